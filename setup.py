@@ -26,7 +26,6 @@ EXTRAS = {
     "pictures": ["pyvista>=0.46"],  # pictures and videos in better light, on the graphics card
     "video": ["imageio[ffmpeg]>=2.28"],  # MP4
     "usd": ["usd-core>=24.5"],
-    "pyg": ["torch_geometric>=2.4"],
     # Meshes of different connectivity; libigl's AABB tree came to Python with 2.6.
     "register": ["robust_laplacian>=1.0", "potpourri3d>=1.2", "libigl>=2.6"],
     # Parts that pass through each other; earlier versions of ipctk have another interface, and were not tried.

@@ -18,7 +18,7 @@ from torch_modal.data.samples import load_sample
 
 N_CODE, N_MORE, BATCH = 8, 300, 24
 Penalty = Callable[[nn.Module, Tensor, Tensor, Tensor], Tensor]  # of decoder, predictions, targets, a line of codes
-ARMS = ("plain", "ShellLoss", "LatentElasticity", "PathEnergy", "members", "in-betweens")
+ARMS = ("plain", "ShellLoss", "LatentElasticity", "path", "members", "in-betweens")
 
 
 def decoder_of(mean: Tensor) -> nn.Module:
@@ -67,12 +67,16 @@ def train(shapes: Tensor, mixtures: Tensor, n: int, steps: int, penalty: Penalty
 
 def penalties(faces: Tensor) -> dict[str, Penalty]:
     """What arms add to the loss."""
-    shell, path = tm.losses.ShellLoss(faces).float(), tm.losses.PathEnergy(faces).float()
+    shell = tm.losses.ShellLoss(faces).float()
     elastic = tm.losses.LatentElasticity(faces, directions=2).float()
+
+    def path(x: Tensor) -> Tensor:
+        return (len(x) - 1) * shell(x[1:], x[:-1]).sum()
+
     return {
         "ShellLoss": lambda decoder, predicted, wanted, line: 0.01 * shell(predicted, wanted).mean(),
         "LatentElasticity": lambda decoder, predicted, wanted, line: 0.001 * elastic(decoder, line[1:4]).mean(),
-        "PathEnergy": lambda decoder, predicted, wanted, line: 0.001 * path(decoder, line),
+        "path": lambda decoder, predicted, wanted, line: 0.001 * path(decoder(line)),
     }
 
 

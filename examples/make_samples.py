@@ -28,7 +28,7 @@ from _sculpt import (
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
-from torch_modal.io.frames import save_mesh
+import torch_modal as tm
 
 # -------------------------------------------------------------------------------------------- creature, shape
 # About 2 units long, Y up, facing +X; its right side is +Z. Left limbs are mirror images of the right ones.
@@ -345,7 +345,7 @@ def main() -> None:
         describe(name, rest, faces, frames)
         for kind, shapes in frames.items():
             for n, shape in enumerate(shapes, start=0 if kind == "key" or name == "creature" else 1):
-                save_mesh(shape, faces, out / name / f"{kind}-{n}.ply", overwrite=True)
+                tm.save_mesh(shape, faces, out / name / f"{kind}-{n}.ply", overwrite=True)
 
 
 if __name__ == "__main__":

@@ -21,7 +21,6 @@ from _animals import animal, galloping, tips
 from scipy.spatial import cKDTree
 
 import torch_modal as tm
-from torch_modal.io.frames import save_mesh
 
 TIMES = {"slender": 0.0, "stout": 4.5}
 """Of their strides, in frames: stretched, and about to push off with the hind legs."""
@@ -55,8 +54,8 @@ def main(out: Path, levels: int = 3, cell: float | None = None, n_modes: int = 3
     np.savetxt(out / "landmarks.txt", landmarks, fmt="%d", header="slender  stout")
     (_, faces, _), (_, stout_faces, _) = bodies.values()
     slender, stout = (galloping(name, TIMES[name], cells[name]) for name in bodies)
-    save_mesh(slender, faces, out / "slender.obj", overwrite=True)
-    save_mesh(stout, stout_faces, out / "stout.obj", overwrite=True)
+    tm.save_mesh(slender, faces, out / "slender.obj", overwrite=True)
+    tm.save_mesh(stout, stout_faces, out / "stout.obj", overwrite=True)
     found = tm.register(slender, faces, stout, stout_faces, landmarks=landmarks, same_subject=False)
     print(found.summary())
 

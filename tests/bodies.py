@@ -2,7 +2,7 @@
 
 A body is a surface at rest along the x axis and a motion of space. The key-frames are the motion's ends, and the motion
 half-way is the true in-between: every motion here turns its body by an angle that grows evenly with time, and keeps the
-lengths along its centre line (bar, limb, tube), around its wall (squeezed tube) or everywhere (sheet).
+lengths along its centre line (bar, limb, tube) or everywhere (sheet).
 """
 
 from collections.abc import Callable
@@ -12,16 +12,13 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from solids import box, surface
+from solids import as_mesh, box
 
-from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.inspect import signed_volume
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 Motion = Callable[[FloatArray, float], FloatArray]
-
-SHARP = np.radians(40.0)  # hinges sharper than this belong to the shape, not to its triangulation
 
 
 class Body(NamedTuple):
@@ -69,45 +66,13 @@ def twist(points: FloatArray, time: float, angle: float, start: float, stop: flo
     return np.stack([x, c * y - s * z, s * y + c * z], axis=1)
 
 
-def squeeze(points: FloatArray, time: float, amount: float, radius: float) -> FloatArray:
-    """Round sections about the x axis made oval; the curvature ``(1 + amount cos 2 theta) / radius`` grows evenly.
-
-    The circle of this radius keeps its lengths, the wall its thickness.
-    """
-    x, y, z = points.T
-    theta, distance = np.arctan2(z, y), np.hypot(y, z)
-    # The tangent's direction is known in closed form, the curve is its integral: by Gauss' rule with two points a cell.
-    n = 4096
-    cell = 2 * np.pi / n
-
-    def tangent(angle: FloatArray) -> FloatArray:
-        turned = angle + 0.5 * amount * time * np.sin(2 * angle) + np.pi / 2
-        return np.stack([np.cos(turned), np.sin(turned)], axis=-1)
-
-    def way(start: FloatArray, length: FloatArray) -> FloatArray:
-        places = (start + length * (0.5 + offset) for offset in (-np.sqrt(1 / 12), np.sqrt(1 / 12)))
-        return length[:, None] * sum(tangent(place) for place in places) / 2
-
-    steps = way(np.arange(n) * cell, np.full(n, cell))
-    corners = np.cumsum(steps, axis=0) - steps
-    corners -= corners.mean(axis=0)
-    place = np.mod(theta, 2 * np.pi)
-    index = np.minimum((place / cell).astype(np.int64), n - 1)
-    curve = corners[index] + way(index * cell, place - index * cell)
-    direction = tangent(theta)
-    normal = np.stack([direction[:, 1], -direction[:, 0]], axis=-1)
-    oval = radius * curve + (distance - radius)[:, None] * normal
-    return np.column_stack([x, oval])
-
-
 # ------------------------------------------------------------------------------------------------------------ surfaces
 
 
 def bar_surface(cells: tuple[int, int, int], size: tuple[float, float, float]) -> tuple[FloatArray, IntArray]:
     """A box along x, centred on the axis, its vertices spread evenly."""
-    solid = box(cells, size)
-    used, faces = np.unique(surface(solid), return_inverse=True)
-    return solid.vertices[used] - [0, size[1] / 2, size[2] / 2], faces.reshape(-1, 3)
+    vertices, faces = as_mesh(box(cells, size))
+    return vertices - [0, size[1] / 2, size[2] / 2], faces
 
 
 def turned_surface(profile: FloatArray, spacing: float, closed: bool = False) -> tuple[FloatArray, IntArray]:
@@ -184,64 +149,6 @@ def twisted_plate(thickness: float) -> tuple[FloatArray, FloatArray, IntArray]:
     return flat, turned, np.concatenate([top, bottom, *rim])
 
 
-def irregular(vertices: FloatArray, faces: IntArray, jitter: float = 0.35) -> tuple[FloatArray, IntArray]:
-    """The same surface with vertices moved about within it and some edges turned round.
-
-    Vertices on sharp edges and on the boundary stay, and so do these edges.
-
-    Args:
-        vertices: *Shape:* ``(V, 3)``.
-        faces: *Shape:* ``(F, 3)``.
-        jitter: How far vertices move, as a part of the way to a random point of one of their faces.
-    """
-    random = np.random.default_rng(0)
-    mesh = Connectivity(faces)
-    hinges = mesh.hinges
-    i, j, k, left = (vertices[corner] for corner in hinges.T)
-    first, second = np.cross(j - i, k - i), np.cross(left - i, j - i)
-    first, second = (n / np.linalg.norm(n, axis=1, keepdims=True) for n in (first, second))
-    smooth = np.einsum("hi,hi->h", first, second) > np.cos(SHARP)
-    fixed = np.zeros(len(vertices), dtype=bool)
-    fixed[hinges[~smooth, :2]] = fixed[mesh.boundary_edges] = True
-
-    own = np.empty(len(vertices), dtype=np.int64)  # a random face of each vertex
-    order = random.permutation(len(faces))
-    own[faces[order]] = order[:, None]
-    target = np.einsum("vc,vci->vi", random.dirichlet([1, 1, 1], len(vertices)), vertices[faces[own]])
-    moved = np.where(fixed[:, None], vertices, vertices + jitter * (target - vertices))
-
-    return moved, _turned_edges(moved, faces, hinges[smooth], random)
-
-
-def _turned_edges(
-    vertices: FloatArray, faces: IntArray, hinges: IntArray, random: np.random.Generator, share: float = 0.3
-) -> IntArray:
-    """Some edges replaced by the other diagonal of their two triangles, where those stay fat."""
-    edges = {tuple(edge) for edge in Connectivity(faces).edges}
-    faces = faces.copy()
-    face_of = {tuple(np.roll(face, -c)): f for f, face in enumerate(faces) for c in range(3)}
-    touched: set[int] = set()
-    for i, j, k, m in random.permutation(hinges)[: int(share * len(hinges))]:
-        first, second = face_of[i, j, k], face_of[j, i, m]
-        new = (min(k, m), max(k, m))
-        if touched & {first, second} or new in edges:
-            continue
-        corners = np.array([[i, m, k], [m, j, k]])
-        if _fatness(vertices, corners).min() < 0.3:
-            continue
-        faces[first], faces[second] = corners
-        touched |= {first, second}
-        edges.add(new)
-    return faces
-
-
-def _fatness(vertices: FloatArray, faces: IntArray) -> FloatArray:
-    """Area over that of an equilateral triangle with the longest edge. *Shape:* ``(F,)``."""
-    a, b, c = (vertices[corner] for corner in faces.T)
-    longest = np.max([np.einsum("fi,fi->f", e, e) for e in (b - a, c - b, a - c)], axis=0)
-    return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2 / (np.sqrt(3) / 4 * longest)
-
-
 # -------------------------------------------------------------------------------------------------------------- bodies
 
 BAR = 4.0
@@ -311,15 +218,12 @@ _BENT = {
 }
 GUTTER = 1 / 3
 """How far the gutter, a sheet, is rolled already at the first key-frame: a flat one has no inside to be filled."""
-SQUEEZED = "tube squeezed"
-
 BODIES = (
     "bar bent 90",
     "bar bent 180",
     "bar twisted 90",
     "bar twisted 180",
     "tube bent 90",
-    SQUEEZED,
     "vessel bent 60",
     "limb bent 120",
     "elbow bent 120",
@@ -327,36 +231,28 @@ BODIES = (
     "gutter rolled 270",
 )
 """The bodies that are looked at by default; :func:`body` takes other angles as well."""
-SLENDER = ("wire bent 120", "rod bent 180")
-"""Bodies that are harder to fill with tetrahedra, and easy otherwise."""
 
 
 @cache
-def _at_rest(make: Callable[[], tuple[FloatArray, IntArray]], jittered: bool) -> tuple[FloatArray, IntArray]:
-    surface_at_rest = irregular(*make()) if jittered else make()
+def _at_rest(make: Callable[[], tuple[FloatArray, IntArray]]) -> tuple[FloatArray, IntArray]:
+    surface_at_rest = make()
     for array in surface_at_rest:
         array.setflags(write=False)  # others get the same arrays
     return surface_at_rest
 
 
-def body(name: str, jittered: bool = False) -> Body:
-    """One of the bodies, of 2,000 to 4,000 vertices.
-
-    Args:
-        name: What is moved and how, and by how many degrees in its whole: ``"bar twisted 180"``.
-        jittered: Whether its triangulation is irregular.
+def body(name: str) -> Body:
+    """One of the bodies, of 2,000 to 4,000 vertices, by what is moved, how, and by how many degrees in its whole.
 
     Raises:
         ValueError: There is no such body.
     """
-    if name == SQUEEZED:
-        return Body(*_at_rest(_tube, jittered), partial(squeeze, amount=1.2, radius=0.6))
     kind, _, degrees = name.rpartition(" ")
     if kind not in _BENT or not degrees.isdigit():
-        raise ValueError(f"there is no body {name!r}; there are {SQUEEZED!r} and, with an angle, {', '.join(_BENT)}")
+        raise ValueError(f"there is no body {name!r}; there are, with an angle, {', '.join(_BENT)}")
     make, bending, start, stop = _BENT[kind]
     motion = partial(bending, angle=np.radians(int(degrees)), start=start, stop=stop)
-    return Body(*_at_rest(make, jittered), partial(_later, motion) if kind.startswith("gutter") else motion)
+    return Body(*_at_rest(make), partial(_later, motion) if kind.startswith("gutter") else motion)
 
 
 def _later(motion: Motion, points: FloatArray, time: float) -> FloatArray:

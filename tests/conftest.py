@@ -15,18 +15,17 @@ import scipy.sparse as sp
 import torch
 import trimesh
 from kornia.geometry.conversions import quaternion_to_rotation_matrix
-from solids import as_it_is, box, element_hessian, lumped_mass, surface
-from threads import limit_threads
+from solids import as_it_is, box, eigenmodes, element_hessian, lumped_mass, surface
+from timing import limit_threads
 
 from torch_modal.energy.energy import RestShapes
 from torch_modal.inbetween.settings import Objective, Solver
 from torch_modal.inbetween.solver import InBetweenSolver
 from torch_modal.keyframes.check import Keyframes
-from torch_modal.precompute.basis import ModalBasis
-from torch_modal.precompute.eigen import lowest_modes
-from torch_modal.precompute.extract import extract_bases
-from torch_modal.precompute.tetrahedra import Tetrahedra
-from torch_modal.precompute.tetwild import TetWild
+from torch_modal.modes.basis import ModalBasis
+from torch_modal.modes.extract import extract_bases
+from torch_modal.modes.tetrahedra import Tetrahedra
+from torch_modal.modes.tetwild import TetWild
 from torch_modal.registration.load import load_keyframes
 from torch_modal.solve.implicit import ConvergenceWarning
 
@@ -94,7 +93,7 @@ def bent_bar(cells: tuple[int, int, int], n_modes: int) -> Shapes:
     bases = []
     for pose in poses:
         solid = Tetrahedra(pose, bar.tets)
-        modes = lowest_modes(element_hessian(solid), sp.diags(lumped_mass(solid)), pose, n_modes)
+        modes = eigenmodes(element_hessian(solid), sp.diags(lumped_mass(solid)), pose, n_modes)
         at_surface = modes.modes.T.reshape(n_modes, -1, 3)[:, used]
         numbers = (pose[used], modes.eigenvalues, at_surface.copy(), modes.rigid_eigenvalues)
         bases.append(ModalBasis(*map(torch.from_numpy, numbers)))
@@ -118,12 +117,6 @@ def small_bars() -> Shapes:
 def hand_path(data_dir: Path) -> Keyframes:
     """Frames 00, 02, 04, 06, 08 of a hand that closes: the middle of a span is its reference in-between."""
     return load_keyframes([data_dir / "mh-hand-path" / f"{i:02}.obj" for i in (0, 2, 4, 6, 8)])
-
-
-@pytest.fixture(scope="session")
-def hand_frames(data_dir: Path) -> torch.Tensor:
-    """All nine frames of that hand. *Shape:* ``(9, V, 3)``."""
-    return load_keyframes([data_dir / "mh-hand-path" / f"{i:02}.obj" for i in range(9)]).keyframes
 
 
 @pytest.fixture(scope="session")

@@ -143,11 +143,11 @@ LAYERS: dict[str, Case] = {
     "ModalDecoder": Case(decoder, decoded, "other", batched=False),
     "Passengers": Case(passengers, lambda layer, x: layer(x)),
     "Passengers, rotations": Case(passengers, lambda layer, x: layer.rotations(x), "other"),
+    "Passengers, gradients": Case(passengers, lambda layer, x: layer.gradients(x), "other"),
     "GaussNewtonStep": Case(Step, pair, "other"),
     "ShellEnergy": Case(lambda s: tm.ShellEnergy(s.faces), pair, "other"),
     "ShellLoss": Case(lambda s: tm.losses.ShellLoss(s.faces), pair, "a ratio"),
     "LatentElasticity": Case(lambda s: tm.losses.LatentElasticity(s.faces), latent, "a ratio", batched=False),
-    "PathEnergy": Case(lambda s: tm.losses.PathEnergy(s.faces), latent, "a ratio", batched=False),
 }
 
 TRANSFORMS: dict[str, Case] = {

@@ -51,13 +51,6 @@ def rolled(place: FloatArray, length: float, turns: float) -> FloatArray:
     return 2 * np.pi * turns * place / length
 
 
-def coiled(place: FloatArray, length: float, turns: float, radius: float) -> FloatArray:
-    """Directions along a spiral that begins with this radius, and whose windings do not touch."""
-    whole = 2 * np.pi * turns
-    growth = 2 * (length - whole * radius) / whole**2
-    return (np.sqrt(radius**2 + 2 * growth * place) - radius) / growth
-
-
 def folded(place: FloatArray, centre: float, width: float, angle: float) -> FloatArray:
     """Directions of two straight parts with a narrow bend between them."""
     u = np.clip((place - centre) / width + 0.5, 0, 1)
@@ -180,10 +173,6 @@ _strip = partial(rectangle, *STRIP, 0.055)
 SHEETS: dict[str, tuple[Callable[[], tuple[FloatArray, IntArray]], Callable[[FloatArray, float], FloatArray]]] = {
     "strip rolled once": (_strip, partial(cylinder, direction=partial(rolled, length=STRIP[0], turns=1))),
     "strip rolled 3 times": (_strip, partial(cylinder, direction=partial(rolled, length=STRIP[0], turns=3))),
-    "strip coiled 3 times": (
-        _strip,
-        partial(cylinder, direction=partial(coiled, length=STRIP[0], turns=3, radius=0.2)),
-    ),
     "page folded 170": (
         partial(rectangle, *PAGE, 0.024),
         partial(cylinder, direction=partial(folded, centre=0.7, width=0.14, angle=np.radians(170))),
@@ -196,8 +185,6 @@ SHEETS: dict[str, tuple[Callable[[], tuple[FloatArray, IntArray]], Callable[[Flo
     "shirt": (partial(_shirt, 0.4), partial(raised, angle=np.radians(40))),
     "flat shirt folded": (partial(_shirt, 0.0), partial(put_together, angle=np.radians(120))),
 }
-
-
 """Their flat shapes, and how they move."""
 
 

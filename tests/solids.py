@@ -5,10 +5,11 @@ import itertools
 import numpy as np
 import scipy.sparse as sp
 
-from torch_modal.precompute.embedding import find_neighbours, fit_weights
-from torch_modal.precompute.stiffness import hat_gradients, mass_matrix
-from torch_modal.precompute.surface import CanonicalSurface
-from torch_modal.precompute.tetrahedra import Tetrahedra, solid_volumes
+from torch_modal.modes.eigen import ElasticBody, ElasticModes, lowest_modes
+from torch_modal.modes.embedding import find_neighbours, fit_weights
+from torch_modal.modes.stiffness import hat_gradients, mass_matrix
+from torch_modal.modes.surface import CanonicalSurface
+from torch_modal.modes.tetrahedra import Tetrahedra, solid_volumes
 
 
 def box(cells: tuple[int, int, int], size: tuple[float, float, float], jitter: float = 0.0) -> Tetrahedra:
@@ -38,9 +39,9 @@ def together(*solids: Tetrahedra) -> Tetrahedra:
     )
 
 
-def embed_surface(points: np.ndarray, solid: Tetrahedra, normals: np.ndarray | None = None) -> sp.csr_matrix:
+def embed_surface(points: np.ndarray, solid: Tetrahedra, normals: np.ndarray | float = 0.0) -> sp.csr_matrix:
     """Weights of the surface in the pose in which its neighbours are found. *Shape:* ``(V, N)``."""
-    return fit_weights(points, solid.vertices, *find_neighbours(points, solid, normals))
+    return fit_weights(points, solid.vertices, *find_neighbours(points, solid, normals + np.zeros(points.shape)))
 
 
 def element_hessian(solid: Tetrahedra) -> sp.csc_matrix:
@@ -54,6 +55,17 @@ def element_hessian(solid: Tetrahedra) -> sp.csc_matrix:
     n = 3 * len(solid.vertices)
     k = sp.coo_matrix((blocks.reshape(-1), (rows.reshape(-1), columns.reshape(-1))), shape=(n, n)).tocsc()
     return sp.csc_matrix((k + k.T) / 2)
+
+
+def as_mesh(solid: Tetrahedra) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and faces of its surface alone."""
+    used, faces = np.unique(surface(solid), return_inverse=True)
+    return solid.vertices[used], faces.reshape(-1, 3)
+
+
+def eigenmodes(k: sp.csc_matrix, mass: sp.spmatrix, positions: np.ndarray, n_modes: int) -> ElasticModes:
+    """Lowest modes of these matrices."""
+    return lowest_modes(ElasticBody(positions, k, mass, lambda motions: motions), n_modes)
 
 
 def as_it_is(points: np.ndarray, faces: np.ndarray) -> CanonicalSurface:

@@ -37,11 +37,6 @@ def filled(tree: Any, tensors: Iterable[Tensor]) -> Any:
     return mapped(tree, lambda _: next(each))
 
 
-def picked(tree: Any, index: Tensor | None) -> Any:
-    """Pick some of the samples, or all where None."""
-    return tree if index is None else rows(tree, index)
-
-
 def rows(tree: Any, samples: Tensor | slice) -> Any:
     """Pick some of the samples."""
     return mapped(tree, lambda tensor: tensor[samples])

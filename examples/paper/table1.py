@@ -16,7 +16,7 @@ from _bipeds import KINDS, biped
 
 import torch_modal as tm
 from torch_modal.data.samples import load_sample
-from torch_modal.precompute.surface import CanonicalSurface
+from torch_modal.modes.surface import CanonicalSurface
 
 N_MODES = 50
 PAPER = {

@@ -7,7 +7,7 @@ import pytest
 import torch
 from conftest import Shapes
 from torch import Tensor
-from torch.func import hessian, jacfwd, vmap
+from torch.func import hessian, jacfwd
 
 from torch_modal.backends.torch.fine_steps import (
     RIDGE,
@@ -131,30 +131,6 @@ def test_a_step_that_goes_uphill_ends_where_the_parabola_is_least(case: Case) ->
     shorter = case.rows + length[:, None] * core.extend(move)
     assert bool((core.value(shorter, case.reference) < before).all())
     torch.testing.assert_close(length[0], -0.5 * slope[0] / (after - before - slope)[0])
-
-
-def test_the_length_of_a_step_is_continuous() -> None:
-    before, slope = torch.ones(3, dtype=torch.float64), torch.full((3,), -0.2, dtype=torch.float64)
-    after = torch.tensor([0.9 - 1e-9, 0.9 + 1e-9, torch.inf], dtype=torch.float64)
-    length = step_length(before, slope, after, torch.ones_like(before))
-    assert float(length[0]) == 1 and 1 - 1e-7 < float(length[1]) < 1 and float(length[2]) == 0
-
-
-def test_a_minimum_stays(small_bars: Shapes) -> None:
-    case = Case(small_bars)
-    rest = case.rests[0]
-    assert torch.equal(relax(case.core, rest, case.shell.against(rest), 2, 5), rest)
-
-
-def test_under_vmap(small_bars: Shapes) -> None:
-    """The line search looks at numbers, and vmap must not mind."""
-    case = Case(small_bars, roughness=0.05)
-
-    def relaxed(x: Tensor) -> Tensor:
-        return relax(case.core, x, case.reference, 2, 4)
-
-    shifted = torch.stack([case.x, case.x + 0.5])
-    torch.testing.assert_close(vmap(relaxed)(shifted), torch.stack([relaxed(x) for x in shifted]))
 
 
 def test_chunks_fit_into_caches_or_the_memory_of_a_gpu() -> None:

@@ -15,17 +15,15 @@ from statistics import median
 from typing import Any
 
 import torch
-from threads import limit_threads
+from cases import keyframes_of
+from timing import limit_threads
 from torch import Tensor
 from torch.utils.data import DataLoader
 
 import torch_modal as tm
 
-DATA = Path(__file__).parents[2].parent / "shared" / "data"
-MESHES = {
-    "hand": [DATA / "mh-hand-path" / f"{i:02}.obj" for i in (0, 4, 8)],
-    "woman": [DATA / "mh-woman" / f"{name}.obj" for name in ("00-rest", "02-walk-a", "03-walk-b")],
-}
+MESHES = {"hand": ("mh-hand-path", "00", "04", "08"), "woman": ("mh-woman",)}
+"""Folders beside the project, and the files of them."""
 WORKERS, BATCH, ROUNDS = 2, 16, 3
 
 
@@ -37,24 +35,14 @@ class RandomLinear(tm.RandomInBetween):
         return torch.lerp(batch.shapes, partners.shapes, t[:, None, None])
 
 
-def stored(name: str, root: Path) -> Path | None:
-    """A set of the mesh, in a folder of its own; None, with a word, where the data is not there."""
-    paths = MESHES[name]
-    if not paths[0].is_file():
-        print(f"(no {name}: {paths[0]} is not there)")
-        return None
-    keyframes, faces = tm.load_keyframes(paths)
-    folder = root / name / "set"
-    tm.write_set(folder, keyframes, faces, tm.extract_bases(keyframes, faces, 30), [path.name for path in paths])
-    return folder
-
-
 def throughput(arguments: argparse.Namespace) -> None:
     """Print shapes a second."""
     with tempfile.TemporaryDirectory() as place:
         for name in arguments.meshes:
-            folder = stored(name, Path(place))
-            if folder is not None:
+            found = keyframes_of(*MESHES[name])
+            if found is not None:
+                folder = Path(place) / name / "set"
+                tm.write_set(folder, *found, tm.extract_bases(*found, 30), [f"{i}.obj" for i in range(len(found[0]))])
                 compare(name, folder, arguments)
 
 
@@ -87,7 +75,7 @@ def compare(name: str, folder: Path, arguments: argparse.Namespace) -> None:
             started = time.perf_counter()
             n = sum(len(batch["vertices"]) for batch in loader)
             rates[way].append(n / (time.perf_counter() - started))
-    n_vertices = tm.open_set(folder).n_vertices
+    n_vertices = tm.StoredSet(folder).n_vertices
     print(f"\n{name}, {n_vertices} vertices, {WORKERS} workers, batches of {BATCH}; first 16 shapes {cold:.1f} s")
     base = median(rates["linear"])
     print(f"{'':34s}{'shapes / s':>12s}{'of linear':>12s}")

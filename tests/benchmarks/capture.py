@@ -11,15 +11,14 @@ import scipy.sparse as sp
 import torch
 from numpy.typing import NDArray
 from quadratic import at_points, quadratic_modes
-from solids import element_hessian, embed_surface, lumped_mass
+from solids import eigenmodes, element_hessian, embed_surface, lumped_mass
 
 import torch_modal as tm
 from torch_modal.geometry.connectivity import vertex_areas
 from torch_modal.io.cache import Arrays, Cache
-from torch_modal.precompute.eigen import lowest_modes
-from torch_modal.precompute.stiffness import arap_hessian, mass_matrix
-from torch_modal.precompute.surface import CanonicalSurface
-from torch_modal.precompute.tetrahedra import Mesher, Tetrahedra
+from torch_modal.modes.stiffness import arap_hessian, mass_matrix
+from torch_modal.modes.surface import CanonicalSurface
+from torch_modal.modes.tetrahedra import Mesher, Tetrahedra
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -74,7 +73,7 @@ class Judge:
     def _linear(self, tetrahedra: Tetrahedra) -> FloatArray:
         """As fine as one can wait for, with the plainest method."""
         mass = sp.diags(lumped_mass(tetrahedra))
-        modes = lowest_modes(element_hessian(tetrahedra), mass, tetrahedra.vertices, N_MODES).modes
+        modes = eigenmodes(element_hessian(tetrahedra), mass, tetrahedra.vertices, N_MODES).modes
         return self.at_surface(self.embedding(tetrahedra), modes)
 
     def _quadratic(self, tetrahedra: Tetrahedra) -> FloatArray:
@@ -110,7 +109,7 @@ class Judge:
 
 def solid_modes(tetrahedra: Tetrahedra) -> FloatArray:
     """The lowest modes, as the package computes them by default."""
-    return lowest_modes(arap_hessian(tetrahedra), mass_matrix(tetrahedra), tetrahedra.vertices, N_MODES).modes
+    return eigenmodes(arap_hessian(tetrahedra), mass_matrix(tetrahedra), tetrahedra.vertices, N_MODES).modes
 
 
 def rows(judge: Judge, runs: int) -> list[tuple[str, list[Found]]]:

@@ -11,11 +11,12 @@ import numpy as np
 import torch
 
 import torch_modal as tm
-from torch_modal.data.samples import load_sample
+from torch_modal.data.samples import SAMPLES, load_sample
+from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.io.read import SUFFIXES
 
 sys.path.append(str(Path(__file__).parents[1]))  # beside the tests
-from bodies import BODIES, SLENDER, body
+from bodies import BODIES, body
 
 DATA = Path(__file__).parents[2].parent / "shared" / "data"
 HALF = 0.5
@@ -99,17 +100,48 @@ def folder(path: Path) -> Iterator[Case]:
     yield from spans(path.name, files, [(0, len(files) - 1)], truth=True)
 
 
+def files_of(name: str, *beginnings: str) -> list[Path]:
+    """Meshes of a folder beside the project, those whose names begin so; none, with a word, where it is not there."""
+    found = [file for start in beginnings or ("",) for file in sorted((DATA / name).glob(f"{start}*.obj"))]
+    if not found:
+        print(f"(without {name}: the folder {DATA / name} is not there)")
+    return found
+
+
+def keyframes_of(name: str, *beginnings: str) -> tuple[torch.Tensor, torch.Tensor] | None:
+    """Key-frames and faces of a sample or of such a folder; None where that is not there."""
+    if name in SAMPLES:
+        return load_sample(name)[:2]
+    files = files_of(name, *beginnings)
+    return tm.load_keyframes(files) if files else None
+
+
+def animal(name: str) -> tuple[torch.Tensor, torch.Tensor, list[tuple[str, int, int]]]:
+    """Frames and faces of an animal beside the project, and the name, the start and the end of each clip."""
+    with np.load(DATA / "animals" / f"{name}.npz") as given:
+        starts, lengths = given["clip_starts"].tolist(), given["clip_lengths"].tolist()
+        clips = [(str(own), i, i + n) for own, i, n in zip(given["clip_names"], starts, lengths, strict=True)]
+        return torch.tensor(given["frames"]).double(), torch.tensor(given["faces"]).long(), clips
+
+
+def divided(x: torch.Tensor, faces: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Shapes whose triangles are divided in four. *Shape:* ``(K, V, 3), (F, 3)``."""
+    mesh = Connectivity(faces.numpy(), x.shape[1])
+    i, j, k = faces.unbind(1)
+    a, b, c = (torch.tensor(mesh.sides).view(3, -1) + x.shape[1]).unbind()  # of ij, jk, ki
+    corners = ((i, a, c), (a, j, b), (c, b, k), (a, b, c))
+    return torch.cat([x, x[:, mesh.edges].mean(2)], 1), torch.cat([torch.stack(face, 1) for face in corners])
+
+
 def hand_path() -> Iterator[Case]:
-    """Three spans of a closing hand; nothing, with a word, where the data is not there."""
-    files = [DATA / "mh-hand-path" / f"{i:02}.obj" for i in range(9)]
-    if _there(files[0].parent):
+    """Three spans of a closing hand."""
+    if files := files_of("mh-hand-path"):
         yield from spans("mh-hand-path", files, [(0, 8), (0, 4), (4, 8)], truth=True)
 
 
 def women() -> Iterator[Case]:
     """A figure at rest and in two steps of a walk, without a reference."""
-    files = [DATA / "mh-woman" / f"{name}.obj" for name in ("00-rest", "02-walk-a", "03-walk-b")]
-    if _there(files[0].parent):
+    if files := files_of("mh-woman"):
         yield from spans("mh-woman", files, [(1, 2), (0, 1), (0, 2)], ["00", "02", "03"])
 
 
@@ -122,8 +154,7 @@ def shared() -> Iterator[Case]:
         ("ict-face", [(0, 1), (0, 2), (1, 2), (0, 3)]),
         ("hyper-cube", [(0, 1), (1, 2), (2, 3)]),
     ):
-        if _there(DATA / name):
-            files = sorted((DATA / name).glob("*.obj"))
+        if files := files_of(name):
             labels = [file.stem[:2] if file.stem[:2].isdigit() else file.stem[-1] for file in files]
             yield from spans(name, files, ends, labels)
 
@@ -139,22 +170,11 @@ def samples() -> Iterator[Case]:
             yield Case(f"sample {name} {i}/{(i + 1) % n}", shapes, i, (i + 1) % n, truths)
 
 
-def bodies(names: Iterable[str] = BODIES, jittered: bool = False) -> Iterator[Case]:
+def bodies(names: Iterable[str] = BODIES) -> Iterator[Case]:
     """Synthetic bodies that bend far, and thin and hollow ones."""
     for name in names:
-        shape = body(name, jittered)
+        shape = body(name)
         first, half, last = (torch.from_numpy(shape.pose(t)) for t in (0.0, HALF, 1.0))
         shapes = KeyframeSet(torch.stack([first, last]), torch.from_numpy(np.array(shape.faces)))
         quarters = {t: torch.from_numpy(shape.pose(t)) for t in (0.25, 0.75)}
-        yield Case(name + (", irregular" if jittered else ""), shapes, 0, 1, {HALF: half, **quarters})
-
-
-def slender() -> Iterator[Case]:
-    """Bodies that are hard to fill with tetrahedra."""
-    yield from bodies(SLENDER)
-
-
-def _there(path: Path) -> bool:
-    if not path.is_dir():
-        print(f"(without {path.name}: the folder {path} is not there)")
-    return path.is_dir()
+        yield Case(name, shapes, 0, 1, {HALF: half, **quarters})

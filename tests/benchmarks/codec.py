@@ -18,13 +18,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import torch
-from cases import DATA
+from cases import divided, keyframes_of
+from measures import edge_lengths, mean_ratio
 from motions import OPENED, closed_part, sculpted
-from threads import limit_threads
+from tables import head
+from timing import limit_threads
 from torch import Tensor
 
 import torch_modal as tm
-from torch_modal.geometry.connectivity import Connectivity
 
 GALLOP, GRIP, LONG = 96, 41, 1000
 
@@ -47,10 +48,9 @@ class Sequence:
 
     def measured(self, x: Tensor) -> tuple[float, float]:
         """Distance, in 1e-3 of the diagonal, and edge error, in %."""
-        i, j = torch.tensor(Connectivity(self.faces.numpy()).edges).T
-        lengths, true = ((y[:, i] - y[:, j]).norm(dim=-1) for y in (x, self.frames))
+        lengths = (edge_lengths(y, self.faces) for y in (x, self.frames))
         distance = float((x - self.frames).norm(dim=-1).mean()) / self.diagonal
-        return 1e3 * distance, 100 * float(((lengths - true).abs() / true).mean())
+        return 1e3 * distance, 100 * mean_ratio(*lengths)
 
 
 def creature() -> Sequence:
@@ -63,12 +63,8 @@ def creature() -> Sequence:
 
 def hand_path() -> Sequence | None:
     """The rigged hand that closes."""
-    folder = DATA / "mh-hand-path"
-    if not folder.is_dir():
-        print(f"(without {folder.name}: the folder {folder} is not there)")
-        return None
-    frames, faces = tm.load_keyframes([folder / f"{i:02}.obj" for i in range(9)])
-    return Sequence("mh-hand-path", frames, faces, False, ((0, 8), (0, 4, 8), (0, 2, 4, 6, 8)))
+    found = keyframes_of("mh-hand-path")
+    return found and Sequence("mh-hand-path", *found, False, ((0, 8), (0, 4, 8), (0, 2, 4, 6, 8)))
 
 
 def grip() -> Sequence:
@@ -123,8 +119,9 @@ def print_floats(sequence: Sequence) -> None:
 
 def print_decode(sequence: Sequence) -> None:
     """A row of speed: 100 frames of about 8,000 vertices."""
-    frames, faces = sequence.frames[:2], sequence.faces
-    x, faces = refined(frames, faces, 8000)
+    x, faces = sequence.frames[:2], sequence.faces
+    while x.shape[1] < 8000:
+        x, faces = divided(x, faces)
     keys = tm.encode(x, faces, [0, 1], 60, progress=False)
     t = torch.linspace(0, 1, 100, dtype=torch.float64)
     a = torch.randn(100, keys.n_modes, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
@@ -136,19 +133,6 @@ def print_decode(sequence: Sequence) -> None:
             decoder(a.to(kind), t.to(kind))
             seconds = time.process_time() - start
         print(f"| {sequence.name}, {x.shape[1]} vertices, {kind} | {100 / seconds:.0f} frames a second |", flush=True)
-
-
-def refined(frames: Tensor, faces: Tensor, n_vertices: int) -> tuple[Tensor, Tensor]:
-    """Triangles cut in four until there are that many vertices."""
-    while frames.shape[1] < n_vertices:
-        mesh = Connectivity(faces.numpy())
-        edges = torch.tensor(mesh.edges)
-        middle = torch.tensor(mesh.sides).reshape(3, -1).T + frames.shape[1]  # of sides 01, 12, 20
-        frames = torch.cat([frames, frames[:, edges].mean(2)], 1)
-        (a, b, c), (ab, bc, ca) = faces.T, middle.T
-        parts = [[a, ab, ca], [ab, b, bc], [ca, bc, c], [ab, bc, ca]]
-        faces = torch.cat([torch.stack(part, 1) for part in parts])
-    return frames, faces
 
 
 def print_long() -> None:
@@ -164,24 +148,17 @@ def print_long() -> None:
     seconds = time.process_time() - start
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     own = frames.numel() * 8 / 2**20
-    print(
-        "| frames | vertices | key-frames | mean distance, worst, % | seconds | frames, MB | peak before, after, MB |"
-    )
-    print("|---|---|---|---|---|---|---|")
+    columns = "frames", "vertices", "key-frames", "mean distance, worst, %", "seconds", "frames, MB"
+    print(head(*columns, "peak before, after, MB"))
     print(
         f"| {LONG} | {frames.shape[1]} | {len(found.keyframes)} | {100 * float(found.errors.mean()):.2g}, "
         f"{100 * float(found.errors.max()):.2g} | {seconds:.0f} | {own:.0f} | {before / 1024:.0f}, {peak / 1024:.0f} |"
     )
 
 
-TABLES = {
-    "floats": (
-        "| motion | key-frames | floats / 3V | path: distance, edges | + 60 amplitudes "
-        "| PCA, components: distance, edges = ours over it | PCA of more floats |",
-        print_floats,
-    ),
-    "decode": ("| decoding on one core | speed |", print_decode),
-}
+FLOATS = ("motion", "key-frames", "floats / 3V", "path: distance, edges", "+ 60 amplitudes")
+PCA = ("PCA, components: distance, edges = ours over it", "PCA of more floats")
+TABLES = {"floats": ((*FLOATS, *PCA), print_floats), "decode": (("decoding on one core", "speed"), print_decode)}
 
 
 def main() -> None:
@@ -195,9 +172,8 @@ def main() -> None:
         if name == "long":
             print_long()
             continue
-        head, row = TABLES[name]
-        print(head)
-        print("|---" * (head.count("|") - 1) + "|")
+        columns, row = TABLES[name]
+        print(head(*columns))
         for sequence in chosen(args.motions):
             row(sequence)
 

@@ -22,8 +22,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from cases import DATA
-from threads import limit_threads
+from cases import keyframes_of
+from measures import edge_lengths, mean_ratio
+from timing import limit_threads
 from torch import Tensor
 
 import torch_modal as tm
@@ -66,26 +67,18 @@ def legs(inward: float = 10.0, swing: float = 14.0) -> Case:
     return Case("swapped legs", torch.from_numpy(np.stack(poses)), torch.from_numpy(faces.astype(np.int64)))
 
 
-def files(name: str, *paths: str) -> Case | None:
-    """A pair of the larger meshes; None, with a word, where they are not there."""
-    if not (DATA / paths[0]).is_file():
-        print(f"(without {name}: {DATA / paths[0]} is not there)")
-        return None
-    return Case(name, *tm.load_keyframes([DATA / path for path in paths]))
-
-
-def sample_hand() -> Case:
-    """The sample's."""
-    sample = load_sample("hand")
-    return Case("sample hand", sample.keyframes, sample.faces)
+def pair(name: str, folder: str, *files: str) -> Case | None:
+    """A sample, or two of the larger meshes; None where they are not there."""
+    found = keyframes_of(folder, *files)
+    return found and Case(name, *found)
 
 
 CASES: dict[str, Callable[[], Case | None]] = {
-    "hand": sample_hand,
+    "hand": lambda: pair("sample hand", "hand"),
     "legs": legs,
-    "mh-hand": lambda: files("mh-hand 02/04", "mh-hand/02-fist.obj", "mh-hand/04-spread.obj"),
-    "woman-02": lambda: files("mh-woman 00/02", "mh-woman/00-rest.obj", "mh-woman/02-walk-a.obj"),
-    "woman-23": lambda: files("mh-woman 02/03", "mh-woman/02-walk-a.obj", "mh-woman/03-walk-b.obj"),
+    "mh-hand": lambda: pair("mh-hand 02/04", "mh-hand", "02", "04"),
+    "woman-02": lambda: pair("mh-woman 00/02", "mh-woman", "00", "02"),
+    "woman-23": lambda: pair("mh-woman 02/03", "mh-woman", "02", "03"),
 }
 
 
@@ -156,18 +149,12 @@ def crossings(names: list[str]) -> Iterator[tuple[Case, Run]]:
 def edges(case: Case, found: Run) -> None:
     """Edge errors of the sample hand against its true frames."""
     sample = load_sample("hand")
-    i, j = torch.tensor(tm.ShapeSpace(tm.extract_bases(*sample[:2], 30, progress=False), sample.faces).edges).T
-
-    def error(x: Tensor, true: Tensor) -> float:
-        mine, its = ((y[i] - y[j]).norm(dim=-1) for y in (x, true))
-        return float(100 * ((mine - its).abs() / its).mean())
-
     print("\nedge error of the sample hand, %, without contact, after as many steps, and with contact")
     for t, true in zip(sample.true_times, sample.truth, strict=True):
-        k = round(t * 2**LEVELS)
-        print(
-            f"  t = {t:.2f}" + "".join(f"{error(x[k], true):10.3f}" for x in (found.plain, found.polished, found.apart))
-        )
+        k, lengths = round(t * 2**LEVELS), edge_lengths(true, case.faces)
+        shapes = (x[k] for x in (found.plain, found.polished, found.apart))
+        errors = [100 * mean_ratio(edge_lengths(x, case.faces), lengths) for x in shapes]
+        print(f"  t = {t:.2f}" + "".join(f"{error:10.3f}" for error in errors))
 
 
 def singles(names: list[str]) -> None:
@@ -198,7 +185,7 @@ def untouched() -> None:
 
 def gradients() -> None:
     """Of a weighted sum of the sample hand's vertices at t = 7/8, against central differences."""
-    case = sample_hand()
+    case = Case("sample hand", *load_sample("hand")[:2])
     layer = tm.InBetween(tm.extract_bases(case.keyframes, case.faces, 20, progress=False), case.faces, contact=True)
     search, found = ContactSearch.__call__, []
     calls = 0

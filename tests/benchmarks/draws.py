@@ -10,17 +10,17 @@ is installed. ``linear`` draws the same pairs and times as ``RandomInBetween``.
 """
 
 import argparse
-from typing import Any
 
+import numpy as np
 import torch
 from augment import MESHES, RandomLinear
-from threads import limit_threads
+from cases import keyframes_of
+from measures import HAS_CONTACT, crossing_pairs
+from numpy.typing import NDArray
+from timing import limit_threads
 from torch import Tensor
 
 import torch_modal as tm
-from torch_modal.data.samples import load_sample
-from torch_modal.geometry.connectivity import Connectivity
-from torch_modal.geometry.crossings import Crossings, has_contact
 
 TRANSFORMS: dict[str, tm.ShapeAugmentation] = {
     "linear": RandomLinear(p=1.0),
@@ -32,29 +32,10 @@ TRANSFORMS: dict[str, tm.ShapeAugmentation] = {
 }
 
 
-def keyframes_of(name: str) -> tuple[Tensor, Tensor] | None:
-    """Key-frames and faces; None, with a word, where the data is not there."""
-    if name == "creature":
-        sample = load_sample("creature")
-        return sample.keyframes, sample.faces
-    if not MESHES[name][0].is_file():
-        print(f"(no {name}: {MESHES[name][0]} is not there)")
-        return None
-    return tm.load_keyframes(MESHES[name])
-
-
-def crossings(x: Tensor, faces: Tensor) -> Tensor | None:
-    """Pairs of faces that cross, *shape* ``(n, 2)``; None without the extra ``contact``."""
-    if not has_contact():
-        return None
-    shape = x.double().numpy()
-    return torch.from_numpy(Crossings(Connectivity(faces.numpy(), len(shape)), shape[None]).pairs(shape))
-
-
-def around(pairs: Tensor, faces: Tensor, rings: int = 2) -> Tensor:
+def around(pairs: NDArray[np.int64], faces: Tensor, rings: int = 2) -> Tensor:
     """Faces within so many rings of those that cross. *Shape:* ``(F,)``, bool."""
     near = torch.zeros(len(faces), dtype=torch.bool)
-    near[pairs.flatten()] = True
+    near[pairs.ravel()] = True
     for _ in range(rings):
         touched = torch.zeros(int(faces.max()) + 1, dtype=torch.bool)
         touched[faces[near].flatten()] = True
@@ -64,7 +45,7 @@ def around(pairs: Tensor, faces: Tensor, rings: int = 2) -> Tensor:
 
 def measure(name: str, n: int, n_intersections: int, kinds: list[str], contact: bool) -> None:
     """Print a line for each transform."""
-    found = keyframes_of(name)
+    found = keyframes_of(*MESHES.get(name, (name,)))
     if found is None:
         return
     keyframes, faces = found
@@ -73,7 +54,7 @@ def measure(name: str, n: int, n_intersections: int, kinds: list[str], contact: 
     k = len(space)
     shell = tm.ShellEnergy(faces)
     volumes = shell.measure(pool.shapes.double()).volume
-    old = [None if pairs is None else around(pairs, faces) for pairs in (crossings(x, faces) for x in pool.shapes)]
+    old = [around(crossing_pairs(x, faces), faces) for x in pool.shapes if HAS_CONTACT]
     for kind in kinds:
         augment = TRANSFORMS[kind]
         generator = torch.Generator().manual_seed(0)
@@ -92,10 +73,9 @@ def measure(name: str, n: int, n_intersections: int, kinds: list[str], contact: 
             ratios.append(shell.measure(y.double()).volume / source)
             strains.append(space.strain(y, pool.shapes[rows]).abs().amax(1))
             for row in range(len(rows)):
-                if old[0] is not None and len(new) < n_intersections:
-                    mine: Any = crossings(y[row], faces)
-                    known: Any = old[int(rows[row])] | old[int(partner[row])]
-                    new.append(int((~known[mine]).all(1).sum()))
+                if old and len(new) < n_intersections:
+                    known = old[int(rows[row])] | old[int(partner[row])]
+                    new.append(int((~known[crossing_pairs(y[row], faces)]).all(1).sum()))
         off = (torch.cat(ratios) - 1).abs()
         strain = torch.cat(strains)
         line = f"{kind:32s}{finite:7d}{100 * float(off.median()):9.2f} %{100 * float(off.max()):7.2f} %"

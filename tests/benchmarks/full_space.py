@@ -32,8 +32,9 @@ RIDGE = 1e-9
 HELD_ALTITUDE = 0.005
 HOLD = 1e9
 
-# The energy stagnates when this many steps together gain less than the tolerance.
-STAGNATION_STEPS = 5
+MAX_STEPS = 100
+# The energy stagnates when this many steps together gain less than this part of it.
+STAGNATION_STEPS, TOLERANCE = 5, 1e-8
 
 
 class FullSpaceResult(NamedTuple):
@@ -45,8 +46,6 @@ class FullSpaceResult(NamedTuple):
     """Eq. 5 at the start and after each step, at a bounding-box diagonal of 100; it never rises."""
     stagnated: bool
     """Whether there was nothing more to gain."""
-    n_held: int
-    """Vertices of collapsed triangles that were held in the last step."""
 
 
 def full_space(
@@ -56,12 +55,7 @@ def full_space(
     t: float = 0.5,
     *,
     start: Tensor | None = None,
-    alpha: float = 500.0,
-    beta: float = 10.0,
-    gamma: float = 1000.0,
     example_based: bool = False,
-    max_steps: int = 100,
-    tolerance: float = 1e-8,
 ) -> FullSpaceResult:
     r"""The shape that minimises :math:`(1-t)\, d(x_a, x) + t\, d(x_b, x)` (Eq. 5) over all vertices.
 
@@ -75,27 +69,11 @@ def full_space(
         t: Time in [0, 1].
         start: Where to start, in the caller's coordinates. Default: linear interpolation of the aligned key-frames.
             *Shape:* ``(V, 3)``.
-        alpha: Stretching stiffness.
-        beta: Bending stiffness.
-        gamma: Volume stiffness.
         example_based: One reference whose lengths, angles, volume and weights are interpolated between those of the
             key-frames, in place of two (Froehlich and Botsch 2011).
-        max_steps: Newton steps at most.
-        tolerance: The energy stagnates when five steps together gain less than this part of it.
-
-    Raises:
-        ValueError: Shapes that do not fit, or a time outside [0, 1].
     """
-    if not 0 <= t <= 1:
-        raise ValueError(f"t lies in [0, 1], from key-frame to key-frame; got {t}")
-    if x_a.shape != x_b.shape or x_a.dim() != 2 or x_a.shape[-1] != 3:
-        raise ValueError(f"x_a and x_b are both of shape (V, 3); got {tuple(x_a.shape)} and {tuple(x_b.shape)}")
-    first, second = (x.detach().cpu().double() for x in (x_a, x_b))
-    own = (first.amax(0) - first.amin(0)).norm()
-    if not bool(torch.isfinite(own + second.sum())) or own == 0:
-        raise ValueError("x_a and x_b must be finite and x_a must have a size; check them for NaN and infinity")
-    scale = CANONICAL_SIZE / own
-    faces = torch.as_tensor(faces).cpu().long()
+    first, second = x_a.double(), x_b.double()
+    scale = CANONICAL_SIZE / (first.amax(0) - first.amin(0)).norm()
     weights = torch.from_numpy(connectivity.vertex_areas(first.numpy(), faces.numpy()))
     first, second = first * scale, second * scale
     back = best_fit(second, first, weights)
@@ -103,19 +81,17 @@ def full_space(
     motion = back.inverse().fraction(torch.tensor(t, dtype=torch.float64))
     x = torch.lerp(first, aligned, t)
     if start is not None:
-        x = motion.inverse().apply(start.detach().cpu().double() * scale)
+        x = motion.inverse().apply(start.double() * scale)
 
     energy = Energy(Mesh.of(faces, len(first)), [Stretch(), SquaredBend(), Volume()])
     at_t = torch.tensor([t], dtype=torch.float64)
     rests = [energy.rest(energy.extend(y.T[:, None].contiguous())) for y in (first, aligned)]
-    stiffness = [alpha, beta, gamma]
+    stiffness = [500.0, 10.0, 1000.0]
     reference = energy.among(rests, torch.stack([1 - at_t, at_t], -1), stiffness)
     if example_based:
         reference = energy.against(_interpolated(energy, rests[0], rests[1], t), stiffness)
-    start_rows = x.T[:, None].contiguous()
-    rows, energies, stagnated, n_held = _minimise(energy, faces, start_rows, reference, max_steps, tolerance)
-    shape = motion.apply(rows[:, 0].T) / scale
-    return FullSpaceResult(shape.to(x_a), energies, stagnated, n_held)
+    rows, energies, stagnated = _minimise(energy, faces, x.T[:, None].contiguous(), reference)
+    return FullSpaceResult((motion.apply(rows[:, 0].T) / scale).to(x_a), energies, stagnated)
 
 
 def _interpolated(energy: Energy, first: Rest, second: Rest, t: float) -> Rest:
@@ -127,32 +103,23 @@ def _interpolated(energy: Energy, first: Rest, second: Rest, t: float) -> Rest:
     return Rest(measures, tuple(torch.lerp(a, b, t) for a, b in zip(first.weights, second.weights, strict=True)))
 
 
-def _minimise(
-    energy: Energy,
-    faces: Tensor,
-    rows: Tensor,
-    reference: Reference,
-    max_steps: int,
-    tolerance: float,
-) -> tuple[Tensor, list[float], bool, int]:
+def _minimise(energy: Energy, faces: Tensor, rows: Tensor, reference: Reference) -> tuple[Tensor, list[float], bool]:
     assembly = _Assembly(energy)
     energies = [float(energy.value(energy.extend(rows), reference))]
-    held = torch.zeros(rows.shape[-1], dtype=torch.bool)
-    for _ in range(max_steps):
-        held = _held(faces, rows)
-        direction = assembly.direction(energy.linearise(energy.extend(rows), reference), held)
+    for _ in range(MAX_STEPS):
+        direction = assembly.direction(energy.linearise(energy.extend(rows), reference), _held(faces, rows))
         for length in STEP_LENGTHS:
             moved = rows + length * direction
             found = float(energy.value(energy.extend(moved), reference))
             if found < energies[-1]:
                 break
         else:
-            return rows, energies, True, int(held.sum())
+            return rows, energies, True
         rows = moved
         energies.append(found)
-        if len(energies) > STAGNATION_STEPS and energies[-1 - STAGNATION_STEPS] - found < tolerance * found:
-            return rows, energies, True, int(held.sum())
-    return rows, energies, False, int(held.sum())
+        if len(energies) > STAGNATION_STEPS and energies[-1 - STAGNATION_STEPS] - found < TOLERANCE * found:
+            return rows, energies, True
+    return rows, energies, False
 
 
 def _held(faces: Tensor, rows: Tensor) -> Tensor:

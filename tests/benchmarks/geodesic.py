@@ -29,7 +29,9 @@ FloatArray = NDArray[np.float64]
 
 LAMBDA = 1e-3
 """Of the distances, as in the paper."""
-LEVELS = (1_000, 4_000)
+N_STEPS = 8
+"""Of the path: a power of two."""
+LEVELS = (4_000, 1_000)
 """Faces of the coarser meshes."""
 ITERATIONS = {"coarse": 1000, "fine": 200}
 """Of the quasi-Newton method, at most."""
@@ -40,8 +42,6 @@ class Geodesic(NamedTuple):
 
     frames: Tensor
     """At even times from 0 to 1, both key-frames included. *Shape:* ``(n + 1, V, 3)``."""
-    energies: list[float]
-    """Of the finest mesh, before and after."""
     iterations: list[int]
     """Of each level."""
 
@@ -52,46 +52,41 @@ class Geodesic(NamedTuple):
         return torch.lerp(self.frames[before], self.frames[before + 1], (place - before)[:, None, None])
 
 
-def geodesic(x_a: Tensor, x_b: Tensor, faces: Tensor, n_steps: int = 8, levels: tuple[int, ...] = LEVELS) -> Geodesic:
+def geodesic(x_a: Tensor, x_b: Tensor, faces: Tensor) -> Geodesic:
     """The path between two key-frames, in the frame of the first; its rigid motion is that of the key-frames.
 
     Args:
         x_a: Key-frame at 0. *Shape:* ``(V, 3)``.
         x_b: Key-frame at 1. *Shape:* ``(V, 3)``.
         faces: Vertex indices. *Shape:* ``(F, 3)``.
-        n_steps: Steps of the path, a power of two.
-        levels: Faces of the coarser meshes, ascending; those with fewer faces in all do not count.
     """
-    if n_steps < 2 or n_steps & (n_steps - 1):
-        raise ValueError(f"n_steps must be a power of two, 2 or more; got {n_steps}")
     scale = CANONICAL_SIZE / (x_a.amax(0) - x_a.amin(0)).norm()
     first, second = x_a.double() * scale, x_b.double() * scale
     back = best_fit(second, first, torch.from_numpy(vertex_areas(first.numpy(), faces.numpy())))
     pairs = []
     ends, own_faces = torch.stack([first, back.apply(second)]), faces
     finest = ends
-    for n_faces in sorted((n for n in levels if n < len(faces)), reverse=True):
+    for n_faces in [n for n in LEVELS if n < len(faces)]:
         pairs.append(ReducedPair(*ends, own_faces, n_faces))
         ends, own_faces = pairs[-1].coarse, pairs[-1].faces
     metric = _Metric(ends, own_faces)
     path, iterations = torch.lerp(ends[0], ends[1], 0.5)[None], []
     while True:
-        path, count, _ = metric.minimise(path, ITERATIONS["coarse"] if pairs else ITERATIONS["fine"])
+        path, count = metric.minimise(path, ITERATIONS["coarse"] if pairs else ITERATIONS["fine"])
         iterations.append(count)
-        if len(path) + 1 == n_steps:
+        if len(path) + 1 == N_STEPS:
             break
         whole = torch.cat([ends[:1], path, ends[1:]])
         path = torch.stack([(whole[:-1] + whole[1:]) / 2, whole[1:]], 1).flatten(0, 1)[:-1]
-    energies = [float("nan")] * 2
     for pair in reversed(pairs):
-        times = (torch.arange(1, n_steps) / n_steps).tolist()
+        times = (torch.arange(1, N_STEPS) / N_STEPS).tolist()
         path = torch.stack([pair.expand(x, t) for x, t in zip(path, times, strict=True)])
         metric = _Metric(pair.fine, pair.fine_faces)
-        path, count, energies = metric.minimise(path, ITERATIONS["fine"])
+        path, count = metric.minimise(path, ITERATIONS["fine"])
         iterations.append(count)
     whole = torch.cat([finest[:1], path, finest[1:]])
-    motion = back.inverse().fraction(torch.linspace(0, 1, n_steps + 1, dtype=torch.float64))
-    return Geodesic((motion.apply(whole) / scale).to(x_a), energies, iterations)
+    motion = back.inverse().fraction(torch.linspace(0, 1, N_STEPS + 1, dtype=torch.float64))
+    return Geodesic((motion.apply(whole) / scale).to(x_a), iterations)
 
 
 class _Metric:
@@ -112,8 +107,8 @@ class _Metric:
         self.areas = np.mean([vertex_areas(x.numpy(), faces.numpy()) for x in ends], axis=0)[:, None, None]
         self.first, self.last = (x.numpy()[:, None] for x in ends)
 
-    def minimise(self, path: Tensor, iterations: int) -> tuple[Tensor, int, list[float]]:
-        """Shapes between the ends, ``(n - 1, V, 3)``; iterations; the energy before and after."""
+    def minimise(self, path: Tensor, iterations: int) -> tuple[Tensor, int]:
+        """Shapes between the ends, ``(n - 1, V, 3)``, and iterations."""
         start = np.ascontiguousarray(path.numpy().transpose(1, 0, 2))
 
         def function(flat: FloatArray) -> tuple[float, FloatArray]:
@@ -123,7 +118,7 @@ class _Metric:
         options = {"maxiter": iterations, "maxfun": 2 * iterations, "maxcor": 20, "ftol": 1e-7, "gtol": 0.0}
         found = minimize(function, start.reshape(-1), jac=True, method="L-BFGS-B", options=options)
         shapes = torch.from_numpy(np.ascontiguousarray(found.x.reshape(start.shape).transpose(1, 0, 2)))
-        return shapes, int(found.nit), [self(start)[0], float(found.fun)]
+        return shapes, int(found.nit)
 
     def __call__(self, path: FloatArray) -> tuple[float, FloatArray]:
         """The energy and its gradient. *Shape:* ``(V, n - 1, 3)``."""

@@ -22,8 +22,9 @@ from itertools import combinations, pairwise
 
 import numpy as np
 import torch
-from cases import DATA
-from threads import limit_threads
+from cases import animal
+from measures import distance_and_edges
+from timing import limit_threads
 from torch import Tensor, nn
 
 import torch_modal as tm
@@ -46,9 +47,8 @@ class Task:
     """A body: what is trained on, what is tested."""
 
     def __init__(self, body: str, n_poses: int, apart: int) -> None:
-        with np.load(DATA / "animals" / f"{body}.npz") as given:
-            frames, self.faces = torch.tensor(given["frames"]).double(), torch.tensor(given["faces"]).long()
-            starts = [*given["clip_starts"].tolist(), len(frames)]
+        frames, self.faces, clips = animal(body)
+        starts = [*(start for _, start, _ in clips), len(frames)]
         frames = best_fit(frames, frames[0].expand_as(frames), torch.ones(frames.shape[1]).double()).apply(frames)
         self.size = float((frames[0].amax(0) - frames[0].amin(0)).norm())
         if apart:
@@ -68,13 +68,6 @@ class Task:
         self.test = frames[rest[np.linspace(0, len(rest) - 1, N_TEST).round().astype(int)]]
         self.poses = frames[places]
         self.edges = torch.tensor(Connectivity(self.faces.numpy()).edges)
-
-    def errors(self, found: Tensor, truth: Tensor) -> tuple[float, float]:
-        """Distance and edges."""
-        i, j = self.edges.T
-        lengths, true = ((x[:, i] - x[:, j]).norm(dim=-1) for x in (found.double(), truth))
-        distance = (found.double() - truth).norm(dim=-1).mean() / self.size
-        return 100 * float(distance), 100 * float(((lengths - true).abs() / true.mean()).mean())
 
     def more(self, arm: str, seed: int) -> tuple[Tensor, Tensor]:
         """Shapes beside the poses, and the weights of the poses' codes for the first of them; others have their own."""
@@ -193,7 +186,8 @@ def tested(task: Task, decoder: nn.Module, codes: Tensor) -> list[float]:
     i, j = torch.tensor(task.pairs).T
     with torch.no_grad():
         middles = decoder(0.5 * (codes[i] + codes[j]))
-        return [*task.errors(task.size * decoder(z), task.test), *task.errors(task.size * middles, task.middles)]
+        pairs = (decoder(z), task.test), (middles, task.middles)
+        return [e for x, y in pairs for e in distance_and_edges(task.size * x.double(), y, task.faces, task.size)]
 
 
 def main() -> None:
@@ -222,9 +216,7 @@ def main() -> None:
     means = {arm: np.exp(np.log(rows).mean(0)) for arm, rows in found.items()}
     for arm, values in means.items():
         print(f"| {arm} | {' | '.join(f'{value:.2f}' for value in values)} |")
-    groups = [
-        [values for arm, values in means.items() if (arm in ("plain", "linear", "ARAPReg")) is old] for old in (1, 0)
-    ]
+    groups = [[values for arm, values in means.items() if (arm in OTHERS) is old] for old in (True, False)]
     if all(groups):
         old, ours = (np.min(group, 0) for group in groups)
         print(f"best of ours over the best of the others: {', '.join(f'{value:.2f}' for value in (ours / old)[:4])}")

@@ -2,22 +2,24 @@
 
 from dataclasses import dataclass
 from functools import cached_property
+from importlib.util import find_spec
 
 import numpy as np
 import torch
-import vtk
 from cases import HALF, Case
 from numpy.typing import NDArray
+from shapes import edge_lengths
 from torch import Tensor
-from vtk.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray, vtk_to_numpy
 
 import torch_modal as tm
 from torch_modal.energy.bend import wrap_angle
 from torch_modal.geometry.canonical import CANONICAL_SIZE
 from torch_modal.geometry.connectivity import Connectivity
+from torch_modal.geometry.crossings import Crossings
 from torch_modal.geometry.rigid import best_fit
 
 NAN = float("nan")
+HAS_CONTACT = all(find_spec(name) for name in ("ipctk", "igl"))
 FLAT = 1e-3  # volumes below this part of (surface area)^(3/2) are not compared; a sphere has 0.094
 
 
@@ -44,7 +46,7 @@ class Row:
     folds: float = NAN
     """Hinges bent by more than a right angle beyond what they are in either key-frame."""
     crossings: float = NAN
-    """Faces that go through others they did not go through in either key-frame."""
+    """Faces that go through others they did not go through in either key-frame; NaN without the extra ``contact``."""
     seconds: float = NAN
     """Processor time of one in-between."""
     note: str = ""
@@ -52,26 +54,8 @@ class Row:
 
 def crossing_pairs(x: Tensor, faces: Tensor) -> NDArray[np.int64]:
     """Pairs of faces that intersect; faces that share a vertex are no pair. *Shape:* ``(n, 2)``."""
-    triangles = faces.numpy()
-    points = vtk.vtkPoints()
-    points.SetData(numpy_to_vtk(np.ascontiguousarray(x.double().numpy()), deep=True))
-    cells = vtk.vtkCellArray()
-    cells.SetData(3, numpy_to_vtkIdTypeArray(np.ascontiguousarray(triangles).ravel(), deep=True))
-    surface = vtk.vtkPolyData()
-    surface.SetPoints(points)
-    surface.SetPolys(cells)
-    find = vtk.vtkCollisionDetectionFilter()
-    find.SetCollisionModeToAllContacts()
-    find.SetBoxTolerance(0.0)
-    find.SetCellTolerance(0.0)
-    for port in (0, 1):  # against itself
-        find.SetInputData(port, surface)
-        find.SetTransform(port, vtk.vtkTransform())
-    find.Update()
-    pairs = np.stack([vtk_to_numpy(find.GetContactCells(port)).astype(np.int64) for port in (0, 1)], axis=1)
-    pairs = np.unique(np.sort(pairs, axis=1), axis=0)
-    first, second = (triangles[side] for side in pairs.T)
-    return pairs[~(first[:, :, None] == second[:, None, :]).any((1, 2))]
+    shape = x.double().numpy()
+    return np.sort(Crossings(Connectivity(faces.numpy(), len(shape)), shape[None]).pairs(shape), axis=1)
 
 
 class Yardstick:
@@ -79,7 +63,6 @@ class Yardstick:
 
     def __init__(self, case: Case) -> None:
         self.case = case
-        self.edges = torch.tensor(Connectivity(case.faces.numpy()).edges)
         used = case.x_a[case.faces.unique()]
         self.scale = CANONICAL_SIZE / torch.linalg.norm(used.amax(0) - used.amin(0))
         self.shell = tm.ShellEnergy(case.faces)
@@ -101,7 +84,8 @@ class Yardstick:
         if self.has_volume:
             row.volume = self.volume(x) / self.usual_volume
         row.folds = float(self.folded(x).sum())
-        row.crossings = float(len(np.unique(self.new_crossings(x))))
+        if HAS_CONTACT:
+            row.crossings = float(len(np.unique(self.new_crossings(x))))
         if truth is not None:
             row.edge_error = self.edge_error(x, HALF)
             laid = self.laid(x, truth)
@@ -118,8 +102,7 @@ class Yardstick:
 
     def lengths(self, x: Tensor) -> Tensor:
         """*Shape:* ``(V, 3) -> (E,)``."""
-        i, j = self.edges.T
-        return torch.linalg.norm(x[i] - x[j], dim=1)
+        return edge_lengths(x, self.case.faces)
 
     def energy(self, x: Tensor) -> float:
         """What an in-between at t = 1/2 minimises."""
@@ -182,3 +165,10 @@ def mean_ratio(found: Tensor, wanted: Tensor) -> float:
     """Mean of ``|found - wanted| / wanted``; edges without a length do not count."""
     some = wanted > 0
     return float(((found - wanted).abs()[some] / wanted[some]).mean())
+
+
+def distance_and_edges(found: Tensor, truth: Tensor, faces: Tensor, size: float) -> tuple[float, float]:
+    """Mean distance of vertices over a size, and mean error of edges over their mean length, in percent."""
+    lengths, true = (edge_lengths(x, faces) for x in (found, truth))
+    distance = (found - truth).norm(dim=-1).mean() / size
+    return 100 * float(distance), 100 * float((lengths - true).abs().mean() / true.mean())

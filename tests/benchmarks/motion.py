@@ -17,7 +17,7 @@ from statistics import fmean
 from measures import NAN
 from motion_measures import Measured
 from motions import MOTIONS
-from tables import number
+from tables import head, number
 
 
 def print_motion(measured: Measured) -> None:
@@ -64,8 +64,8 @@ def print_costs(measured: Measured) -> None:
     print(f"| {measured.motion.name} | {single:.2f} | {sequence:.2f} |", flush=True)
 
 
-COSTS = "| motion | one shape, over the pair's | sequence |"
-TABLE = "| motion | measure | smooth | pair | smooth over pair | truth |"
+COSTS = ("motion", "one shape, over the pair's", "sequence")
+TABLE = ("motion", "measure", "smooth", "pair", "smooth over pair", "truth")
 
 
 def main() -> None:
@@ -74,9 +74,8 @@ def main() -> None:
     parser.add_argument("motions", nargs="*", help=f"of {', '.join(MOTIONS)}; default: all")
     parser.add_argument("--costs", action="store_true", help="costs alone")
     args = parser.parse_args()
-    head, row = (COSTS, print_costs) if args.costs else (TABLE, print_motion)
-    print(head)
-    print("|---" * (head.count("|") - 1) + "|")
+    columns, row = (COSTS, print_costs) if args.costs else (TABLE, print_motion)
+    print(head(*columns))
     for name in args.motions or MOTIONS:
         for motion in MOTIONS[name]():
             row(Measured(motion))

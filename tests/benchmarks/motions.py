@@ -10,10 +10,8 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from cases import DATA, KeyframeSet
+from cases import KeyframeSet, keyframes_of
 from torch import Tensor
-
-import torch_modal as tm
 
 sys.path.append(str(Path(__file__).parents[2] / "examples"))
 import make_samples
@@ -98,11 +96,10 @@ def grip() -> Iterator[Motion]:
 
 def hand_path() -> Iterator[Motion]:
     """The rigged hand that closes; its frames are an even motion."""
-    folder = DATA / "mh-hand-path"
-    if not folder.is_dir():
-        print(f"(without {folder.name}: the folder {folder} is not there)")
+    found = keyframes_of("mh-hand-path")
+    if found is None:
         return
-    frames, faces = tm.load_keyframes([folder / f"{i:02}.obj" for i in range(9)])
+    frames, faces = found
     for kept in ((0, 2, 4, 6, 8), (0, 4, 8)):
         rest = tuple(float(i) for i in range(9) if i not in kept)
         name = "mh-hand-path " + ",".join(map(str, kept))
@@ -112,13 +109,10 @@ def hand_path() -> Iterator[Motion]:
 
 def unrelated() -> Iterator[Motion]:
     """Poses of a hand that are no motion; without a truth."""
-    folder = DATA / "mh-hand"
-    if not folder.is_dir():
-        print(f"(without {folder.name}: the folder {folder} is not there)")
-        return
-    keyframes, faces = tm.load_keyframes(sorted(folder.glob("0[0-4]*.obj")))
-    times = tuple(float(i) for i in range(len(keyframes)))
-    yield Motion("mh-hand 00-04, no motion", KeyframeSet(keyframes, faces), times, fractions(times, 0.25, 0.5), None)
+    found = keyframes_of("mh-hand")
+    if found is not None:
+        times = tuple(float(i) for i in range(len(found[0])))
+        yield Motion("mh-hand 00-04, no motion", KeyframeSet(*found), times, fractions(times, 0.25, 0.5), None)
 
 
 MOTIONS: dict[str, Callable[[], Iterator[Motion]]] = {

@@ -27,9 +27,9 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from cases import DATA
+from cases import DATA, animal
 from scipy.cluster.vq import kmeans2
-from threads import limit_threads
+from timing import limit_threads
 from torch import Tensor, nn
 
 import torch_modal as tm
@@ -70,8 +70,7 @@ def load(body: str) -> Task:
         x, faces = torch.tensor(np.stack([made.frame(t) for t in times])), torch.tensor(made.faces).long()
         parts = torch.tensor(parts_of(sample, x[0].numpy()))
     else:
-        with np.load(DATA / "animals" / f"{body}.npz") as given:
-            x, faces = torch.tensor(given["frames"]).double(), torch.tensor(given["faces"]).long()
+        x, faces, _ = animal(body)
         parts = co_moving(x[:: max(1, len(x) // N_FRAMES)], faces)
     x = best_fit(x, x[0].expand_as(x), torch.ones(x.shape[1]).to(x)).apply(x)
     return Task(x.float(), faces, parts, farthest_points(x[0], N_LANDMARKS, first=0))

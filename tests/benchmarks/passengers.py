@@ -10,19 +10,17 @@ of edges against the mean of both ends.
 
 import argparse
 import time
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 import trimesh
-from threads import limit_threads
+from measures import edge_lengths, mean_ratio
+from timing import limit_threads, timed
 from torch import Tensor
 
 import torch_modal as tm
 from torch_modal.data.samples import load_sample
-from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.passengers.proxy import Proxy
 
 RELIEF, WAVES = 0.004, 60
@@ -42,16 +40,6 @@ def relief(levels: int) -> tuple[Tensor, Tensor]:
     return torch.from_numpy(rough), torch.from_numpy(faces)
 
 
-def seconds(run: Callable[[], Any], repeats: int = 3) -> float:
-    """Least process time."""
-    found = []
-    for _ in range(repeats):
-        start = time.process_time()
-        run()
-        found.append(time.process_time() - start)
-    return min(found)
-
-
 def fine_meshes(levels: int, n_proxy: int, picture: Path | None) -> None:
     """The proxy against the whole."""
     keyframes, faces = relief(levels)
@@ -66,14 +54,12 @@ def fine_meshes(levels: int, n_proxy: int, picture: Path | None) -> None:
         return proxy.carried(torch.stack([proxy.keyframes[0], between, proxy.keyframes[1]]), [0, 2], keyframes)
 
     with torch.no_grad():
-        found, full = carried(), whole(*keyframes, 0.5)
-        times = seconds(carried), seconds(lambda: whole(*keyframes, 0.5))
+        (found, own_time), (full, whole_time) = timed(carried), timed(lambda: whole(*keyframes, 0.5))
     diagonal = float((keyframes[0].amax(0) - keyframes[0].amin(0)).norm())
-    i, j = torch.tensor(Connectivity(faces.numpy()).edges).unbind(1)
-    ends, own, others = ((x[..., i, :] - x[..., j, :]).norm(dim=-1) for x in (keyframes, found[1], full))
-    errors = [float((x / ends.mean(0) - 1).abs().mean()) for x in (own, others)]
+    lengths = edge_lengths(keyframes, faces).mean(0)
+    errors = [mean_ratio(edge_lengths(x, faces), lengths) for x in (found[1], full)]
     print(f"{keyframes.shape[1]} vertices, proxy of {proxy.keyframes.shape[1]}, set-up {set_up:.1f} s")
-    print(f"an in-between: {times[0]:.2f} s, whole mesh {times[1]:.2f} s, ratio {times[0] / times[1]:.2f}")
+    print(f"an in-between: {own_time:.2f} s, whole mesh {whole_time:.2f} s, ratio {own_time / whole_time:.2f}")
     distance = 100 * float((found[1] - full).norm(dim=-1).mean()) / diagonal
     print(f"distance to the whole solve {distance:.3f} %; edge error over the whole's {errors[0] / errors[1]:.2f}")
     print(f"key-frames bit for bit: {torch.equal(found[::2], keyframes)}")
@@ -100,8 +86,8 @@ def many_points(n: int) -> None:
             own(leaf).square().sum().backward()
 
         with torch.no_grad():
-            forward = seconds(lambda own=own, shape=shape: own(shape))  # type: ignore[misc]
-        print(f"  {str(dtype)[6:]}: forward {forward:.2f} s, with gradient {seconds(with_gradient):.2f} s")
+            forward = timed(lambda own=own, shape=shape: own(shape))[1]  # type: ignore[misc]
+        print(f"  {str(dtype)[6:]}: forward {forward:.2f} s, with gradient {timed(with_gradient)[1]:.2f} s")
 
 
 def main() -> None:

@@ -23,7 +23,7 @@ from typing import NamedTuple
 import numpy as np
 from capture import table
 from numpy.typing import NDArray
-from threads import limit_threads
+from timing import limit_threads
 
 import torch_modal as tm
 from torch_modal.geometry.connectivity import Connectivity

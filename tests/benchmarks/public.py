@@ -37,10 +37,11 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from cases import DATA, Case, KeyframeSet
+from cases import DATA, Case, KeyframeSet, animal
 from methods import Outcome, UnavailableError, by_peer, peer_python
 from scipy.interpolate import CubicHermiteSpline
-from threads import limit_threads
+from tables import head
+from timing import limit_threads
 from torch import Tensor
 
 import torch_modal as tm
@@ -79,11 +80,9 @@ class Clip(NamedTuple):
 def clips(bodies: list[str], sequences: list[Path], step: int) -> Iterator[Clip]:
     """All of them, cut after the last frame that is given."""
     for body in bodies:
-        with np.load(DATA / "animals" / f"{body}.npz") as stored:
-            frames, faces = torch.tensor(stored["frames"]).double(), torch.tensor(stored["faces"]).long()
-            parts = zip(stored["clip_names"], stored["clip_starts"], stored["clip_lengths"], strict=True)
-            for name, start, length in parts:
-                yield from cut(body, str(name), frames[start : start + length], faces, step)
+        frames, faces, parts = animal(body)
+        for name, start, end in parts:
+            yield from cut(body, name, frames[start:end], faces, step)
     for sequence in sequences:
         if sequence.is_dir():
             files = sorted(file for file in sequence.iterdir() if file.suffix.lower() in (".ply", ".obj"))
@@ -280,7 +279,7 @@ def export(folder: Path, given: Iterable[Clip]) -> None:
 def table(title: str, rows: dict[str, list[dict[str, float]]]) -> None:
     """Means over clips."""
     names = list(next(iter(rows.values()))[0])
-    print(f"\n| {title} | {' | '.join(names)} |\n|---{'|---' * len(names)}|")
+    print(f"\n{head(title, *names)}")
     for method, values in rows.items():
         means = (np.mean([value[name] for value in values]) for name in names)
         print(f"| {method} | {' | '.join(f'{mean:.3g}' for mean in means)} |", flush=True)

@@ -8,9 +8,9 @@ import scipy.sparse as sp
 import scipy.sparse.linalg as spla
 
 from torch_modal.geometry.sparse import factorize
-from torch_modal.precompute.embedding import closest_tetrahedra
-from torch_modal.precompute.stiffness import hat_gradients
-from torch_modal.precompute.tetrahedra import Tetrahedra, tet_volumes
+from torch_modal.modes.embedding import closest_tetrahedra
+from torch_modal.modes.stiffness import hat_gradients
+from torch_modal.modes.tetrahedra import Tetrahedra, tet_volumes
 
 EDGES = tuple(itertools.combinations(range(4), 2))
 N_RIGID = 6

@@ -1,6 +1,6 @@
 """How good in-betweens are: the methods of this package, linear interpolation, and peers, side by side.
 
-    python tests/benchmarks/quality.py [FOLDER ...] [--shared] [--samples] [--bodies] [--irregular]
+    python tests/benchmarks/quality.py [FOLDER ...] [--shared] [--samples] [--bodies]
 
 A folder holds the frames of a motion, in the order of their names: the first and the last are the key-frames, those
 between are the truth at their places. Two frames alone have no truth, and then only energies, drift and volumes are
@@ -21,10 +21,9 @@ import torch
 from cases import HALF, Case
 from measures import Row, Yardstick
 from methods import METHODS, Method, UnavailableError
-from sheet import draw_bars, draw_sheet
+from sheet import draw_sheet
 from tables import case_table, load_rows, markdown, save_rows
-from threads import limit_threads
-from timing import untimed
+from timing import limit_threads, untimed
 
 REFERENCE = "full"
 """The method whose optimum tells which way faces look where there is no truth; it comes first."""
@@ -78,8 +77,6 @@ def chosen_cases(arguments: argparse.Namespace) -> Iterator[Case]:
         yield from cases.samples()
     if arguments.bodies:
         yield from cases.bodies()
-    if arguments.irregular:
-        yield from cases.bodies(jittered=True)
     yield from cases.bodies(arguments.body)
 
 
@@ -90,19 +87,17 @@ def parse(words: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--shared", action="store_true", help="all data sets that are kept beside the project")
     parser.add_argument("--samples", action="store_true", help="the samples that come with the package")
     parser.add_argument("--bodies", action="store_true", help="bars, hollow and slender bodies, a sheet")
-    parser.add_argument("--irregular", action="store_true", help="the same with irregular triangles")
     parser.add_argument("--body", nargs="+", default=[], metavar="NAME", help="others, such as 'bar bent 270'")
     parser.add_argument("--methods", nargs="+", choices=list(METHODS), default=list(METHODS), metavar="NAME")
     parser.add_argument("--only", nargs="+", default=[""], metavar="TEXT", help="only cases with one of these in them")
     parser.add_argument("--peer-python", type=Path, metavar="FILE", help="a Python that has morphomatics")
     parser.add_argument("--results", type=Path, metavar="FILE.json", help="keep results, and go on from those there")
     parser.add_argument("--markdown", type=Path, metavar="FILE.md", help="write all tables")
-    parser.add_argument("--bars", type=Path, metavar="FILE.png", help="draw the errors as bars")
     parser.add_argument("--sheet", type=Path, metavar="FILE.png", help="draw the shapes, coloured by their edge errors")
     arguments = parser.parse_args(words)
-    named = ("folders", "shared", "samples", "bodies", "irregular", "body")
+    named = ("folders", "shared", "samples", "bodies", "body")
     if not any(getattr(arguments, name) for name in named):
-        parser.error("name a folder of frames, or --shared, --samples, --bodies, --irregular or --body")
+        parser.error("name a folder of frames, or --shared, --samples, --bodies or --body")
     return arguments
 
 
@@ -133,8 +128,6 @@ def main(words: Sequence[str] | None = None) -> None:
     print(text)
     if arguments.markdown:
         arguments.markdown.write_text(text)
-    if arguments.bars:
-        draw_bars(shown, arguments.bars)
     if arguments.sheet:
         draw_sheet(drawn, arguments.sheet)
 

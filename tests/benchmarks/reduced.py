@@ -16,8 +16,7 @@ from torch import Tensor
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.poisson import Reconstruction
 from torch_modal.geometry.rigid import best_fit, blend
-from torch_modal.geometry.triangle_frames import Sides
-from torch_modal.precompute.coarsening import coarsen
+from torch_modal.modes.coarsening import coarsen
 
 FLAT = 1e-6
 """Of the mean area."""
@@ -63,9 +62,9 @@ class ReducedPair:
     def expand(self, shape: Tensor, t: float) -> Tensor:
         """The fine shape of a coarse one at a time. *Shape:* ``(V_coarse, 3) -> (V, 3)``."""
         wanted = [self._turned(coarse, shape, end) for end, coarse in zip(self.fine, self.coarse, strict=True)]
-        sides = Sides(*(torch.lerp(a, b, t).T[:, None].contiguous() for a, b in zip(*wanted, strict=True)))
+        first, second = (torch.lerp(a, b, t).T[:, None].contiguous() for a, b in zip(*wanted, strict=True))
         rest = torch.lerp(*self.fine, t).T[:, None].contiguous()
-        found = self.reconstruction(sides, rest)[:, 0].T
+        found = self.reconstruction((first, second), rest)[:, 0].T
         return found + (shape - found[self.chosen]).mean(0)
 
     def _turned(self, coarse: Tensor, shape: Tensor, end: Tensor) -> tuple[Tensor, Tensor]:

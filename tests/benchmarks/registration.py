@@ -101,12 +101,12 @@ def damaged(
     return surface.vertices, surface.faces
 
 
-def five_marks(rest: FloatArray, faces: IntArray, truth: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Five points spread over the template, and where they belong: what a person would pick."""
+def five_marks(rest: FloatArray, faces: IntArray, truth: FloatArray) -> FloatArray:
+    """Five points spread over the template, and where they belong: what a person would pick. *Shape:* ``(5, 2, 3)``."""
     surface = MeshSurface(rest, faces)
     shape = SpectralShape(surface)
     chosen = surface.nearest_alike(shape.placed.vertices, shape.coarse.vertex_normals)[shape.farthest_points(5)[0]]
-    return rest[chosen], truth[chosen]
+    return np.stack([rest[chosen], truth[chosen]], axis=1)
 
 
 class Case(NamedTuple):
@@ -211,7 +211,7 @@ def across() -> dict[str, Any]:
     """An animal on one of other proportions and tessellation, by eight landmarks; other places are held out."""
     (first, first_faces, cones), (second, second_faces, second_cones) = animal("slender"), animal("stout")
     here, there = MeshSurface(first, first_faces), MeshSurface(second, second_faces)
-    marks = here.closest(tips(cones)).points, there.closest(tips(second_cones)).points
+    marks = np.stack([here.closest(tips(cones)).points, there.closest(tips(second_cones)).points], axis=1)
     others, places = here.closest(held_out(cones)), there.closest(held_out(second_cones)).points
     return laid("slender animal on stout animal", here, there, marks, lambda x: here.rows(others) @ x - places)
 

@@ -1,49 +1,16 @@
-"""Pictures of results: errors as bars, and shapes coloured by the errors of their edges."""
+"""Pictures of results: shapes coloured by the errors of their edges."""
 
-import math
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import numpy as np
 import torch
 from cases import HALF, Case
-from measures import Row, Yardstick
+from measures import Yardstick
 
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
+from torch_modal.geometry.connectivity import Connectivity
 
-LEAST = 0.01  # per cent, where the axis of the bars begins
 WORST = 0.2  # relative edge error at the end of the colour scale
-
-
-def draw_bars(rows: list[Row], path: Path) -> None:
-    """Edge errors (drift without a truth) of all methods, a group of bars for each case, on a logarithmic axis."""
-    names = list(dict.fromkeys(row.case for row in rows))
-    methods = [name for name in dict.fromkeys(row.method for row in rows) if name != "truth"]
-    figure, axes = plt.subplots(figsize=(max(8, 1.1 * len(names)), 5.5), layout="constrained")
-    width = 0.85 / len(methods)
-    for i, method in enumerate(methods):
-        value = {row.case: row.edge_error for row in rows if row.method == method}
-        drift = {row.case: row.edge_drift for row in rows if row.method == method}
-        heights = [
-            value.get(n, math.nan) if math.isfinite(value.get(n, math.nan)) else drift.get(n, math.nan) for n in names
-        ]
-        axes.bar(np.arange(len(names)) + i * width, 100 * np.array(heights), width, label=method)
-    known = {row.case for row in rows if math.isfinite(row.edge_error)}
-    axes.set_xticks(
-        np.arange(len(names)) + 0.4, [n if n in known else f"{n} *" for n in names], rotation=40, ha="right"
-    )
-    axes.set(yscale="log", ylim=(LEAST, None), ylabel="mean edge-length error, % (* no truth: against mean lengths)")
-    axes.legend(ncols=4, fontsize="small")
-    axes.grid(axis="y", alpha=0.3)
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
-
-
-def bar_height(row: Row) -> float:
-    """The error, or the drift where there is no truth."""
-    return row.edge_error if math.isfinite(row.edge_error) else row.edge_drift
 
 
 def draw_sheet(drawn: list[tuple[Case, dict[str, torch.Tensor]]], path: Path) -> None:
@@ -70,7 +37,7 @@ def draw_sheet(drawn: list[tuple[Case, dict[str, torch.Tensor]]], path: Path) ->
             x = yardstick.laid(shapes[name], guide)
             error = (yardstick.lengths(x) - wanted).abs() / wanted
             polygons = pyvista.PolyData.from_regular_faces(x.numpy(), case.faces.numpy())
-            polygons["error"] = around_vertices(error, yardstick.edges, len(x))
+            polygons["error"] = around_vertices(error, Connectivity(case.faces.numpy()).edges, len(x))
             plotter.add_mesh(polygons, clim=(0, WORST), cmap="YlOrRd", show_scalar_bar=False, smooth_shading=False)
             text = f"{name}  {100 * float(error.mean()):.1f} %\n{case.name}"
             plotter.add_text(text, position=(6, 206), font_size=6)
@@ -79,10 +46,10 @@ def draw_sheet(drawn: list[tuple[Case, dict[str, torch.Tensor]]], path: Path) ->
     plotter.close()
 
 
-def around_vertices(error: torch.Tensor, edges: torch.Tensor, n_vertices: int) -> np.ndarray:
+def around_vertices(error: torch.Tensor, edges: np.ndarray, n_vertices: int) -> np.ndarray:
     """Mean over the edges of each vertex. *Shape:* ``(E,), (E, 2) -> (V,)``."""
     total, count = torch.zeros(2, n_vertices, dtype=error.dtype)
-    for end in edges.T:
+    for end in torch.tensor(edges).T:
         total.index_add_(0, end, error)
         count.index_add_(0, end, torch.ones_like(error))
     return (total / count.clamp_min(1)).numpy()

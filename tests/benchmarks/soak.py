@@ -1,6 +1,6 @@
 """Does anything ever fail on a healthy mesh? Many perturbed pairs of key-frames, and what went wrong.
 
-    nice python tests/benchmarks/soak.py [--n 300] [--mesher NAME] [--preset NAME] [--seed 0] [--data DIR]
+    nice python tests/benchmarks/soak.py [--n 300] [--mesher NAME] [--preset NAME] [--seed 0]
 
 Each takes two key-frames of a sample or of the data beside the project, decimates them alike to a random number of
 faces, turns and perturbs their vertices by a small part of the edges, and asks for the bases of both, 5 to 60 modes,
@@ -17,14 +17,13 @@ import sys
 import time
 import warnings
 from collections import Counter
-from pathlib import Path
 
 import numpy as np
 import torch
-from cases import DATA
+from cases import DATA, animal, keyframes_of
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from threads import limit_threads
+from timing import limit_threads
 from tqdm import tqdm
 from wild import FELL_BACK, WORSE, straight
 
@@ -32,8 +31,8 @@ import torch_modal as tm
 from torch_modal.errors import MeshError
 from torch_modal.geometry.canonical import CANONICAL_SIZE
 from torch_modal.inbetween.settings import PRESETS
-from torch_modal.precompute.coarsening import coarsen
-from torch_modal.precompute.extract import MESHERS
+from torch_modal.modes.coarsening import coarsen
+from torch_modal.modes.extract import MESHERS
 from torch_modal.solve.minimise import Status
 
 FloatArray = NDArray[np.float64]
@@ -45,21 +44,12 @@ WORST = 0.01
 """Part of the elements that is left out."""
 
 
-def sources(data: Path) -> dict[str, tuple[FloatArray, IntArray]]:
+def sources() -> dict[str, tuple[FloatArray, IntArray]]:
     """Key-frames of all shapes at hand."""
-    samples = Path(tm.__file__).parent / "samples"
-    files = {name: sorted((samples / name).glob("key-*.ply")) for name in ("creature", "hand")}
-    found = {}
-    if data.is_dir():
-        for name in ("mh-hand-path", "mh-woman", "mh-hand", "ict-face", "hyper-cube"):
-            files[name] = sorted((data / name).glob("*.obj"))
-        for file in sorted((data / "animals").glob("*.npz")):
-            stored = np.load(file)
-            found[file.stem] = stored["frames"].astype(np.float64), stored["faces"].astype(np.int64)
-    for name, own in files.items():
-        keyframes, faces = tm.load_keyframes(own)
-        found[name] = keyframes.numpy(), faces.numpy()
-    return found
+    folders = ("mh-hand-path", "mh-woman", "mh-hand", "ict-face", "hyper-cube")
+    found = {file.stem: animal(file.stem)[:2] for file in sorted((DATA / "animals").glob("*.npz"))}
+    found |= {name: own for name in ("creature", "hand", *folders) if (own := keyframes_of(name))}
+    return {name: (keyframes.numpy(), faces.numpy()) for name, (keyframes, faces) in found.items()}
 
 
 def draw(keyframes: FloatArray, faces: IntArray, random: np.random.Generator) -> tuple[FloatArray, IntArray]:
@@ -102,11 +92,10 @@ def main() -> int:
     parser.add_argument("--mesher", choices=MESHERS, help="in the place of the default")
     parser.add_argument("--preset", choices=[name for name in PRESETS if name != "paper"], default="accurate")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--data", type=Path, default=DATA, help="more, if it is there")
     arguments = parser.parse_args()
     warnings.simplefilter("ignore")
     random = np.random.default_rng(arguments.seed)
-    shapes = sources(arguments.data)
+    shapes = sources()
     chosen = {} if arguments.mesher is None else {"mesher": arguments.mesher}
     errors: Counter[str] = Counter()
     statuses: Counter[str] = Counter()

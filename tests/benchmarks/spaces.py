@@ -16,13 +16,12 @@ from collections.abc import Iterator
 
 import numpy as np
 import torch
-from cases import DATA
-from threads import limit_threads
+from cases import DATA, animal, keyframes_of
+from measures import distance_and_edges
+from timing import limit_threads
 from torch import Tensor
 
 import torch_modal as tm
-from torch_modal.data.samples import load_sample
-from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.rigid import best_fit
 
 ANIMALS = ("fox", "husky", "cow", "trex", "velociraptor", "frog")
@@ -35,15 +34,10 @@ def sets(names: list[str]) -> Iterator[tuple[str, Tensor, Tensor]]:
     """Name, poses and faces of each; of the animals eight poses, even over all of their clips."""
     for name in names:
         if name in ANIMALS:
-            with np.load(DATA / "animals" / f"{name}.npz") as given:
-                frames, faces = given["frames"], given["faces"]
-            places = np.linspace(0, len(frames) - 1, N_POSES).round().astype(int)
-            yield name, torch.tensor(frames[places]).double(), torch.tensor(faces).long()
-        elif name in FOLDERS:
-            yield name, *tm.load_keyframes(sorted((DATA / name).glob("*.obj")))
-        else:
-            sample = load_sample(name)  # type: ignore[arg-type]
-            yield name, sample.keyframes, sample.faces
+            frames, faces, _ = animal(name)
+            yield name, frames[np.linspace(0, len(frames) - 1, N_POSES).round().astype(int)], faces
+        elif found := keyframes_of(name):
+            yield name, *found
 
 
 def moved(x: Tensor, to: Tensor, picked: Tensor) -> Tensor:
@@ -61,17 +55,12 @@ def markers(x: Tensor) -> Tensor:
     return torch.tensor(found)
 
 
-def errors(x: Tensor, truth: Tensor, edges: Tensor) -> tuple[float, float]:
+def errors(x: Tensor, truth: Tensor, faces: Tensor) -> tuple[float, float]:
     """Distance, and error of edges, in percent."""
-    lengths, true = ((y[edges[:, 0]] - y[edges[:, 1]]).norm(dim=-1) for y in (x, truth))
-    diagonal = (truth.amax(0) - truth.amin(0)).norm()
-    return (
-        100 * float((x - truth).norm(dim=-1).mean() / diagonal),
-        100 * float((lengths - true).abs().mean() / true.mean()),
-    )
+    return distance_and_edges(x, truth, faces, float((truth.amax(0) - truth.amin(0)).norm()))
 
 
-def linear(poses: Tensor, truth: Tensor, picked: Tensor, edges: Tensor) -> tuple[float, float]:
+def linear(poses: Tensor, truth: Tensor, picked: Tensor, faces: Tensor) -> tuple[float, float]:
     """Of the linear span, with the best ridge."""
     everywhere = torch.arange(len(truth))
     poses = moved(poses, moved(poses, poses[0], everywhere).mean(0), everywhere)
@@ -89,11 +78,11 @@ def linear(poses: Tensor, truth: Tensor, picked: Tensor, edges: Tensor) -> tuple
             wanted = back - mean[picked]
             right = columns.mT @ ((wanted - wanted.mean(0)).flatten() / size)
             x = mean + torch.einsum("k,kvc->vc", torch.linalg.solve(system, right), off)
-        found.append(errors(moved(x, truth, picked), truth, edges))
+        found.append(errors(moved(x, truth, picked), truth, faces))
     return min(found)
 
 
-def by_components(space: tm.ShapeSpace, poses: Tensor, truth: Tensor, edges: Tensor) -> tuple[float, float]:
+def by_components(space: tm.ShapeSpace, poses: Tensor, truth: Tensor, faces: Tensor) -> tuple[float, float]:
     """Distance of a pose from its projections to all components: of rotations and strains, and of displacements."""
     everywhere = torch.arange(len(truth))
     components = space.components()
@@ -103,7 +92,7 @@ def by_components(space: tm.ShapeSpace, poses: Tensor, truth: Tensor, edges: Ten
     off = (truth - poses.mean(0)).flatten()
     weights = torch.linalg.lstsq(left.mT, off[:, None], driver="gelsd").solution
     straight = poses.mean(0) + (left.mT @ weights).view_as(truth)
-    return errors(own, truth, edges)[0], errors(straight, truth, edges)[0]
+    return errors(own, truth, faces)[0], errors(straight, truth, faces)[0]
 
 
 def coverage(space: tm.ShapeSpace, poses: Tensor, truth: Tensor, n: int) -> tuple[float, float, int, float, float]:
@@ -157,7 +146,6 @@ def main() -> None:
     all_covered: list[tuple[float, ...]] = []
     seconds = []
     for name, poses, faces in sets(arguments.sets):
-        edges = torch.tensor(Connectivity(faces.numpy(), poses.shape[1]).edges)
         bases = tm.extract_bases(poses, faces, arguments.modes)
         rows: dict[str, list[tuple[float, float]]] = defaultdict(list)
         covered = []
@@ -169,10 +157,10 @@ def main() -> None:
             start = time.process_time()
             found = space.fit(truth[picked], picked)
             seconds.append(time.process_time() - start)
-            rows["fit"].append(errors(found.shape, truth, edges))
-            rows["linear"].append(linear(others, truth, picked, edges))
-            rows["nearest"].append(min(errors(x, truth, edges) for x in moved(others, truth, picked)))
-            rows["components"].append(by_components(space, others, truth, edges))
+            rows["fit"].append(errors(found.shape, truth, faces))
+            rows["linear"].append(linear(others, truth, picked, faces))
+            rows["nearest"].append(min(errors(x, truth, faces) for x in moved(others, truth, picked)))
+            rows["components"].append(by_components(space, others, truth, faces))
             if arguments.draws:
                 covered.append(coverage(space, others, truth, arguments.draws))
         row(f"{name}, {len(poses)}", rows, covered)

@@ -2,11 +2,13 @@
 
     python tests/benchmarks/speed.py [--before CHECKOUT] [--peer-python FILE] [--rounds 3]
     python tests/benchmarks/speed.py --parts growth first
+    python tests/benchmarks/speed.py --parts batches [--device cuda]
 
 Each side runs in processes of its own, on one thread, in turns; what is told are ratios of processor seconds, the best
 of all rounds, so that what else a machine does slows all sides. ``--before`` names the folder of another checkout, for
 example of an earlier commit. Bases are there before the clock starts, but for ``--parts first``: from two new
-key-frames to a sequence with nothing cached, on the clock.
+key-frames to a sequence with nothing cached, on the clock. ``--parts batches`` compares batches, forward and with their
+gradients, with single calls.
 """
 
 import argparse
@@ -26,7 +28,7 @@ import torch
 import trimesh
 from cases import Case, samples, shared
 from methods import UnavailableError, by_peer, peer_python
-from threads import limit_threads
+from timing import limit_threads, timed
 
 import torch_modal as tm
 from torch_modal.data.samples import load_sample
@@ -50,17 +52,6 @@ def solvers(backend: str) -> list[tm.Solver]:
     return [tm.Solver(**chosen), tm.Solver(local_steps=0, **chosen)]
 
 
-def seconds(work: Callable[[], Any], repeats: int) -> float:
-    """Of the processor: the best of several calls after one that does not count."""
-    work()
-    best = float("inf")
-    for _ in range(repeats):
-        start = time.process_time()
-        work()
-        best = min(best, time.process_time() - start)
-    return best
-
-
 def worker(name: str, backend: str, answer: str) -> None:
     """One side of one case: seconds, and what came out."""
     limit_threads()
@@ -75,7 +66,7 @@ def worker(name: str, backend: str, answer: str) -> None:
             return tm.Path(bases, faces, cyclic=True, solver=solvers(backend)[0])
 
         with torch.no_grad():
-            found = {"193 shapes": seconds(lambda: path(sample.keyframes, t), 2), "making a path": seconds(make, 3)}
+            found = {"193 shapes": timed(lambda: path(sample.keyframes, t))[1], "making a path": timed(make)[1]}
             np.savez(answer, shape=path(sample.keyframes, t).numpy(), gradient=0, **found)
         return
     case = all_cases()[name]
@@ -88,12 +79,12 @@ def worker(name: str, backend: str, answer: str) -> None:
         return found
 
     found: dict[str, Any] = {
-        "forward and backward": seconds(backward, 3),
-        "making a layer": seconds(lambda: tm.InBetween(bases, case.faces, solver=solvers(backend)[0]), 3),
+        "forward and backward": timed(backward)[1],
+        "making a layer": timed(lambda: tm.InBetween(bases, case.faces, solver=solvers(backend)[0]))[1],
     }
     with torch.no_grad():
-        found["whole"] = seconds(lambda: layer(x_a, x_b, 0.5), 8)
-        found["without local steps"] = seconds(lambda: modal(x_a, x_b, 0.5), 8)
+        found["whole"] = timed(lambda: layer(x_a, x_b, 0.5))[1]
+        found["without local steps"] = timed(lambda: modal(x_a, x_b, 0.5))[1]
         shape = layer(x_a, x_b, 0.5).numpy() / float((x_a.amax(0) - x_a.amin(0)).norm())
     np.savez(answer, shape=shape, gradient=backward().numpy(), **found)
 
@@ -157,12 +148,40 @@ def growth(arguments: argparse.Namespace) -> None:
         for backend in ("warp", "torch"):
             both = [tm.InBetween(bases, faces, solver=solver) for solver in solvers(backend)]
             with torch.no_grad():
-                whole, modal = (seconds(lambda: layer(*shapes, 0.5), 5) for layer in both)  # noqa: B023
+                whole, modal = (timed(lambda: layer(*shapes, 0.5))[1] for layer in both)  # noqa: B023
             print(
                 f"{shapes.shape[1]:>7} vertices, {backend:<5}: whole {1e3 * whole:7.1f} ms, modal {1e3 * modal:7.1f} ms"
             )
         finer = [trimesh.remesh.subdivide(x.numpy(), faces.numpy()) for x in shapes]
         shapes, faces = torch.tensor(np.stack([x for x, _ in finer])), torch.tensor(finer[0][1])
+
+
+def batches(arguments: argparse.Namespace) -> None:
+    """Time of one in-between in batches of the sample hand at random times, on the clock."""
+    limit_threads()
+    case = next(case for case in samples() if "hand" in case.name)
+    layer = tm.InBetween(case.bases(), case.faces).to(arguments.device)
+    both = torch.stack([case.x_a, case.x_b]).to(arguments.device)
+    times = torch.rand(64, dtype=torch.float64, generator=torch.Generator().manual_seed(0)).to(arguments.device)
+
+    def clock(work: Callable[[], Any]) -> float:
+        found = []
+        for _ in range(arguments.rounds + 1):
+            start = time.perf_counter()
+            work()
+            if arguments.device == "cuda":
+                torch.cuda.synchronize()
+            found.append(time.perf_counter() - start)
+        return min(found[1:])
+
+    def trained(n: int) -> None:
+        layer(*both.clone().requires_grad_(), times[:n]).square().sum().backward()
+
+    for n in (1, 4, 16, 64):
+        with torch.no_grad():
+            forward = clock(lambda: layer(*both, times[:n]))  # noqa: B023
+        backward = clock(lambda: trained(n))  # noqa: B023
+        print(f"batch of {n:2d}: {1e3 * forward / n:6.1f} ms each, with gradients {1e3 * backward / n:6.1f} ms")
 
 
 FIRST = """
@@ -200,7 +219,7 @@ def first(arguments: argparse.Namespace) -> None:
         )
 
 
-PARTS = {"compare": compare, "growth": growth, "first": first}
+PARTS = {"compare": compare, "growth": growth, "first": first, "batches": batches}
 
 
 def main() -> None:
@@ -210,6 +229,7 @@ def main() -> None:
     parser.add_argument("--before", type=Path, metavar="CHECKOUT")
     parser.add_argument("--peer-python", type=Path, metavar="FILE", help="a Python that has morphomatics")
     parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--device", default="cpu", help="of the batches")
     parser.add_argument("--worker", nargs=3, metavar=("CASE", "SIDE", "ANSWER"), help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.worker:

@@ -90,6 +90,18 @@ def remark(row: Row, by_name: dict[str, Row]) -> str:
     return f"  {'; '.join(said)}" if said else ""
 
 
+def head(*columns: str) -> str:
+    """The first two lines of a table in Markdown."""
+    return f"| {' | '.join(columns)} |\n{'|---' * len(columns)}|"
+
+
+def print_table(title: str, columns: Iterable[str], rows: Iterable[Iterable[str]]) -> None:
+    """Print a table in Markdown, each line as soon as it is known."""
+    print(f"\n**{title}**\n\n{head(*columns)}", flush=True)
+    for row in rows:
+        print(f"| {' | '.join(row)} |", flush=True)
+
+
 def markdown(rows: list[Row]) -> str:
     """What comes out of all cases, and what matters most of each: a line for each case, a column for each method."""
     names = list(dict.fromkeys(row.case for row in rows))
@@ -100,7 +112,7 @@ def markdown(rows: list[Row]) -> str:
         table = [[cell(found[name].get(method), found[name]) for method in methods] for name in names]
         if all(value == "-" for line in table for value in line):
             continue
-        lines += ["", f"**{title}**", "", f"| | {' | '.join(methods)} |", "|---" * (len(methods) + 1) + "|"]
+        lines += ["", f"**{title}**", "", head("", *methods)]
         lines += [f"| {name} | {' | '.join(line)} |" for name, line in zip(names, table, strict=True)]
     return "\n".join([*lines, ""])
 
@@ -137,11 +149,8 @@ PIVOTS: dict[str, Callable[[Row | None, dict[str, Row]], str]] = {
 
 def summary(found: dict[str, dict[str, Row]], methods: list[str]) -> list[str]:
     """Over all cases: geometric means of errors and times, the gap closed, and how often a method lost."""
-    lines = [
-        "| method | edge error | over linear | edge drift over linear | gap closed: mean | least | time over joint "
-        "| cases | worse than linear |",
-        "|---|---|---|---|---|---|---|---|---|",
-    ]
+    columns = "method", "edge error", "over linear", "edge drift over linear", "gap closed: mean", "least"
+    lines = [head(*columns, "time over joint", "cases", "worse than linear")]
     for name in methods:
         mine = [(found[case][name], found[case]) for case in found if name in found[case]]
         mine = [(row, others) for row, others in mine if math.isfinite(row.energy)]

@@ -33,9 +33,8 @@ from measures import Yardstick
 from methods import METHODS, UnavailableError
 from sheet import look
 from sheets import SHEETS, sheet
-from tables import geometric_mean, number
-from threads import limit_threads
-from timing import timed, untimed
+from tables import geometric_mean, number, print_table
+from timing import limit_threads, timed, untimed
 
 import torch_modal as tm
 
@@ -200,16 +199,6 @@ def draw(path: Path, only: Sequence[str]) -> None:
         plotter.add_text(case.name, position=(6, 150), font_size=6)
     plotter.screenshot(path)
     plotter.close()
-
-
-# -------------------------------------------------------------------------------------------------------------- tables
-
-
-def print_table(title: str, columns: Sequence[str], rows: Iterator[list[str]]) -> None:
-    """Print a table in Markdown, each line as soon as it is known."""
-    print(f"\n**{title}**\n\n| " + " | ".join(columns) + " |\n" + "|---" * len(columns) + "|", flush=True)
-    for row in rows:
-        print("| " + " | ".join(row) + " |", flush=True)
 
 
 PARTS = ("lens", "times", "bodies", "sheets")

@@ -1,4 +1,4 @@
-"""How long something takes. Standard library only: the peers' process imports it too."""
+"""How long something takes, and on how many threads. The peers' process, which has no torch, imports it too."""
 
 import os
 import time
@@ -28,6 +28,15 @@ def timed(function: Callable[[], T]) -> tuple[T, float]:
         if spent > ENOUGH_SECONDS:
             break
     return result, best
+
+
+def limit_threads(n: int = 1) -> None:
+    """For the rest of this process: so many threads of torch, of BLAS and of OpenMP."""
+    import torch
+    from threadpoolctl import threadpool_limits
+
+    torch.set_num_threads(n)
+    threadpool_limits(n)
 
 
 @contextmanager

@@ -11,35 +11,23 @@ import argparse
 from collections.abc import Callable, Iterator
 
 import torch
-from cases import DATA
-from threads import limit_threads
-from timing import timed
+from cases import divided, keyframes_of
+from measures import distance_and_edges
+from timing import limit_threads, timed
 from torch import Tensor
 
 import torch_modal as tm
 from torch_modal.data.samples import load_sample
-from torch_modal.geometry.connectivity import Connectivity
 
 Row = tuple[str, str]
-
-
-def divided(x: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
-    """Shapes whose triangles are divided in four. *Shape:* ``(K, V, 3), (F, 3)``."""
-    mesh = Connectivity(faces.numpy(), x.shape[1])
-    i, j, k = faces.unbind(1)
-    a, b, c = (torch.tensor(mesh.sides).view(3, -1) + x.shape[1]).unbind()  # of ij, jk, ki
-    corners = ((i, a, c), (a, j, b), (c, b, k), (a, b, c))
-    return torch.cat([x, x[:, mesh.edges].mean(2)], 1), torch.cat([torch.stack(face, 1) for face in corners])
 
 
 def middle(x: Tensor, faces: Tensor, bases: list[tm.ModalBasis]) -> Iterator[Row]:
     """The mean of all frames of the closing hand against the one in the middle."""
     w = torch.full((len(x),), 1 / len(x), dtype=torch.float64)
-    edges = torch.tensor(Connectivity(faces.numpy(), x.shape[1]).edges)
 
     def error(shape: Tensor) -> float:
-        lengths, true = ((one[edges[:, 0]] - one[edges[:, 1]]).norm(dim=-1) for one in (shape, x[len(x) // 2]))
-        return float((lengths - true).abs().mean() / true.mean())
+        return distance_and_edges(shape, x[len(x) // 2], faces, 1)[1]
 
     with torch.no_grad():
         for preset in ("accurate", "fast"):
@@ -67,12 +55,10 @@ def times(name: str, x: Tensor, faces: Tensor, bases: list[tm.ModalBasis]) -> It
 
 def rows(n_modes: int) -> Iterator[Row]:
     """All of them."""
-    sample = load_sample("creature")
-    x, faces = sample.keyframes, sample.faces
-    bases = tm.extract_bases(x, faces, n_modes)
-    yield from times("creature", x, faces, bases)
-    if DATA.is_dir():
-        x, faces = tm.load_keyframes([DATA / "mh-hand-path" / f"{i:02}.obj" for i in range(9)])
+    x, faces = load_sample("creature")[:2]
+    yield from times("creature", x, faces, tm.extract_bases(x, faces, n_modes))
+    if found := keyframes_of("mh-hand-path"):
+        x, faces = found
         yield from middle(x, faces, tm.extract_bases(x, faces, n_modes))
         x, faces = divided(x[:8], faces)
         yield from times("hand", x, faces, tm.extract_bases(x, faces, n_modes))

@@ -53,7 +53,7 @@ from typing import Any
 import numpy as np
 import torch
 from tables import geometric_mean, number
-from threads import limit_threads
+from timing import limit_threads
 from tqdm import tqdm
 from wild_bodies import bent_and_twisted
 from wild_making import BODIES, WildBody
@@ -61,7 +61,7 @@ from wild_making import BODIES, WildBody
 import torch_modal as tm
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.rigid import blend
-from torch_modal.precompute.extract import METHODS, Method
+from torch_modal.modes.extract import METHODS, Method
 from torch_modal.solve.minimise import Status
 
 N_MODES = 30

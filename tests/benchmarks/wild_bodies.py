@@ -6,13 +6,15 @@ data that is kept beside the project is absent, its bodies are left out, with a 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pyvista
 import wild_solids  # noqa: F401 - its bodies enter the list
 import wild_surfaces  # noqa: F401
-from cases import DATA
+from cases import DATA, animal, keyframes_of
 from pyvista import examples
 from trimesh import creation
 from wild_making import (
@@ -38,9 +40,6 @@ from wild_making import (
     tube,
     turned,
 )
-
-from torch_modal.data.samples import load_sample
-from torch_modal.io.read import read_mesh
 
 ANGLE = np.radians(60.0)
 
@@ -82,27 +81,27 @@ def bent_and_twisted(vertices: FloatArray, faces: IntArray, time: float) -> Floa
 
 
 def _sizes() -> None:
-    kind = "few and many faces"
-    add("ball of 80", kind, lambda: stretched(ball(1), 2, 1, 1))
-    add("ball of 320", kind, lambda: stretched(ball(2), 2, 1, 1))
-    add("octopus of 300", kind, lambda: fewer(BODIES["octopus"].make(), 300))
-    add("blob of 900", kind, lambda: fewer(blob(3), 900))
-    add("blob of 1,010", kind, lambda: fewer(blob(3), 1010))
-    add("blob of 1,280", kind, lambda: blob(3))
-    add("torus of 1,600", kind, lambda: of(creation.torus(1, 0.3, 40, 20)))
-    add("blob of 20,480", kind, lambda: blob(5))
-    add("torus of 60,000", kind, lambda: of(creation.torus(1, 0.3, 300, 100)))
+    body = partial(add, "few and many faces")
+    body("ball of 80", lambda: stretched(ball(1), 2, 1, 1))
+    body("ball of 320", lambda: stretched(ball(2), 2, 1, 1))
+    body("octopus of 300", lambda: fewer(BODIES["octopus"].make(), 300))
+    body("blob of 900", lambda: fewer(blob(3), 900))
+    body("blob of 1,010", lambda: fewer(blob(3), 1010))
+    body("blob of 1,280", lambda: blob(3))
+    body("torus of 1,600", lambda: of(creation.torus(1, 0.3, 40, 20)))
+    body("blob of 20,480", lambda: blob(5))
+    body("torus of 60,000", lambda: of(creation.torus(1, 0.3, 300, 100)))
 
-    kind = "units"
+    body = partial(add, "units")
     for name, factor in (("1e-3", 1e-3), ("1e4", 1e4), ("1e-9", 1e-9)):
-        add(f"figure times {name}", kind, partial(_scaled, "figure", factor))
-        add(f"blob times {name}", kind, partial(_scaled, "blob", factor))
-    add("figure, far from the origin", kind, lambda: moved(BODIES["figure"].make(), 1e4, -2e4, 3e4))
+        body(f"figure times {name}", partial(_scaled, "figure", factor))
+        body(f"blob times {name}", partial(_scaled, "blob", factor))
+    body("figure, far from the origin", lambda: moved(BODIES["figure"].make(), 1e4, -2e4, 3e4))
 
-    kind = "loose vertices"
-    add("loose vertices before", kind, partial(_loose, "figure", 50, True))
-    add("loose vertices after", kind, partial(_loose, "blob", 500, False))
-    add("loose vertices far away", kind, partial(_loose, "capsule", 3, False, 100.0))
+    body = partial(add, "loose vertices")
+    body("loose vertices before", partial(_loose, "figure", 50, True))
+    body("loose vertices after", partial(_loose, "blob", 500, False))
+    body("loose vertices far away", partial(_loose, "capsule", 3, False, 100.0))
 
 
 def _scaled(name: str, factor: float) -> Surface:
@@ -119,39 +118,34 @@ def _loose(name: str, n: int, before: bool, spread: float = 1.0) -> Surface:
 
 
 def _slivers() -> None:
-    kind = "slivers"
-    add("long triangles", kind, lambda: of(creation.cylinder(radius=0.3, height=4, sections=64)))
-    add("squeezed grid", kind, lambda: thick(lambda u, v: (3 * u**4, v, 0.2 * np.sin(3 * u)), 0.2, 40, 12))
-    add("fan", kind, lambda: turned([(0, 0), (1, 0), (1, 0.5), (0, 0.5)], 200))
-    add("nearly collapsed edges", kind, lambda: _nearly_collapsed(stretched(ball(3), 2, 1, 1)))
-    add(
+    body = partial(add, "slivers")
+    body("long triangles", lambda: of(creation.cylinder(radius=0.3, height=4, sections=64)))
+    body("squeezed grid", lambda: thick(lambda u, v: (3 * u**4, v, 0.2 * np.sin(3 * u)), 0.2, 40, 12))
+    body("fan", lambda: turned([(0, 0), (1, 0), (1, 0.5), (0, 0.5)], 200))
+    body("nearly collapsed edges", lambda: _nearly_collapsed(stretched(ball(3), 2, 1, 1)))
+    body(
         "capsule, marching cubes",
-        kind,
         lambda: level_set(limbs([([-1, 0, 0], [1, 0.2, 0.1], 0.4, 0.2)]), (1.6, 0.8, 0.6), 0.07),
     )
-    add("squashed rings", kind, lambda: tube(lambda u: np.stack([3 * u**3, 0 * u, 0 * u], 1), 0.3, 60, 20))
+    body("squashed rings", lambda: tube(lambda u: np.stack([3 * u**3, 0 * u, 0 * u], 1), 0.3, 60, 20))
 
-    kind = "machines"
-    add("nut", kind, lambda: of_vtk(pyvista.read(f"{examples.dir_path}/nut.ply")))
-    add("hexagonal beam", kind, lambda: of_vtk(pyvista.read(f"{examples.dir_path}/hexbeam.vtk")))
-    add("gear", kind, lambda: _gear(16), contact=True)
-    add(
-        "shaft",
-        kind,
-        lambda: turned([(0, 0), (0.3, 0), (0.3, 1), (0.6, 1), (0.6, 1.4), (0.3, 1.4), (0.3, 3), (0, 3)], 32),
-    )
-    add("box of 12", kind, lambda: of(creation.box(extents=(3, 1, 1))))
-    add("box of 192", kind, lambda: block((3, 1, 1), 2))
-    add("bracket", kind, lambda: level_set(_bracket, (1.3, 1.3, 0.6), 0.09))
-    add("letters", kind, lambda: of_vtk(pyvista.Text3D("wild", depth=0.3)), closed=False)
-    add("icosahedron", kind, lambda: of(creation.icosahedron()))
+    body = partial(add, "machines")
+    body("nut", lambda: of_vtk(pyvista.read(f"{examples.dir_path}/nut.ply")))
+    body("hexagonal beam", lambda: of_vtk(pyvista.read(f"{examples.dir_path}/hexbeam.vtk")))
+    body("gear", lambda: _gear(16), contact=True)
+    body("shaft", lambda: turned([(0, 0), (0.3, 0), (0.3, 1), (0.6, 1), (0.6, 1.4), (0.3, 1.4), (0.3, 3), (0, 3)], 32))
+    body("box of 12", lambda: of(creation.box(extents=(3, 1, 1))))
+    body("box of 192", lambda: block((3, 1, 1), 2))
+    body("bracket", lambda: level_set(_bracket, (1.3, 1.3, 0.6), 0.09))
+    body("letters", lambda: of_vtk(pyvista.Text3D("wild", depth=0.3)))
+    body("icosahedron", lambda: of(creation.icosahedron()))
 
-    kind = "noisy"
+    body = partial(add, "noisy")
     for part in (0.05, 0.2, 0.5):
-        add(f"ellipsoid, noise {part}", kind, partial(_noisy_ball, part))
-    add("octopus, noise 0.2", kind, lambda: noisy(BODIES["octopus"].make(), 0.2))
-    add("plate, noise 0.1", kind, lambda: noisy(plate(0.01), 0.1), contact=True)
-    add("cup, noise 0.1", kind, lambda: noisy(BODIES["cup"].make(), 0.1), closed=False)
+        body(f"ellipsoid, noise {part}", partial(_noisy_ball, part))
+    body("octopus, noise 0.2", lambda: noisy(BODIES["octopus"].make(), 0.2))
+    body("plate, noise 0.1", lambda: noisy(plate(0.01), 0.1), contact=True)
+    body("cup, noise 0.1", lambda: noisy(BODIES["cup"].make(), 0.1))
 
 
 def _noisy_ball(part: float) -> Surface:
@@ -197,36 +191,23 @@ def _bracket(x: FloatArray, y: FloatArray, z: FloatArray) -> FloatArray:
 
 
 def _data() -> None:
-    kind = "data"
-    add("ant", kind, lambda: of_vtk(pyvista.read(f"{examples.dir_path}/ant.ply")), contact=True)
+    body = partial(add, "data")
+    body("ant", lambda: of_vtk(pyvista.read(f"{examples.dir_path}/ant.ply")), contact=True)
     for name in ("creature", "hand"):
-        add(f"sample {name}", kind, partial(_sample, name), contact=True)
+        body(f"sample {name}", partial(_first, keyframes_of, name), contact=True)
     if not DATA.is_dir():
         print(f"(without animals, hands and faces: the folder {DATA} is not there)")
         return
     for file in sorted((DATA / "animals").glob("*.npz")):
-        add(file.stem, kind, partial(_animal, file.stem), closed=None, contact=file.stem == "fox")
-    for folder, name in (
-        ("mh-hand", "00-open"),
-        ("mh-woman", "00-rest"),
-        ("ict-face", "00-neutral"),
-        ("hyper-cube", "cube-1"),
-    ):
-        add(folder, kind, partial(_file, folder, name), closed=None)
+        body(file.stem, partial(_first, animal, file.stem), contact=file.stem == "fox")
+    for folder in ("mh-hand", "mh-woman", "ict-face", "hyper-cube"):
+        body(folder, partial(_first, keyframes_of, folder))
 
 
-def _sample(name: str) -> Surface:
-    sample = load_sample(name)
-    return sample.keyframes[0].numpy().astype(np.float64), sample.faces.numpy()
-
-
-def _animal(name: str) -> Surface:
-    stored = np.load(DATA / "animals" / f"{name}.npz")
-    return stored["frames"][0].astype(np.float64), stored["faces"].astype(np.int64)
-
-
-def _file(folder: str, name: str) -> Surface:
-    return read_mesh(DATA / folder / f"{name}.obj")
+def _first(load: Callable[[str], Any], name: str) -> Surface:
+    """The first shape of a sample, of a folder beside the project, or of an animal."""
+    keyframes, faces = load(name)[:2]
+    return keyframes[0].double().numpy(), faces.numpy()
 
 
 for _make in (_sizes, _slivers, _data):

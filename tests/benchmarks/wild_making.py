@@ -18,13 +18,11 @@ Surface = tuple[FloatArray, IntArray]
 
 
 class WildBody(NamedTuple):
-    """A surface, and what is claimed of it."""
+    """A surface."""
 
     name: str
     kind: str
     make: Callable[[], Surface]
-    closed: bool | None
-    """Whether each edge belongs to two faces of opposite senses; None where nothing is claimed."""
     contact: bool
     """Whether it belongs to the smaller set that is tried with contact."""
 
@@ -32,9 +30,9 @@ class WildBody(NamedTuple):
 BODIES: dict[str, WildBody] = {}
 
 
-def add(name: str, kind: str, make: Callable[[], Surface], closed: bool | None = True, contact: bool = False) -> None:
+def add(kind: str, name: str, make: Callable[[], Surface], contact: bool = False) -> None:
     """Put a body into ``BODIES``."""
-    BODIES[name] = WildBody(name, kind, make, closed, contact)
+    BODIES[name] = WildBody(name, kind, make, contact)
 
 
 # -------------------------------------------------------------------------------------------------------------- helpers

@@ -35,25 +35,23 @@ from wild_making import (
 
 
 def _plain() -> None:
-    kind = "plain"
-    add("sphere", kind, ball)
-    add("ellipsoid", kind, lambda: stretched(ball(), 3, 1, 0.6), contact=True)
-    add("capsule", kind, lambda: of(creation.capsule(height=4, radius=0.5, count=(20, 20))))
-    add("cylinder", kind, lambda: fewer(split(of(creation.cylinder(radius=0.4, height=4, sections=24)), 3), 2400))
-    add("cone", kind, lambda: turned([(0, 0), *[(0.8 * (1 - k / 20), 3 * k / 20) for k in range(20)], (0, 3)]))
-    add("torus", kind, lambda: of(creation.torus(1, 0.3, 40, 20)))
-    add("box", kind, lambda: block((4, 1, 1)))
-    add("cube", kind, lambda: block((1, 1, 1)))
-    add(
+    body = partial(add, "plain")
+    body("sphere", ball)
+    body("ellipsoid", lambda: stretched(ball(), 3, 1, 0.6), contact=True)
+    body("capsule", lambda: of(creation.capsule(height=4, radius=0.5, count=(20, 20))))
+    body("cylinder", lambda: fewer(split(of(creation.cylinder(radius=0.4, height=4, sections=24)), 3), 2400))
+    body("cone", lambda: turned([(0, 0), *[(0.8 * (1 - k / 20), 3 * k / 20) for k in range(20)], (0, 3)]))
+    body("torus", lambda: of(creation.torus(1, 0.3, 40, 20)))
+    body("box", lambda: block((4, 1, 1)))
+    body("cube", lambda: block((1, 1, 1)))
+    body(
         "pear",
-        kind,
         lambda: turned([(0, 0), *[(np.sin(a) * (1.3 + np.cos(a)), 2 * a) for a in np.linspace(0.1, 3, 30)], (0, 6.3)]),
     )
-    add("superellipsoid", kind, lambda: stretched(super_ellipsoid(0.3), 2.5, 1, 1))
-    add("blob", kind, lambda: blob(3))
-    add(
+    body("superellipsoid", lambda: stretched(super_ellipsoid(0.3), 2.5, 1, 1))
+    body("blob", lambda: blob(3))
+    body(
         "bottle",
-        kind,
         lambda: turned([(0, 0), (0.5, 0), *[(0.5, k / 6) for k in range(1, 13)], (0.2, 2.4), (0.2, 3), (0, 3)], 32),
     )
 
@@ -62,45 +60,32 @@ def _plain() -> None:
 
 
 def _limbs() -> None:
-    kind = "thin limbs"
+    body = partial(add, "thin limbs")
     tail = [(1.01 * np.sin(a), -np.cos(a)) for a in np.linspace(0.12, 3.05, 24)]
     for radius in (0.06, 0.02, 0.008):
         rope = [(radius, z) for z in np.linspace(1.05, 5, 60)]
-        add(
-            f"balloon, tail {radius}",
-            kind,
-            partial(turned, [(0, -1), *tail, *rope, (0, 5)], 16),
-            contact=radius == 0.06,
-        )
+        body(f"balloon, tail {radius}", partial(turned, [(0, -1), *tail, *rope, (0, 5)], 16), contact=radius == 0.06)
     arms = [([0, 0, 0], 0.9 * p, 0.1, 0.03) for p in circle(8, 1)]
-    add(
+    body(
         "octopus",
-        kind,
         lambda: fewer(level_set(limbs([([0, 0, 0], [0, 0, 0.3], 0.3, 0.35), *arms]), (1.2, 1.2, 0.8), 0.025), 4000),
         contact=True,
     )
-    add(
-        "starfish",
-        kind,
-        lambda: level_set(limbs([([0, 0, 0], p, 0.15, 0.06) for p in circle(5, 1)]), (1.2, 1.2, 0.4), 0.04),
+    body(
+        "starfish", lambda: level_set(limbs([([0, 0, 0], p, 0.15, 0.06) for p in circle(5, 1)]), (1.2, 1.2, 0.4), 0.04)
     )
-    add("spider", kind, lambda: fewer(level_set(limbs(_spider()), (1.2, 1.2, 0.7), 0.025), 3000), contact=True)
-    add("tree", kind, lambda: fewer(level_set(limbs(_tree(4, 0.8), 0.015), (1.4, 1.4, 1.4), 0.03), 5000), closed=None)
-    add(
-        "tree, a twig broken off",
-        kind,
-        lambda: fewer(level_set(limbs(_tree(4, 0.65), 0.015), (1.4, 1.4, 1.4), 0.03), 5000),
-    )
-    add("figure", kind, lambda: fewer(level_set(limbs(_figure()), (1.1, 0.5, 1.2), 0.03), 3000))
-    add("figure, 600 faces", kind, lambda: fewer(level_set(limbs(_figure()), (1.1, 0.5, 1.2), 0.03), 600))
-    add("snake", kind, lambda: tube(lambda u: np.stack([3 * u, 0.4 * np.sin(9 * u), 0 * u], 1), 0.06, 160, 10))
-    add(
+    body("spider", lambda: fewer(level_set(limbs(_spider()), (1.2, 1.2, 0.7), 0.025), 3000), contact=True)
+    body("tree", lambda: fewer(level_set(limbs(_tree(4, 0.8), 0.015), (1.4, 1.4, 1.4), 0.03), 5000))
+    body("tree, a twig broken off", lambda: fewer(level_set(limbs(_tree(4, 0.65), 0.015), (1.4, 1.4, 1.4), 0.03), 5000))
+    body("figure", lambda: fewer(level_set(limbs(_figure()), (1.1, 0.5, 1.2), 0.03), 3000))
+    body("figure, 600 faces", lambda: fewer(level_set(limbs(_figure()), (1.1, 0.5, 1.2), 0.03), 600))
+    body("snake", lambda: tube(lambda u: np.stack([3 * u, 0.4 * np.sin(9 * u), 0 * u], 1), 0.06, 160, 10))
+    body(
         "coil",
-        kind,
         lambda: tube(lambda u: np.stack([2 * u, 0.5 * np.cos(30 * u), 0.5 * np.sin(30 * u)], 1), 0.05, 240, 8),
         contact=True,
     )
-    add("hair", kind, lambda: tube(lambda u: np.stack([4 * u, 0.1 * u**2, 0 * u], 1), 0.005, 200, 6))
+    body("hair", lambda: tube(lambda u: np.stack([4 * u, 0.1 * u**2, 0 * u], 1), 0.005, 200, 6))
 
 
 def _spider() -> list[tuple]:
@@ -143,15 +128,14 @@ def _figure() -> list[tuple]:
 
 
 def _pieces() -> None:
-    kind = "many pieces"
-    add("two balls", kind, lambda: joined(ball(2), moved(ball(2), 2.5, 0, 0)))
-    add("two balls, overlapping", kind, lambda: joined(ball(2), moved(ball(2), 1.2, 0, 0)))
-    add("ball in a ball", kind, lambda: joined(ball(3), ball(2, 0.5)))
-    add("chain of 12", kind, lambda: joined(*[moved(_link(k % 2), 1.3 * k, 0, 0) for k in range(12)]), contact=True)
-    add("41 balls", kind, lambda: _cloud(41, 2), contact=True)
-    add(
+    body = partial(add, "many pieces")
+    body("two balls", lambda: joined(ball(2), moved(ball(2), 2.5, 0, 0)))
+    body("two balls, overlapping", lambda: joined(ball(2), moved(ball(2), 1.2, 0, 0)))
+    body("ball in a ball", lambda: joined(ball(3), ball(2, 0.5)))
+    body("chain of 12", lambda: joined(*[moved(_link(k % 2), 1.3 * k, 0, 0) for k in range(12)]), contact=True)
+    body("41 balls", lambda: _cloud(41, 2), contact=True)
+    body(
         "41 bones",
-        kind,
         lambda: joined(
             *[
                 moved(stretched(ball(1), 0.3, 0.06, 0.06), 0.4 * (k % 10), 0.3 * (k // 10), 0.2 * np.sin(k))
@@ -159,9 +143,8 @@ def _pieces() -> None:
             ]
         ),
     )
-    add(
+    body(
         "100 tetrahedra",
-        kind,
         lambda: joined(
             *[
                 moved((v, f), *(4 * np.random.default_rng(k).random(3) * [2, 1, 1]))
@@ -170,20 +153,14 @@ def _pieces() -> None:
             ]
         ),
     )
-    add("feathered bird", kind, _bird)
-    add("ball and a crumb", kind, lambda: joined(ball(3), moved(ball(0, 0.01), 1.3, 0, 0)))
-    add(
+    body("feathered bird", _bird)
+    body("ball and a crumb", lambda: joined(ball(3), moved(ball(0, 0.01), 1.3, 0, 0)))
+    body(
         "ball and ten crumbs",
-        kind,
         lambda: joined(stretched(ball(3), 2, 1, 1), *[moved(ball(0, 0.02), *(1.4 * p)) for p in circle(10, 1)]),
     )
-    add("stack of plates", kind, lambda: joined(*[moved(block((2, 1, 0.05), 2), 0, 0, 0.15 * k) for k in range(8)]))
-    add(
-        "ball and sheets",
-        kind,
-        lambda: joined(stretched(ball(3), 2, 1, 1), *[_sheet_at(k) for k in range(5)]),
-        closed=False,
-    )
+    body("stack of plates", lambda: joined(*[moved(block((2, 1, 0.05), 2), 0, 0, 0.15 * k) for k in range(8)]))
+    body("ball and sheets", lambda: joined(stretched(ball(3), 2, 1, 1), *[_sheet_at(k) for k in range(5)]))
 
 
 def _link(turned_: int) -> Surface:
@@ -229,7 +206,7 @@ def _sheet_at(k: int) -> Surface:
 
 
 def _genus() -> None:
-    kind = "high genus"
+    body = partial(add, "high genus")
 
     def ball_of(pattern: Callable[..., FloatArray], scale: float) -> Callable[..., FloatArray]:
         return lambda x, y, z: np.maximum(
@@ -242,19 +219,14 @@ def _genus() -> None:
     def schwarz(x: FloatArray, y: FloatArray, z: FloatArray) -> FloatArray:
         return np.cos(x) + np.cos(y) + np.cos(z) + 0.2
 
-    add("gyroid", kind, lambda: level_set(ball_of(gyroid, 4), (1.8, 1.2, 1.2), 0.08))
-    add(
-        "gyroid, decimated",
-        kind,
-        lambda: fewer(level_set(ball_of(gyroid, 4), (1.8, 1.2, 1.2), 0.06), 4000),
-        closed=None,
-    )
-    add("Schwarz", kind, lambda: level_set(ball_of(schwarz, 5), (1.8, 1.2, 1.2), 0.07), contact=True)
-    add("chain of tori", kind, lambda: level_set(_tori(5), (3.2, 0.9, 0.4), 0.05))
-    add("frame of a cube", kind, lambda: level_set(limbs(_frame(), 0.02), (1.2, 1.2, 1.2), 0.05))
-    add("lattice of bars", kind, lambda: level_set(limbs(_bars(3), 0.015), (1.7, 1.2, 1.2), 0.07))
-    add("sponge", kind, lambda: _sponge())
-    add("figure eight", kind, lambda: level_set(_tori(2), (1.7, 0.9, 0.4), 0.05))
+    body("gyroid", lambda: level_set(ball_of(gyroid, 4), (1.8, 1.2, 1.2), 0.08))
+    body("gyroid, decimated", lambda: fewer(level_set(ball_of(gyroid, 4), (1.8, 1.2, 1.2), 0.06), 4000))
+    body("Schwarz", lambda: level_set(ball_of(schwarz, 5), (1.8, 1.2, 1.2), 0.07), contact=True)
+    body("chain of tori", lambda: level_set(_tori(5), (3.2, 0.9, 0.4), 0.05))
+    body("frame of a cube", lambda: level_set(limbs(_frame(), 0.02), (1.2, 1.2, 1.2), 0.05))
+    body("lattice of bars", lambda: level_set(limbs(_bars(3), 0.015), (1.7, 1.2, 1.2), 0.07))
+    body("sponge", lambda: _sponge())
+    body("figure eight", lambda: level_set(_tori(2), (1.7, 0.9, 0.4), 0.05))
 
 
 def _tori(n: int) -> Callable[..., FloatArray]:

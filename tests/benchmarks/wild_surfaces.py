@@ -31,13 +31,12 @@ from wild_making import (
 
 
 def _thin() -> None:
-    kind = "thin shells"
+    body = partial(add, "thin shells")
     for thickness in (0.05, 0.01, 0.001):
-        add(f"plate {thickness}", kind, partial(plate, thickness), contact=thickness == 0.01)
-    add("wavy plate", kind, lambda: thick(lambda u, v: (3 * u, v, 0.15 * np.sin(9 * u)), 0.01, 40, 12))
-    add(
+        body(f"plate {thickness}", partial(plate, thickness), contact=thickness == 0.01)
+    body("wavy plate", lambda: thick(lambda u, v: (3 * u, v, 0.15 * np.sin(9 * u)), 0.01, 40, 12))
+    body(
         "disc",
-        kind,
         lambda: turned(
             [
                 (0, 0),
@@ -48,9 +47,8 @@ def _thin() -> None:
             40,
         ),
     )
-    add(
+    body(
         "cup with walls",
-        kind,
         lambda: turned(
             [
                 (0, 0),
@@ -64,17 +62,16 @@ def _thin() -> None:
         ),
         contact=True,
     )
-    add("tube with walls", kind, lambda: of(creation.annulus(0.45, 0.5, 3, sections=24)))
-    add("fine tube with walls", kind, lambda: split(of(creation.annulus(0.47, 0.5, 3, sections=24)), 2))
-    add("hollow ball", kind, lambda: hollow(ball(3), 0.97))
-    add(
+    body("tube with walls", lambda: of(creation.annulus(0.45, 0.5, 3, sections=24)))
+    body("fine tube with walls", lambda: split(of(creation.annulus(0.47, 0.5, 3, sections=24)), 2))
+    body("hollow ball", lambda: hollow(ball(3), 0.97))
+    body(
         "ribbon",
-        kind,
         lambda: thick(
             lambda u, v: (2 * u, 0.3 * (v - 0.5) * np.cos(3 * u), 0.3 * (v - 0.5) * np.sin(3 * u)), 0.005, 60, 6
         ),
     )
-    add("needle", kind, lambda: stretched(ball(3), 1, 0.01, 0.01))
+    body("needle", lambda: stretched(ball(3), 1, 0.01, 0.01))
 
 
 def hollow(surface: Surface, part: float) -> Surface:
@@ -82,32 +79,26 @@ def hollow(surface: Surface, part: float) -> Surface:
 
 
 def _open() -> None:
-    kind = "open"
-    flat = partial(add, kind=kind, closed=False)
-    flat("hemisphere", make=lambda: _hemisphere(3))
-    flat(
-        "cup",
-        make=lambda: turned([(0, 0), (0.5, 0), *[(0.5 + 0.02 * k, 0.1 * k) for k in range(1, 15)]], 32),
-        contact=True,
+    body = partial(add, "open")
+    body("hemisphere", lambda: _hemisphere(3))
+    body(
+        "cup", lambda: turned([(0, 0), (0.5, 0), *[(0.5 + 0.02 * k, 0.1 * k) for k in range(1, 15)]], 32), contact=True
     )
-    flat(
+    body(
         "open cylinder",
-        make=lambda: welded(*patch(lambda u, v: (np.cos(2 * np.pi * v), np.sin(2 * np.pi * v), 4 * u), 30, 24)),
+        lambda: welded(*patch(lambda u, v: (np.cos(2 * np.pi * v), np.sin(2 * np.pi * v), 4 * u), 30, 24)),
     )
-    flat("curved sheet", make=lambda: patch(lambda u, v: (3 * u, v, 0.5 * np.sin(2 * u)), 40, 14))
-    flat("flat sheet", make=lambda: patch(lambda u, v: (3 * u, v, 0 * u), 40, 14))
-    flat("saddle", make=lambda: patch(lambda u, v: (2 * u, v, (u - 0.5) ** 2 - (v - 0.5) ** 2), 30, 20))
-    flat("hills", make=lambda: of_vtk(pyvista.ParametricRandomHills(u_res=40, v_res=30, w_res=30)))
-    flat("Enneper", make=lambda: of_vtk(pyvista.ParametricEnneper(u_res=40, v_res=40, w_res=10)))
-    flat("Moebius strip", make=lambda: of_vtk(pyvista.ParametricMobius(u_res=40, v_res=12, w_res=10)))
-    flat(
-        "helicoid",
-        make=lambda: patch(lambda u, v: (4 * u, (v - 0.5) * np.cos(6 * u), (v - 0.5) * np.sin(6 * u)), 50, 10),
-    )
-    flat("sieve", make=lambda: _sieve(0.3))
-    flat(
+    body("curved sheet", lambda: patch(lambda u, v: (3 * u, v, 0.5 * np.sin(2 * u)), 40, 14))
+    body("flat sheet", lambda: patch(lambda u, v: (3 * u, v, 0 * u), 40, 14))
+    body("saddle", lambda: patch(lambda u, v: (2 * u, v, (u - 0.5) ** 2 - (v - 0.5) ** 2), 30, 20))
+    body("hills", lambda: of_vtk(pyvista.ParametricRandomHills(u_res=40, v_res=30, w_res=30)))
+    body("Enneper", lambda: of_vtk(pyvista.ParametricEnneper(u_res=40, v_res=40, w_res=10)))
+    body("Moebius strip", lambda: of_vtk(pyvista.ParametricMobius(u_res=40, v_res=12, w_res=10)))
+    body("helicoid", lambda: patch(lambda u, v: (4 * u, (v - 0.5) * np.cos(6 * u), (v - 0.5) * np.sin(6 * u)), 50, 10))
+    body("sieve", lambda: _sieve(0.3))
+    body(
         "skirt",
-        make=lambda: patch(
+        lambda: patch(
             lambda u, v: (
                 (0.3 + u) * np.cos(2 * np.pi * v),
                 (0.3 + u) * np.sin(2 * np.pi * v),
@@ -117,7 +108,7 @@ def _open() -> None:
             60,
         ),
     )
-    flat("airplane", make=lambda: of_vtk(pyvista.read(f"{examples.dir_path}/airplane.ply")), contact=True)
+    body("airplane", lambda: of_vtk(pyvista.read(f"{examples.dir_path}/airplane.ply")), contact=True)
 
 
 def _hemisphere(level: int) -> Surface:
@@ -136,23 +127,19 @@ def _sieve(part: float) -> Surface:
 
 
 def _non_manifold() -> None:
-    broken = partial(add, kind="non-manifold", closed=False)
-    broken("boxes at an edge", make=lambda: welded(*joined(block((1, 1, 3), 2), moved(block((1, 1, 3), 2), 1, 1, 0))))
-    broken(
-        "boxes at a corner",
-        make=lambda: welded(*joined(block((1, 1, 1), 2), moved(block((1, 1, 1), 2), 1, 1, 1))),
-        closed=True,
-    )
-    broken("box with inner wall", make=lambda: welded(*joined(block((2, 1, 1), 2), _wall())))
-    broken("T of sheets", make=lambda: welded(*joined(_page(0), _page(1), _page(2))))
-    broken("book of five pages", make=lambda: welded(*joined(*[_page(k, 5) for k in range(5)])), contact=True)
-    broken("bow-tie of cones", make=_bow_tie, closed=True)
-    broken("repeated faces", make=lambda: (ball(2)[0] * [2, 1, 1], np.concatenate([ball(2)[1], ball(2)[1][:30]])))
-    broken("mixed winding", make=lambda: _mixed_winding())
-    broken("triangle soup", make=lambda: _soup(stretched(ball(2), 2, 1, 1)))
-    broken("Klein bottle", make=lambda: of_vtk(pyvista.ParametricKlein(u_res=40, v_res=30, w_res=30)))
-    broken("Roman surface", make=lambda: of_vtk(pyvista.ParametricRoman(u_res=30, v_res=30, w_res=30)))
-    broken("ball with a fin", make=lambda: _fin())
+    body = partial(add, "non-manifold")
+    body("boxes at an edge", lambda: welded(*joined(block((1, 1, 3), 2), moved(block((1, 1, 3), 2), 1, 1, 0))))
+    body("boxes at a corner", lambda: welded(*joined(block((1, 1, 1), 2), moved(block((1, 1, 1), 2), 1, 1, 1))))
+    body("box with inner wall", lambda: welded(*joined(block((2, 1, 1), 2), _wall())))
+    body("T of sheets", lambda: welded(*joined(_page(0), _page(1), _page(2))))
+    body("book of five pages", lambda: welded(*joined(*[_page(k, 5) for k in range(5)])), contact=True)
+    body("bow-tie of cones", _bow_tie)
+    body("repeated faces", lambda: (ball(2)[0] * [2, 1, 1], np.concatenate([ball(2)[1], ball(2)[1][:30]])))
+    body("mixed winding", lambda: _mixed_winding())
+    body("triangle soup", lambda: _soup(stretched(ball(2), 2, 1, 1)))
+    body("Klein bottle", lambda: of_vtk(pyvista.ParametricKlein(u_res=40, v_res=30, w_res=30)))
+    body("Roman surface", lambda: of_vtk(pyvista.ParametricRoman(u_res=30, v_res=30, w_res=30)))
+    body("ball with a fin", lambda: _fin())
 
 
 def _wall() -> Surface:

@@ -8,19 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from solids import box, surface
 
 import torch_modal as tm
 from torch_modal.cli import main as cli
-from torch_modal.io.files import temporary_beside, write_atomically
+from torch_modal.io.files import temporary_beside, write_file
 from torch_modal.progress import ProgressReport
-
-
-@pytest.fixture
-def bar() -> tuple[np.ndarray, np.ndarray]:
-    solid = box((4, 2, 2), (4.0, 1.0, 1.0))
-    used, faces = np.unique(surface(solid), return_inverse=True)
-    return solid.vertices[used], faces.reshape(-1, 3)
 
 
 # ------------------------------------------------------------------------------------------------------------ progress
@@ -42,18 +34,18 @@ def test_a_bar_is_shown_on_terminals(
 
 
 def test_verbose_says_what_is_written(
-    tmp_path: Path, bar: tuple[np.ndarray, np.ndarray], caplog: pytest.LogCaptureFixture
+    tmp_path: Path, capsule: tuple[np.ndarray, np.ndarray], caplog: pytest.LogCaptureFixture
 ) -> None:
     with caplog.at_level(logging.DEBUG, "torch_modal"):
-        (path,) = tm.save_frames(bar[0][None], bar[1], tmp_path, "obj")
+        (path,) = tm.save_frames(capsule[0][None], capsule[1], tmp_path, "obj")
     assert [record.message for record in caplog.records] == [f"wrote {path}, {path.stat().st_size / 1000:.1f} kB"]
 
 
 # ------------------------------------------------------------------------------------------------------ errors of files
 def test_write_errors_name_the_users_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     wanted = tmp_path / "missing" / "a.glb"
-    with pytest.raises(FileNotFoundError) as caught:
-        write_atomically(wanted, b"x")
+    with pytest.raises(FileNotFoundError) as caught, temporary_beside(wanted):
+        pass
     assert caught.value.filename == str(wanted) and ".tmp" not in str(caught.value)
 
     def full(self: Path, data: bytes) -> int:
@@ -61,7 +53,7 @@ def test_write_errors_name_the_users_path(tmp_path: Path, monkeypatch: pytest.Mo
 
     monkeypatch.setattr(Path, "write_bytes", full)
     with pytest.raises(OSError, match=r"No space left on device: '[^']*/b\.glb'") as caught_again:
-        write_atomically(tmp_path / "b.glb", b"x")
+        write_file(tmp_path / "b.glb", b"x")
     assert caught_again.value.errno == errno.ENOSPC and list(tmp_path.iterdir()) == []
     with pytest.raises(PermissionError) as other, temporary_beside(tmp_path / "c.glb"):
         raise PermissionError(errno.EACCES, "of another file", "/elsewhere")
@@ -70,11 +62,11 @@ def test_write_errors_name_the_users_path(tmp_path: Path, monkeypatch: pytest.Mo
 
 def test_the_command_names_the_path_in_one_line(
     tmp_path: Path,
-    bar: tuple[np.ndarray, np.ndarray],
+    capsule: tuple[np.ndarray, np.ndarray],
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    x, faces = bar
+    x, faces = capsule
     files = tm.save_frames(np.stack([x, 1.1 * x]), faces, tmp_path / "in", "obj")
     monkeypatch.setattr(tm, "subdivide", lambda keyframes, *_, **__: keyframes)
     replace = os.replace

@@ -11,14 +11,13 @@ from scipy.optimize import minimize
 from torch import Tensor
 
 import torch_modal as tm
-from torch_modal.cli import main as cli
+from torch_modal import extras
 from torch_modal.contact import in_between as contact_layer
 from torch_modal.contact import modal, separate
 from torch_modal.contact.acceleration import AccelerationLimit
 from torch_modal.contact.active import ContactEnergy, Contacts, ContactSearch, Pull
-from torch_modal.contact.detect import _nearest_faces
 from torch_modal.contact.separate import Timeline, through
-from torch_modal.data.samples import load_sample, sample_files
+from torch_modal.data.samples import load_sample
 from torch_modal.energy.energy import RestShapes
 from torch_modal.energy.term import Mesh
 from torch_modal.geometry.connectivity import Connectivity
@@ -55,15 +54,6 @@ def peak_acceleration(frames: Tensor) -> float:
     return float((frames[2:] - 2 * frames[1:-1] + frames[:-2]).norm(dim=-1).max())
 
 
-def stuck_in_first(hand: Shapes) -> Shapes:
-    """The tip of the little finger goes into its neighbour, in the open hand."""
-    crossed = hand.keyframes.clone()
-    x = crossed[0]
-    reach = (x - x[x[:, 0].argmin()]).norm(dim=-1)
-    x[:, 0] += 0.22 * torch.exp(-((reach / 0.12) ** 2))
-    return Shapes(crossed, hand.faces, hand.bases)
-
-
 # ------------------------------------------------------------------------------------------------------------ energies
 def test_contact_energy_is_that_of_heights_below_the_gap() -> None:
     x = torch.tensor([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0.2, 0.2, 0]], dtype=DOUBLE).repeat(3, 1, 1)
@@ -95,16 +85,6 @@ def test_energies_have_the_derivatives_of_their_values(kind: str, generator: tor
     unit = torch.zeros_like(x)
     unit[0, 5, 0] = 1
     torch.testing.assert_close(at.diagonal[0, 5, 0], at.product(unit)[0, 5, 0])
-
-
-def test_contacts_of_vertices_that_have_none_any_more_stay_active() -> None:
-    former = Contacts(torch.tensor([0, 0, 1]), torch.tensor([[0, 1, 2, 9], [3, 4, 5, 8], [0, 1, 2, 9]]))
-    now = Contacts(torch.tensor([0, 1]), torch.tensor([[0, 1, 3, 9], [3, 4, 5, 7]]))
-    both = now.beside(former)
-    found = {(i, *element) for i, element in zip(both.shapes.tolist(), both.elements.tolist(), strict=True)}
-    assert found == {(0, 0, 1, 3, 9), (0, 3, 4, 5, 8), (1, 3, 4, 5, 7), (1, 0, 1, 2, 9)}
-    some = both.rows(torch.tensor([1]))
-    assert some.shapes.tolist() == [0, 0] and some.elements[:, 3].tolist() == [7, 9]
 
 
 # --------------------------------------------------------------------------------------------------------------- layer
@@ -151,7 +131,7 @@ def test_gradients_are_exact_with_the_set_held(hand: Shapes, monkeypatch: pytest
         calls = 0
         mu, stiffness = layer.mu_of(t, t.shape), layer.stiffness_of(t, t.shape)
         samples = Samples(torch.stack([x_a, x_b])[None], torch.stack([1 - t, t], -1), mu, stiffness)
-        return layer.core(samples, None).shapes[0]
+        return layer.core(samples).shapes[0]
 
     given = [x_a.clone(), x_b.clone(), torch.tensor([0.875], dtype=DOUBLE)]
     for tensor in given:
@@ -281,16 +261,6 @@ def test_a_sample_does_not_depend_on_its_batch(hand: Shapes) -> None:
     assert float((moved - alone).norm(dim=-1).max()) < 1e-6 * size
 
 
-def test_rounding_does_not_choose_among_faces_around_the_nearest_point() -> None:
-    v, f = np.array([7, 7, 7, 7, 9, 9]), np.array([4, 3, 2, 1, 6, 5])
-    height = np.array([0.5, 0.8, -0.8, 0.1, 1.0, 1.0])
-    for sign in (1, -1):
-        distance = 1 + sign * 1e-13 * np.array([1.0, -2, 3, -4, 5, -6])
-        distance[3] = 1.1
-        chosen = _nearest_faces(v, f, distance, height * (1 - sign * 1e-13 * np.arange(6)))
-        assert f[chosen].tolist() == [2, 5]
-
-
 def unlimited(n: int, n_vertices: int, most: float = 10.0) -> Timeline:
     """A trajectory at rest, with a limit of accelerations between frames."""
     limit = AccelerationLimit(
@@ -356,14 +326,9 @@ def test_no_shape_of_a_path_is_made_worse(frogs: Shapes) -> None:
     assert solution.n_crossing.tolist() in (after.tolist(), [0] * 9)
 
 
-def test_contact_needs_one_shape() -> None:
+def test_what_contact_needs_is_said_before_any_work(hand: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ValueError, match="joint"):
         tm.Objective(space="paired", contact=True)
-
-
-def test_missing_extra_is_said_before_any_work(hand: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
-    from torch_modal import extras
-
     real = extras.importlib.util.find_spec
     monkeypatch.setattr(extras.importlib.util, "find_spec", lambda name: None if name == "ipctk" else real(name))
     for make in (
@@ -427,13 +392,18 @@ def test_values_in_time_lie_on_a_curve_through_them() -> None:
     assert float(slope) == pytest.approx(float((line[301] - line[299]) * 500), rel=1e-4)
 
 
-def test_trajectory_is_free_of_crossings_and_does_not_pop(hand: Shapes) -> None:
-    options = {"bases": hand.bases, "progress": False}
-    plain = tm.subdivide(hand.keyframes, hand.faces, 5, **options)
-    frames = tm.subdivide(hand.keyframes, hand.faces, 5, contact=True, **options)
-    assert int((far(plain, hand) > 0).sum()) >= 6
+@pytest.mark.parametrize(("keys", "levels", "least"), [((0, 1), 5, 6), ((0, 1, 0), 3, 4)], ids=["pair", "smooth"])
+def test_trajectory_is_free_of_crossings_and_does_not_pop(
+    hand: Shapes, keys: tuple[int, ...], levels: int, least: int
+) -> None:
+    own = hand.pick(*keys)
+    plain, frames = (
+        tm.subdivide(own.keyframes, hand.faces, levels, contact=contact, bases=own.bases, progress=False)
+        for contact in (False, True)
+    )
+    assert int((far(plain, hand) > 0).sum()) >= least
     assert int(far(frames, hand).sum()) == 0
-    assert torch.equal(frames[[0, -1]], hand.keyframes)
+    assert torch.equal(frames[[0, -1]], own.keyframes[[0, -1]])
     assert peak_acceleration(frames) < 1.3 * peak_acceleration(plain)
 
 
@@ -449,42 +419,6 @@ def test_path_takes_any_time(hand: Shapes) -> None:
     assert torch.equal(shapes[3], hand.keyframes[1])
 
 
-def test_nearest_displacement_within_the_limit(generator: torch.Generator) -> None:
-    shapes = torch.randn(9, 5, 3, dtype=DOUBLE, generator=generator).cumsum(0) / 20
-    seen = torch.randn(7, 5, 3, dtype=DOUBLE, generator=generator)
-    seen[:, 4] *= 1e-3
-    # The coordinates of displacements turn as time goes on; accelerations are seen from outside.
-    angle = torch.linspace(0, 1.2, 7, dtype=DOUBLE)
-    turns = torch.eye(3, dtype=DOUBLE).repeat(7, 1, 1)
-    turns[:, 0, 0], turns[:, 1, 1] = angle.cos(), angle.cos()
-    turns[:, 1, 0], turns[:, 0, 1] = angle.sin(), -angle.sin()
-    limit = AccelerationLimit(shapes, turns, (True, False), 0.4)
-    wanted = torch.einsum("tij,tvi->tvj", turns, seen)
-    found, kept = limit.nearest(wanted)
-    assert kept.tolist() == [0, 1, 2, 3]
-    assert torch.equal(found[:, 4], wanted[:, 4]) and not torch.equal(found[:, 0], wanted[:, 0])
-    turned = torch.einsum("tij,tvj->tvi", turns, found)
-    displaced = shapes.clone()
-    displaced[1:-1] += turned
-    assert float((displaced[2:] - 2 * displaced[1:-1] + displaced[:-2]).norm(dim=-1).max()) < 0.4 * 1.02
-    for v in range(4):
-
-        def room(x: np.ndarray, v: int = v) -> np.ndarray:
-            rows = limit.trajectory[:, v].numpy() + limit.differences.numpy() @ x.reshape(7, 3)
-            return 0.4**2 - (rows**2).sum(1)
-
-        goal = seen[:, v].numpy().ravel()
-        best = minimize(
-            lambda x, goal=goal: ((x - goal) ** 2).sum(),
-            goal,
-            jac=lambda x, goal=goal: 2 * (x - goal),
-            constraints={"type": "ineq", "fun": room},
-            method="SLSQP",
-            options={"maxiter": 300},
-        )
-        assert float(((turned[:, v] - seen[:, v]) ** 2).sum()) == pytest.approx(best.fun, rel=0.02)
-
-
 @pytest.mark.filterwarnings("ignore:in .* in-betweens, parts still")
 def test_limit_keeps_a_trajectory_from_popping(hand: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
     # Three times the peak acceleration, if nothing but this little weight held it.
@@ -496,16 +430,6 @@ def test_limit_keeps_a_trajectory_from_popping(hand: Shapes, monkeypatch: pytest
     assert peak_acceleration(frames) < 1.3 * peak_acceleration(plain)
 
 
-def test_smooth_path_through_three_keyframes(hand: Shapes) -> None:
-    there_and_back = hand.pick(0, 1, 0)
-    options = {"bases": there_and_back.bases, "progress": False}
-    plain = tm.subdivide(there_and_back.keyframes, hand.faces, 3, **options)
-    frames = tm.subdivide(there_and_back.keyframes, hand.faces, 3, contact=True, **options)
-    assert int((far(plain, hand) > 0).sum()) >= 4
-    assert int(far(frames, hand).sum()) == 0
-    assert peak_acceleration(frames) < 1.3 * peak_acceleration(plain)
-
-
 def test_nothing_changes_where_nothing_touches(bars: Shapes) -> None:
     pair = bars.pick(0, 1)
     found = tm.subdivide(pair.keyframes, pair.faces, 2, bases=pair.bases, contact=True, progress=False)
@@ -514,8 +438,11 @@ def test_nothing_changes_where_nothing_touches(bars: Shapes) -> None:
 
 
 def test_crossings_of_keyframes_are_said_and_stay(hand: Shapes) -> None:
-    both = stuck_in_first(hand)
-    crossed = both.keyframes
+    """The tip of the little finger goes into its neighbour, in the open hand."""
+    crossed = hand.keyframes.clone()
+    reach = (crossed[0] - crossed[0, crossed[0, :, 0].argmin()]).norm(dim=-1)
+    crossed[0, :, 0] += 0.22 * torch.exp(-((reach / 0.12) ** 2))
+    both = Shapes(crossed, hand.faces, hand.bases)
     pairs = int(tm.self_contacts(crossed[0], hand.faces).number)
     assert pairs > 10
     options = {"levels": 3, "bases": hand.bases, "progress": False}
@@ -530,15 +457,6 @@ def test_crossings_of_keyframes_are_said_and_stay(hand: Shapes) -> None:
 def test_space_draws_from_tables_without_crossings(hand: Shapes) -> None:
     space = tm.ShapeSpace(hand.bases, hand.faces, contact=True, times=9)
     assert int(far(space.in_betweens.table(0, 1).double(), hand).sum()) == 0
-
-
-@pytest.mark.slow
-def test_command_line(tmp_path: Path) -> None:
-    keys = [str(file) for file in sample_files("hand")]
-    out = tmp_path / "frames"
-    assert cli.main(["subdivide", *keys, "--out", str(out), "--levels", "3", "--contact", "--quiet"]) == 0
-    files = sorted(map(str, out.glob("frame-*.ply")))
-    assert cli.main(["check", *files, "--keyframes", *keys]) == 0
 
 
 @pytest.mark.slow

@@ -1,20 +1,19 @@
 """Random transforms: their conventions, and what the shapes are that they give."""
 
-import copy
-import pickle
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-import trimesh
 from conftest import Shapes, random_rotation
 
 import torch_modal as tm
-from torch_modal.data.deformation import deform, linear_strain
+from torch_modal.data.deformation import deform
 from torch_modal.data.in_betweens import interpolate
 from torch_modal.data.samples import load_sample
+from torch_modal.data.strain import edge_strains
 from torch_modal.geometry.canonical import size
 from torch_modal.geometry.rigid import best_fit
 
@@ -77,11 +76,13 @@ def test_parameters_can_be_read_and_replayed(bars: Shapes, space: tm.ShapeSpace,
     assert bool(((first - x)[chosen].abs().amax((1, 2)) > 1e-3).all())
     second = augment(x)
     assert not torch.equal(second, first)
-    assert torch.equal(augment(x, params), first)
+    assert torch.equal(augment(x, params=params), first)
     assert augment.params is params
     # A shape's result does not depend on which others are transformed.
     alone = {**params, "batch_prob": torch.arange(6) == int(chosen.nonzero()[0])}
-    torch.testing.assert_close(augment(x, alone)[alone["batch_prob"]], first[alone["batch_prob"]], rtol=0, atol=1e-8)
+    torch.testing.assert_close(
+        augment(x, params=alone)[alone["batch_prob"]], first[alone["batch_prob"]], rtol=0, atol=1e-8
+    )
 
 
 @each_kind
@@ -90,25 +91,10 @@ def test_same_on_batch(bars: Shapes, space: tm.ShapeSpace, kind: str) -> None:
     augment(bars.keyframes)
     for value in augment.params.values():
         assert torch.equal(value, value[:1].expand_as(value))
+    assert len(augment(bars.keyframes[:0])) == 0 and "p=1.0" in repr(augment)
     if kind in ("deformation", "rigid"):
         out = augment(bars.keyframes[[1, 1, 1]])
         torch.testing.assert_close(out, out[:1].expand_as(out), rtol=0, atol=1e-9)
-
-
-@each_kind
-def test_probability_zero_changes_nothing(bars: Shapes, space: tm.ShapeSpace, kind: str) -> None:
-    assert torch.equal(KINDS[kind](p=0.0, space=space)(bars.keyframes), bars.keyframes)
-
-
-@each_kind
-def test_empty_batches(bars: Shapes, space: tm.ShapeSpace, kind: str) -> None:
-    for options in ({}, {"same_on_batch": True}):
-        augment = KINDS[kind](p=1.0, space=space, **options)
-        for pool in (None, tm.ShapeBatch.of_keyframes(space)):
-            assert augment(bars.keyframes[:0], pool=pool).shape == (0, space.n_vertices, 3)
-    keys = ("shapes", "normals", "shape_labels")
-    whole = tm.AugmentationSequential(KINDS[kind](p=1.0), data_keys=keys, space=space)
-    assert [len(part) for part in whole(bars.keyframes[:0], None, torch.zeros(0))] == [0, 0, 0]
 
 
 @each_kind
@@ -123,16 +109,6 @@ def test_single_precision_in_any_units(bars: Shapes, kind: str, scale: float) ->
             found.append(augment((factor * bars.keyframes).float(), pool=pool).double() / factor)
     for one, other in zip(found[:2], found[2:], strict=True):
         torch.testing.assert_close(one, other, rtol=0, atol=1e-4)
-
-
-@each_kind
-def test_copies_and_pickles(bars: Shapes, space: tm.ShapeSpace, kind: str) -> None:
-    augment = KINDS[kind](p=1.0, generator=seeded(), space=space)
-    clone, sent = copy.deepcopy(augment), pickle.loads(pickle.dumps(augment))
-    expected = augment(bars.keyframes)
-    assert torch.equal(clone(bars.keyframes), expected)
-    assert torch.equal(sent(bars.keyframes), expected)
-    assert "p=1.0" in repr(augment)
 
 
 def test_without_a_generator_the_global_one_is_used(bars: Shapes, space: tm.ShapeSpace) -> None:
@@ -176,7 +152,7 @@ def test_wrong_calls(bars: Shapes, space: tm.ShapeSpace) -> None:
         deformation(x.long(), space=space)
     deformation(x, space=space)
     with pytest.raises(ValueError, match="2 shapes need parameters with 2 rows"):
-        deformation(x[:2], deformation.params, space=space)
+        deformation(x[:2], params=deformation.params, space=space)
     with pytest.raises(ValueError, match="a pool holds the 3 key-frames"):
         tm.RandomInBetween(p=1.0)(x, space=space, pool=tm.ShapeBatch(x[:2]))
     with pytest.raises(ValueError, match="no in-between"):
@@ -223,7 +199,7 @@ def test_a_pool_may_be_plain_shapes(bars: Shapes, space: tm.ShapeSpace) -> None:
     transform = tm.RandomInBetween(p=1.0)
     x = bars.keyframes[:1]
     found = transform(x, space=space, pool=tm.ShapeBatch(bars.keyframes))
-    known = transform(x, transform.params, space=space, pool=tm.ShapeBatch.of_keyframes(space, x))
+    known = transform(x, params=transform.params, space=space, pool=tm.ShapeBatch.of_keyframes(space, x))
     torch.testing.assert_close(found, known, rtol=0, atol=1e-3)  # solved, and from the table
 
 
@@ -250,14 +226,6 @@ def test_nearest_key_frame_is_found_through_rigid_motions(bars: Shapes, space: t
     assert space.nearest(between).tolist() == [2]
 
 
-def test_in_betweens_are_the_same_from_either_end(bars: Shapes, space: tm.ShapeSpace) -> None:
-    x, y = 1.01 * bars.keyframes[:1], bars.keyframes[2:] + 0.01
-    t = torch.tensor([0.2], dtype=F64)
-    torch.testing.assert_close(
-        space.in_betweens.of_shapes(y, x, 1 - t, 2, 0), space.in_betweens.of_shapes(x, y, t, 0, 2)
-    )
-
-
 def test_times_and_partners_are_uniform(space: tm.ShapeSpace) -> None:
     params = tm.RandomInBetween(t=(0.2, 0.6), p=0.3, space=space).forward_parameters(4000, generator=seeded())
     t = params["t"]
@@ -278,7 +246,7 @@ def extrapolated(space: tm.ShapeSpace, x: torch.Tensor, t: float) -> torch.Tenso
         "partner": torch.zeros(2, dtype=F64),
         "t": torch.full((2,), t, dtype=F64),
     }
-    return augment(x, params)[0]
+    return augment(x, params=params)[0]
 
 
 @pytest.mark.parametrize(("i", "j"), [(0, 1), (1, 0), (2, 1)])
@@ -367,7 +335,7 @@ def test_large_draws_bend(bars: Shapes, space: tm.ShapeSpace) -> None:
     """The straight bar along its softest mode: strains stay those of the linear estimate, which itself shears."""
     x = bars.keyframes[:1]
     displacement = bars.bases[0].modes[0].mT[:, None]
-    displacement = displacement * (0.5 / linear_strain(displacement, x[0], space.edges))
+    displacement = displacement * (0.5 / edge_strains(displacement, x[0], space.reconstruction().edges).abs().max())
     bent = deform(x, displacement, x[0], space.reconstruction())
     straight = x + displacement[:, 0].mT
     initial = volume(x, bars.faces)
@@ -380,12 +348,6 @@ def test_large_draws_bend(bars: Shapes, space: tm.ShapeSpace) -> None:
     turns = [best_fit(x[0, end], bent[0, end], torch.ones(int(end.sum()), dtype=F64)).rotation for end in (left, right)]
     angle = torch.arccos(((turns[0].T @ turns[1]).trace() - 1) / 2)
     assert float(angle) > 1.5
-    # And small ones are the modes themselves, up to the rigid motion that they are aligned by.
-    small = deform(x, 1e-4 * displacement, x[0], space.reconstruction())
-    rigid = bars.bases[0].rigid_modes.flatten(1)
-    difference = ((small - x) * 1e4 - (straight - x)).flatten()
-    difference = difference - rigid.T @ (rigid @ difference)
-    assert float(difference.norm()) < 2e-3 * float((straight - x).norm())
 
 
 def test_deformation_moves_along_with_the_shape(bars: Shapes, space: tm.ShapeSpace) -> None:
@@ -394,7 +356,7 @@ def test_deformation_moves_along_with_the_shape(bars: Shapes, space: tm.ShapeSpa
     augment = tm.RandomModalDeformation(strain=0.03, p=1.0, generator=seeded(), space=space)
     for x in (bars.keyframes, torch.lerp(bars.keyframes, bars.keyframes.roll(1, 0), 0.2)):
         y = augment(x)
-        turned = augment(x @ rotation.T + move, augment.params)
+        turned = augment(x @ rotation.T + move, params=augment.params)
         torch.testing.assert_close(turned, y @ rotation.T + move)
         # It deforms only: the best rigid motion back to where it came from is none.
         back = best_fit(y, x, space.reconstruction().areas)
@@ -453,31 +415,17 @@ def test_rotations_about_an_axis() -> None:
 
 
 # ------------------------------------------------------------------------------------------------------ gradients
-@each_kind
-def test_gradients_flow_to_the_shapes(small_bars: Shapes, kind: str) -> None:
-    solver = tm.Solver(tolerance=1e-12, local_steps=0)
-    space = tm.ShapeSpace(small_bars.bases, small_bars.faces, solver=solver, dtype=F64)
-    options = {"deformation": {"strain": 0.05, "max_strain": 0.9}}.get(kind, {})
-    augment = KINDS[kind](p=1.0, generator=seeded(1), space=space, **options)
-    x = (small_bars.keyframes[:2] + 0.05 * torch.sin(3 * small_bars.keyframes[:2])).requires_grad_()
-    params = augment.forward_parameters(2)
-    tolerances = {"atol": 1e-4, "rtol": 1e-3}
-    assert torch.autograd.gradcheck(
-        lambda x: augment(x, params), [x], fast_mode=True, check_forward_ad=True, **tolerances
-    )
-
-
 def test_gradients_flow_to_parameters(small_bars: Shapes) -> None:
     space = tm.ShapeSpace(small_bars.bases, small_bars.faces, dtype=F64)
     deformation = tm.RandomModalDeformation(strain=0.05, max_strain=0.9, p=1.0, generator=seeded(), space=space)
     params = deformation.forward_parameters(3)
     noise = params["noise"].clone().requires_grad_()
     x = small_bars.keyframes
-    assert torch.autograd.gradcheck(lambda noise: deformation(x, {**params, "noise": noise}), [noise])
+    assert torch.autograd.gradcheck(lambda noise: deformation(x, params={**params, "noise": noise}), [noise])
     motion = tm.RandomRigidMotion(p=1.0, generator=seeded())
     params = motion.forward_parameters(3)
     turn = params["rotation"].clone().requires_grad_()
-    assert torch.autograd.gradcheck(lambda turn: motion(x, {**params, "rotation": turn}), [turn])
+    assert torch.autograd.gradcheck(lambda turn: motion(x, params={**params, "rotation": turn}), [turn])
 
 
 # ----------------------------------------------------------------------------------------------------- composition
@@ -488,7 +436,7 @@ def test_composition_is_its_transforms_one_after_the_other(bars: Shapes, space: 
     out = augment(x)
     step = x
     for part, params in zip(parts, augment.params, strict=True):
-        step = part(step, params, space=space)
+        step = part(step, params=params, space=space)
     torch.testing.assert_close(out, step, rtol=0, atol=1e-9)
     assert torch.equal(augment(x, params=augment.params), out)
     assert not torch.equal(augment(x), out)
@@ -536,6 +484,7 @@ def test_labels_are_blended_if_asked(bars: Shapes, space: tm.ShapeSpace) -> None
         space=space,
     )
     _, hard = beyond(bars.keyframes, one_hot)
+    assert [len(part) for part in beyond(bars.keyframes[:0], one_hot[:0])] == [0, 0]
     assert torch.equal(hard.sort(1).values, torch.tensor([[0.0, 0, 1]], dtype=F64).expand(3, 3))
 
 
@@ -565,27 +514,8 @@ def test_composition_says_what_does_not_fit(bars: Shapes, space: tm.ShapeSpace) 
     with pytest.raises(ValueError, match="times is 3"):
         tm.ShapeSpace(bars.bases, bars.faces, times=3)
     with pytest.raises(ValueError, match="one connectivity"):
-        tm.ShapeSpace([bars.bases[0], Shapes(*_other(bars)).bases[0]], bars.faces)
-
-
-def _other(bars: Shapes) -> tuple[torch.Tensor, torch.Tensor, list[tm.ModalBasis]]:
-    basis = bars.bases[0]
-    smaller = tm.ModalBasis(basis.reference[1:], basis.eigenvalues, basis.modes[:, 1:], basis.rigid_eigenvalues)
-    return bars.keyframes, bars.faces, [smaller]
-
-
-# --------------------------------------------------------------------------------------------------------- normals
-def test_normals() -> None:
-    ball = trimesh.creation.icosphere(subdivisions=3)
-    x, faces = torch.tensor(np.array(ball.vertices)), torch.tensor(np.array(ball.faces))
-    normals = tm.vertex_normals(torch.stack([x, 2 * x + 1]), faces)
-    assert float((normals - x).norm(dim=-1).max()) < 0.02
-    # Two faces at a right angle, one of three times the area; and a vertex without a face.
-    x = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, -3], [5, 5, 5]], dtype=F64)
-    found = tm.vertex_normals(x[None], torch.tensor([[0, 1, 2], [0, 1, 3]]))[0]
-    expected = torch.tensor([0.0, 3.0, 1.0], dtype=F64) / 10**0.5
-    torch.testing.assert_close(found[0], expected)
-    assert found[4].tolist() == [0, 0, 0]
+        smaller = replace(bars.bases[1], reference=bars.bases[1].reference[1:], modes=bars.bases[1].modes[:, 1:])
+        tm.ShapeSpace([bars.bases[0], smaller], bars.faces)
 
 
 # ---------------------------------------------------------------------------------------------------- many draws

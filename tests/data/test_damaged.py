@@ -14,8 +14,9 @@ from safetensors.torch import load_file, save_file
 
 import torch_modal as tm
 from torch_modal.codec.sequence import STORED
-from torch_modal.data.in_betweens import read_table, write_table
-from torch_modal.data.stored import SET_FILE, open_set, write_set
+from torch_modal.data.in_betweens import FORMAT, VERSION, read_table
+from torch_modal.data.stored import SET_FILE, StoredSet, write_set
+from torch_modal.io.tensors import write_tensors
 
 N_IN_NUMBERS = 60
 """Places among the numbers; beside all bytes of short headers."""
@@ -52,13 +53,13 @@ def made(kind: str, bars: Shapes, folder: Path) -> Case:
         return Case(path, load)
     if kind == "table":
         path, key = folder / "between-0-1.safetensors", {"key": "abc"}
-        write_table(path, bars.keyframes[:2].float().repeat(2, 1, 1), key)
+        write_tensors(path, FORMAT, VERSION, {"shapes": bars.keyframes[:2].float().repeat(2, 1, 1)}, key)
         return Case(path, lambda: [read_table(path, key)], refuses=False)
     bases = [basis.truncate(2) for basis in bars.bases[:2]]
     write_set(folder / "set", bars.keyframes[:2], bars.faces, bases, ["a", "b"], times=[1.0, 2.0, 4.0], cyclic=True)
 
     def load_set() -> list[Any]:
-        stored = open_set(folder / "set")
+        stored = StoredSet(folder / "set")
         found = [stored.names, stored.times, stored.cyclic, len(stored), stored.n_vertices]
         return [*found, stored.keyframes, stored.faces, *(part for basis in stored.bases for part in parts_of(basis))]
 

@@ -1,6 +1,5 @@
 """Key-frames that are a motion: who follows whom, and what random in-betweens of them are."""
 
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +8,7 @@ import torch
 from conftest import Shapes
 
 import torch_modal as tm
-from torch_modal.data.motion import Motion
+from torch_modal.data.stored import Motion
 
 F64 = torch.float64
 TIMES = (0.0, 0.5, 2.0, 3.0, 4.5)
@@ -46,19 +45,6 @@ def test_spans_of_successive_key_frames() -> None:
     assert Motion(range(2), 2).span(0, 1) is None and Motion(range(3), 2, cyclic=True).span(0, 1) is None
 
 
-def test_times_are_those_that_are_given() -> None:
-    assert Motion((0, 0.1, 0.7), 3).times.tolist() == [0, 0.1, 0.7]  # not rounded to float32 on the way
-
-
-def test_times_that_are_none(bar_motion: Shapes) -> None:
-    with pytest.raises(ValueError, match=r"one time for each key-frame: \(5,\)"):
-        space_of(bar_motion, keyframe_times=(0, 1))
-    with pytest.raises(ValueError, match="must ascend"):
-        space_of(bar_motion, keyframe_times=(0, 1, 1, 2, 3))
-    with pytest.raises(ValueError, match=r"need their times: range\(6\)"):
-        space_of(bar_motion, keyframe_times=None, cyclic=True)
-
-
 # ----------------------------------------------------------------------------------------------------------- shapes
 @pytest.mark.parametrize("cyclic", [False, True])
 def test_neighbours_are_joined_by_the_path_and_others_by_the_pair(bar_motion: Shapes, cyclic: bool) -> None:
@@ -79,31 +65,16 @@ def test_neighbours_are_joined_by_the_path_and_others_by_the_pair(bar_motion: Sh
         torch.testing.assert_close(space.in_betweens.of_keyframes(j, i, 1 - u), found, rtol=0, atol=1e-6)
     assert torch.equal(space.in_betweens.of_keyframes(0, 2, u), pairs.in_betweens.of_keyframes(0, 2, u))
     x = shapes.keyframes[:2] + 0.01 * torch.sin(shapes.keyframes[:2])
-    half = u[2:3]
-    found = space.in_betweens.of_shapes(x[:1], x[1:], half, 0, 1)
-    assert torch.equal(found, pairs.in_betweens.of_shapes(x[:1], x[1:], half, 0, 1))
+    given = x[:1], x[1:], u[2:3], *torch.tensor([[0], [1]]), torch.tensor([False])
+    assert torch.equal(space.in_betweens(*given), pairs.in_betweens(*given))
 
 
-def test_tables_hold_the_path_and_follow_from_times_and_key_frames(bar_motion: Shapes, tmp_path: Path) -> None:
+def test_tables_hold_the_path(bar_motion: Shapes) -> None:
     t = torch.linspace(0, 1, 23, dtype=F64)
     solved = space_of(bar_motion, times=None).in_betweens.of_keyframes(1, 2, t)
-    read = space_of(bar_motion, folder=tmp_path).in_betweens.of_keyframes(1, 2, t)
-    assert largest(read - solved) < 0.05 * largest(
-        space_of(bar_motion, keyframe_times=None).in_betweens.table(1, 2)[8] - solved[11]
-    )
-    file = tmp_path / "between-1-2.safetensors"
-    kept, when = tmp_path / "kept", file.stat().st_mtime_ns
-    shutil.copy2(file, kept)
-    space_of(bar_motion, folder=tmp_path).in_betweens.table(1, 2)
-    assert file.stat().st_mtime_ns == when
-    first = bar_motion.bases[0]
-    modes = first.modes + 0.1 * torch.sin(first.reference)
-    other = tm.ModalBasis(first.reference, first.eigenvalues, modes, first.rigid_eigenvalues)
-    changed = bar_motion._replace(bases=[other, *bar_motion.bases[1:]])
-    for shapes, times in ((bar_motion, None), (bar_motion, (0.0, 0.5, 2.0, 3.0, 4.6)), (changed, TIMES)):
-        shutil.copy2(kept, file)
-        space_of(shapes, folder=tmp_path, keyframe_times=times).in_betweens.table(1, 2)
-        assert file.stat().st_mtime_ns != when
+    read = space_of(bar_motion).in_betweens.of_keyframes(1, 2, t)
+    pair = space_of(bar_motion, keyframe_times=None).in_betweens.table(1, 2)[8]
+    assert largest(read - solved) < 0.05 * largest(pair - solved[11])
 
 
 # ------------------------------------------------------------------------------------------------------ transforms
@@ -131,15 +102,14 @@ def test_other_shapes_are_solved_with_their_partner_alone(bar_motion: Shapes) ->
     params = {name: torch.tensor([value] * 2) for name, value in (("batch_prob", True), ("partner", 0.7), ("t", 0.4))}
     augment = tm.RandomInBetween(p=1.0)
     # Of a batch: as without times.
-    assert torch.equal(augment(x, params, space=space), augment(x, params, space=pairs))
+    assert torch.equal(augment(x, params=params, space=space), augment(x, params=params, space=pairs))
     # Of the key-frames: the one after the nearest.
     pool = tm.ShapeBatch.of_keyframes(space, x)
-    found = augment(x, params, space=space, pool=pool)
+    found = augment(x, params=params, space=space, pool=pool)
     nearest = space.nearest(x)
     for row, i in enumerate(nearest.tolist()):
-        expected = pairs.in_betweens.of_shapes(
-            x[row : row + 1], bar_motion.keyframes[i + 1 : i + 2], params["t"][:1], i, i + 1
-        )
+        ends = x[row : row + 1], bar_motion.keyframes[i + 1 : i + 2]
+        expected = pairs.in_betweens(*ends, params["t"][:1], *torch.tensor([[i], [i + 1]]), torch.tensor([False]))
         torch.testing.assert_close(found[row : row + 1], expected, rtol=0, atol=1e-6)
 
 

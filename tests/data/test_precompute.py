@@ -16,7 +16,7 @@ from torch_modal.cli import main as cli
 from torch_modal.data import precompute_set
 from torch_modal.data.precompute_set import FAILURE_FILE, Options, Record, read_record
 from torch_modal.data.precompute_tree import printable
-from torch_modal.data.stored import LABELS_FILE, SET_FILE, find_sets, open_set, write_set
+from torch_modal.data.stored import LABELS_FILE, SET_FILE, StoredSet, find_sets, write_set
 from torch_modal.io.frames import save_frames
 
 # In place of the process that computes a set: the set's name says what becomes of it. The package itself starts it,
@@ -139,7 +139,7 @@ def test_bad_sets_are_named_and_do_not_stop_the_others(bench: Bench, monkeypatch
     for name in done:
         record = bench.record(name)
         assert record.status == "done"
-        assert len(open_set(bench.out / name)) == 3
+        assert len(StoredSet(bench.out / name)) == 3
     assert find_sets(bench.out) == sorted(bench.out / name for name in done)
     # The summary names them for somebody who did not watch.
     summary = bench.said[bench.said.index(next(line for line in bench.said if "have their bases" in line)) :]
@@ -164,17 +164,17 @@ def test_names_that_are_no_text(bench: Bench) -> None:
 
 
 def test_processes_have_one_thread_and_as_many_run_as_asked(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    alive, most, wait = [], [], precompute_set._wait
+    alive, most, run = [], [], precompute_set._in_own_process
 
     def counting(*args: object) -> object:
         alive.append(1)
         most.append(len(alive))
         try:
-            return wait(*args)  # type: ignore[arg-type]
+            return run(*args)  # type: ignore[arg-type]
         finally:
             alive.pop()
 
-    monkeypatch.setattr(precompute_set, "_wait", counting)
+    monkeypatch.setattr(precompute_set, "_in_own_process", counting)
     bench.add(*(f"s{i}" for i in range(7)))
     assert bench.run("--workers", "3") == 0
     assert max(most) == 3
@@ -237,12 +237,7 @@ def test_changed_files_and_options_are_computed_again(bench: Bench) -> None:
     assert bench.run("--modes", "40") == 0 and bench.computed() == ["a", "b"]
     assert bench.record("b").reason == "its files or options changed"
     assert bench.run("--modes", "40", "--timeout", "5", "--workers", "1") == 0 and bench.computed() == []
-    times = bench.root / "a" / "times.txt"
-    times.write_text("0 1")
-    assert bench.run("--modes", "40") == 0 and bench.computed() == []  # nobody asked for them
     assert bench.run("--modes", "40", "--sequence") == 0 and bench.computed() == ["a", "b"]
-    times.write_text("0 2")
-    assert bench.run("--modes", "40", "--sequence") == 0 and bench.computed() == ["a"]
 
 
 def test_bases_of_earlier_files_are_named_when_the_new_ones_fail(bench: Bench) -> None:
@@ -253,7 +248,7 @@ def test_bases_of_earlier_files_are_named_when_the_new_ones_fail(bench: Bench) -
     worker.write_text("raise SystemExit(1)")
     assert bench.run() == 3
     assert bench.record("a").warnings == [f"{bench.out / 'a'} still holds the bases of earlier files or options"]
-    assert len(open_set(bench.out / "a")) == 3
+    assert len(StoredSet(bench.out / "a")) == 3
     assert bench.run() == 3 and bench.computed() == ["a"]  # it is not tried again
     worker.write_text(FAKE)
     assert bench.run("--retry") == 0 and bench.record("a").status == "done"
@@ -268,12 +263,12 @@ def test_stored_sets_of_others_are_replaced_only_if_asked(bench: Bench, bars: Sh
     (bench.out / "c" / SET_FILE).write_bytes((bench.out / "a" / SET_FILE).read_bytes()[:-1])
     for _ in range(2):
         assert bench.run() == 3
-        assert len(open_set(bench.out / "a")) == 2
+        assert len(StoredSet(bench.out / "a")) == 2
         said = "holds a damaged set, or one that this command did not write; use --overwrite"
         assert sum(line.endswith(said) for line in bench.said if line.startswith("  failed")) == 2
     assert bench.computed() == ["b"]
     assert bench.run("--overwrite") == 0 and bench.computed() == ["a", "c"]
-    assert len(open_set(bench.out / "a")) == 3
+    assert len(StoredSet(bench.out / "a")) == 3
     # From then on it is ours.
     (bench.root / "a" / "1.obj").write_text("v 5 0 0")
     assert bench.run() == 0 and bench.computed() == ["a"]
@@ -347,13 +342,13 @@ def test_real_sets(capsule: tuple[np.ndarray, np.ndarray], tmp_path: Path, capsy
     assert said[1] == "  failed twice: 2 files have the name frame-000; a shape must be there in one format only"
     assert [path.name for path in find_sets(out)] == ["good", "order"]
 
-    stored = open_set(out / "good")
+    stored = StoredSet(out / "good")
     assert json.loads(stored.note)["status"] == "done"
     keyframes, own_faces = tm.load_keyframes(sorted((root / "good").glob("*.obj")))
     assert torch.equal(stored.keyframes, keyframes) and torch.equal(stored.faces, own_faces)
     assert stored.names == ("key-000.obj", "key-001.obj")
-    assert open_set(out / "order").names == ("frame-9.obj", "frame-10.obj")
-    torch.testing.assert_close(open_set(out / "order").keyframes, torch.from_numpy(shapes[9:]), rtol=0, atol=0)
+    assert StoredSet(out / "order").names == ("frame-9.obj", "frame-10.obj")
+    torch.testing.assert_close(StoredSet(out / "order").keyframes, torch.from_numpy(shapes[9:]), rtol=0, atol=0)
     for mine, its in zip(tm.extract_bases(keyframes, own_faces, 4, mesher="lattice"), stored.bases, strict=True):
         torch.testing.assert_close(its.eigenvalues, mine.eigenvalues)
         torch.testing.assert_close(its.modes, mine.modes, rtol=1e-6, atol=1e-9)
@@ -377,7 +372,7 @@ def test_times_of_a_sequence(
             (source / "times.txt").write_text(times)
         options = Options(sequence=sequence)
         precompute_set.compute(source, target, Record(key=options.key(files)), options)
-        return open_set(target)
+        return StoredSet(target)
 
     for text, expected, cyclic in (
         (None, (0, 1, 2), False),

@@ -20,7 +20,7 @@ import torch_modal as tm
 from torch_modal.cli import main as cli
 from torch_modal.data.precompute_set import DONE, Options, run_set
 from torch_modal.data.precompute_tree import precompute_tree
-from torch_modal.data.stored import SET_FILE, find_sets, open_set
+from torch_modal.data.stored import SET_FILE, StoredSet, find_sets
 from torch_modal.io.frames import save_frames
 
 OPTIONS = Options(n_modes=4, mesher="lattice")  # the lattice always gives the same tetrahedra
@@ -66,7 +66,7 @@ def test_two_commands_on_one_output_folder_at_once(tmp_path: Path) -> None:
     said = [one.communicate(timeout=300)[0] for one in both]
     assert [one.returncode for one in both] == [0, 0], said
     assert all("4 of 4 sets have their bases" in text for text in said)
-    assert all(len(open_set(folder).bases) == 2 for folder in find_sets(out)) and len(find_sets(out)) == 4
+    assert all(len(StoredSet(folder).bases) == 2 for folder in find_sets(out)) and len(find_sets(out)) == 4
     assert not list(out.rglob(".*"))
     said = []  # the results are current, whoever's they are
     precompute_tree(root, out, OPTIONS, workers=2, say=said.append)

@@ -75,7 +75,9 @@ def test_key_depends_on_names_content_and_options(tmp_path: Path) -> None:
     (tmp_path / "s" / "times.txt").write_text("nor does this, unless it is a sequence")
     os.utime(tmp_path / "s" / "1.obj", (0, 0))
     assert key(timeout=5.0, retry=True, overwrite=True, cache_dir="x") == first
-    seen = {first, key(sequence=True), key(n_modes=40), key(method="shell"), key(mesher="tetwild")}
+    in_time = key(sequence=True)
+    (tmp_path / "s" / "times.txt").write_text("0 2")
+    seen = {first, in_time, key(sequence=True), key(n_modes=40), key(method="shell"), key(mesher="tetwild")}
     for change in (
         lambda: (tmp_path / "s" / "1.obj").write_text("v 0 0 0"),
         lambda: (tmp_path / "s" / "2.obj").rename(tmp_path / "s" / "3.obj"),
@@ -84,4 +86,4 @@ def test_key_depends_on_names_content_and_options(tmp_path: Path) -> None:
     ):
         change()
         seen.add(key())
-    assert len(seen) == 9
+    assert len(seen) == 10

@@ -6,17 +6,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-import trimesh
-from conftest import Shapes, random_rotation
+from conftest import Shapes
 from solids import box, surface
 from torch import Tensor
 from torch.autograd import gradcheck
 
 from torch_modal.energy.bend import Bend, dihedral_angle, wrap_angle
 from torch_modal.energy.shell import ShellEnergy
-from torch_modal.energy.stretch import Stretch
-from torch_modal.energy.term import Mesh, Term
-from torch_modal.energy.volume import Volume
 
 TRIANGLE = torch.tensor([[0, 1, 2]])
 HINGE = torch.tensor([[0, 1, 2], [1, 0, 3]])
@@ -77,11 +73,6 @@ def test_energies_by_hand(faces: Tensor, x: Any, rest: Any, stiffness: dict[str,
     assert float(ShellEnergy(faces, **stiffness)(x, rest)) == pytest.approx(energy, rel=1e-9)
 
 
-@pytest.mark.parametrize("fold", [-2.0, -0.3, 0.3, 3.0])
-def test_angles_by_hand(fold: float) -> None:
-    assert ShellEnergy(HINGE).measure(hinge(fold)).angle.tolist() == pytest.approx([fold])
-
-
 def test_wrap_angle() -> None:
     angles = torch.linspace(-10, 10, 401, dtype=torch.float64)
     wrapped = wrap_angle(angles)
@@ -117,29 +108,7 @@ def test_convex_edges_have_positive_angles(brick: tuple[Tensor, Tensor]) -> None
     assert angle[~bent].abs().max() < 1e-13
 
 
-def test_measures_agree_with_trimesh(pair: tuple[Tensor, Tensor, Tensor]) -> None:
-    x, _, faces = pair
-    truth = trimesh.Trimesh(x.numpy(), faces.numpy(), process=False)
-    measures = ShellEnergy(faces).measure(x)
-    assert float(measures.volume) == pytest.approx(truth.volume, rel=1e-12)
-    convex = np.where(truth.face_adjacency_convex, 1, -1)
-    signed = np.sort(truth.face_adjacency_angles * convex)
-    np.testing.assert_allclose(measures.angle.sort().values.numpy(), signed, atol=1e-7)
-    np.testing.assert_allclose(measures.length.sort().values.numpy(), np.sort(truth.edges_unique_length), rtol=1e-12)
-
-
 # ------------------------------------------------------------------------------------------------- invariances
-
-
-def test_rigid_motions_change_nothing(pair: tuple[Tensor, Tensor, Tensor], generator: torch.Generator) -> None:
-    x, rest, faces = pair
-    shell = ShellEnergy(faces)
-    energy = float(shell(x, rest))
-    assert energy > 1e3
-    for _ in range(5):
-        turned = [shape @ random_rotation(generator).mT + 50 for shape in (x, rest)]
-        assert float(shell(*turned)) == pytest.approx(energy, rel=1e-10)
-        assert float(shell(turned[0], x)) == pytest.approx(0, abs=1e-18 * energy)
 
 
 def test_translation_of_an_open_surface_changes_nothing(pair: tuple[Tensor, Tensor, Tensor]) -> None:
@@ -154,7 +123,7 @@ def test_translation_of_an_open_surface_changes_nothing(pair: tuple[Tensor, Tens
 def test_zero_at_rest_only(pair: tuple[Tensor, Tensor, Tensor], generator: torch.Generator) -> None:
     x, _, faces = pair
     shell = ShellEnergy(faces)
-    assert float(shell(x, x)) == 0
+    assert float(shell(x, x)) == 0 and shell(x.expand(2, 1, -1, -1), x.expand(3, -1, -1)).shape == (2, 3)
     (gradient,) = torch.autograd.grad(shell(x.requires_grad_(), x.detach()), x)
     assert gradient.abs().max() == 0
     noise = 1e-3 * torch.randn(20, *x.shape, dtype=torch.float64, generator=generator)
@@ -178,20 +147,6 @@ def test_residuals_square_to_the_energy(pair: tuple[Tensor, Tensor, Tensor]) -> 
         assert float((part**2).sum()) == pytest.approx(float(alone(x, rest)), rel=1e-13)
 
 
-def test_cardinality_broadcasts(pair: tuple[Tensor, Tensor, Tensor], generator: torch.Generator) -> None:
-    x, rest, faces = pair
-    xs = x + torch.randn(2, 1, *x.shape, dtype=torch.float64, generator=generator)
-    rests = rest + torch.randn(3, *x.shape, dtype=torch.float64, generator=generator)
-    shell = ShellEnergy(faces)
-    energies, residuals = shell(xs, rests), shell.residuals(xs, rests)
-    assert energies.shape == (2, 3)
-    assert residuals.shape[:2] == (2, 3)
-    for i in range(2):
-        for j in range(3):
-            assert float(energies[i, j]) == pytest.approx(float(shell(xs[i, 0], rests[j])), rel=1e-13)
-            torch.testing.assert_close(residuals[i, j], shell.residuals(xs[i, 0], rests[j]), atol=1e-12, rtol=0)
-
-
 def test_one_stiffness_per_sample(pair: tuple[Tensor, Tensor, Tensor]) -> None:
     x, rest, faces = pair
     values = [torch.tensor(v, dtype=torch.float64)[:, None] for v in ([1.0, 500.0], [10.0, 0.1], [7.0, 1000.0])]
@@ -213,9 +168,10 @@ def test_low_precision_is_computed_in_float32(
 # ------------------------------------------------------------------------------------------------- derivatives
 
 
-def test_gradcheck_away_from_rest(pair: tuple[Tensor, Tensor, Tensor]) -> None:
+@pytest.mark.parametrize("cut", [0, 6], ids=["closed", "open"])
+def test_gradcheck_away_from_rest(cut: int, pair: tuple[Tensor, Tensor, Tensor]) -> None:
     # A tenth of the size, a fifth larger: stretching, bending and volume are then of one magnitude.
-    x, rest, faces = (pair[0] * 0.12).requires_grad_(), (pair[1] * 0.1).requires_grad_(), pair[2]
+    x, rest, faces = (pair[0] * 0.12).requires_grad_(), (pair[1] * 0.1).requires_grad_(), pair[2][cut:]
     stiffness = [torch.tensor(s, dtype=torch.float64, requires_grad=True) for s in (5.0, 1.0, 30.0)]
 
     def energy(x: Tensor, rest: Tensor, *stiffness: Tensor) -> Tensor:
@@ -224,20 +180,6 @@ def test_gradcheck_away_from_rest(pair: tuple[Tensor, Tensor, Tensor]) -> None:
     gradients = torch.autograd.grad(energy(x, rest, *stiffness), (x, rest, *stiffness))
     assert all(float(g.abs().max()) > 0.1 for g in gradients), "a check at rest would compare 0 with 0"
     assert gradcheck(energy, (x, rest, *stiffness), atol=1e-6)
-
-
-def test_gradcheck_of_an_open_surface(pair: tuple[Tensor, Tensor, Tensor]) -> None:
-    x, rest, faces = (pair[0] * 0.1).requires_grad_(), (pair[1] * 0.1).requires_grad_(), pair[2][6:]
-    shell = ShellEnergy(faces, 0.0, 0.0, 30.0)
-    assert gradcheck(shell, (x, rest), atol=1e-6)
-
-
-@pytest.mark.parametrize("term", [Stretch(), Bend(), Volume()], ids=lambda term: type(term).__name__)
-def test_closed_forms_are_the_gradients(term: Term, generator: torch.Generator) -> None:
-    n = term.elements(Mesh.of(torch.tensor([[0, 1, 2], [0, 2, 3]]), 4)).shape[1] - 1
-    edge_vectors = torch.randn(n, 3, 50, dtype=torch.float64, generator=generator)
-    truth = Term.gradients(term, edge_vectors)
-    torch.testing.assert_close(term.gradients(edge_vectors), truth, atol=1e-10, rtol=1e-10)
 
 
 def test_gradcheck_of_the_angle_through_half_a_turn() -> None:

@@ -18,7 +18,6 @@ from torch_modal.energy.modal_energy import ModalEnergy
 from torch_modal.energy.stretch import Stretch
 from torch_modal.energy.term import Mesh, PeriodicTerm, Term
 from torch_modal.energy.volume import Volume
-from torch_modal.inbetween.joint import coarse_values
 
 DOUBLE = torch.float64
 
@@ -63,54 +62,21 @@ def test_angles_of_any_number_of_shapes_are_one_reference(generator: torch.Gener
     angles, weights = (torch.rand(5, 40, dtype=DOUBLE, generator=generator) for _ in range(2))
     angles = 20 * angles - 10
     term, at = PeriodicTerm(), torch.linspace(-4, 4, 40, dtype=DOUBLE)
-    merged = term.merged(angles, weights)
+    rows, whole, _ = term.merged(angles, weights)
     versine = 1 - (at - angles).cos()
     truth = (weights * (2 * versine + versine**2 / 3)).sum(0)
-    torch.testing.assert_close(term.energies(at, merged.measures, merged.weights), truth)
-    slope = lambda x: term.slopes(x, merged.measures, merged.weights)  # noqa: E731
-    rate = lambda x: term.energies(x, merged.measures, merged.weights).sum()  # noqa: E731
+    torch.testing.assert_close(term.energies(at, rows, whole), truth)
+    slope = lambda x: term.slopes(x, rows, whole)  # noqa: E731
+    rate = lambda x: term.energies(x, rows, whole).sum()  # noqa: E731
     torch.testing.assert_close(slope(at), torch.func.grad(rate)(at))
-    bound, beyond = term.curvatures(at, merged.measures, merged.weights)
+    bound, beyond = term.curvatures(at, rows, whole)
     torch.testing.assert_close(bound + beyond, torch.func.grad(lambda x: slope(x).sum())(at))
     assert bool((beyond <= 1e-12).all())
-    alone = term.merged(torch.zeros(1, 3, dtype=DOUBLE), torch.ones(1, 3, dtype=DOUBLE))
+    alone, of_one, _ = term.merged(torch.zeros(1, 3, dtype=DOUBLE), torch.ones(1, 3, dtype=DOUBLE))
     half_a_turn = math.pi + torch.tensor([-1e-9, 0, 1e-9], dtype=DOUBLE)
-    assert float(term.slopes(half_a_turn, alone.measures, alone.weights).abs().max()) < 1e-8
+    assert float(term.slopes(half_a_turn, alone, of_one).abs().max()) < 1e-8
     small = torch.tensor([1e-5, 0.1, math.radians(60)], dtype=DOUBLE)
-    assert float((term.energies(small, alone.measures, alone.weights) / small**2 - 1).abs().max()) < 0.013
-
-
-@pytest.mark.parametrize("kind", ["area", "spring"])
-@pytest.mark.parametrize("local_steps", [0, 2])
-def test_a_term_of_ones_own_against_central_differences(kind: str, local_steps: int, bars: Shapes) -> None:
-    """It changes the result, and gradients reach its stiffness, the key-frames and the time through all steps."""
-    x_a, x_b = bars.keyframes[1:]
-    weights = torch.randn(x_a.shape, dtype=DOUBLE, generator=torch.Generator().manual_seed(4))
-    point = x_a[[7]] + torch.tensor([0.1, 0.2, -0.1], dtype=DOUBLE)
-
-    def layer_of(stiffness: Any) -> tm.InBetween:
-        term = Area(stiffness) if kind == "area" else Spring([7], point, stiffness)
-        chosen: Any = modal(coarse_faces=200, tolerance=1e-13)
-        objective = replace(chosen["objective"], terms=(term,))
-        return tm.InBetween(
-            bars.bases[1:], bars.faces, objective=objective, solver=replace(chosen["solver"], local_steps=local_steps)
-        )
-
-    values = {"stiffness": torch.tensor(40.0, dtype=DOUBLE), "x_a": x_a, "t": torch.tensor(0.4, dtype=DOUBLE)}
-
-    def value(stiffness: Tensor, x_a: Tensor, t: Tensor) -> Tensor:
-        return (layer_of(stiffness)(x_a, x_b, t) * weights).sum()
-
-    leaves = {name: tensor.clone().requires_grad_() for name, tensor in values.items()}
-    gradients = dict(zip(leaves, torch.autograd.grad(value(**leaves), list(leaves.values())), strict=True))
-    with torch.no_grad():
-        assert float((layer_of(40.0)(x_a, x_b, 0.4) - layer_of(0.0)(x_a, x_b, 0.4)).abs().max()) > 1e-4
-        generator = torch.Generator().manual_seed(1)
-        for name, step in (("stiffness", 1e-2), ("x_a", 1e-5), ("t", 1e-5)):
-            along = torch.randn(values[name].shape, dtype=DOUBLE, generator=generator)
-            ends = [value(**{**values, name: values[name] + s * step * along}) for s in (-2, -1, 1, 2)]
-            slope = (ends[0] - 8 * ends[1] + 8 * ends[2] - ends[3]) / (12 * step)
-            assert float((gradients[name] * along).sum()) == pytest.approx(float(slope), rel=1e-5)
+    assert float((term.energies(small, alone, of_one) / small**2 - 1).abs().max()) < 0.013
 
 
 def test_a_stiff_spring_holds_its_vertex(bars: Shapes, generator: torch.Generator) -> None:
@@ -169,20 +135,6 @@ def test_a_soft_part_takes_the_deformation(bars: Shapes) -> None:
     lengths = [(x[end] - x[start]).norm(dim=-1) for x in (blind(x_a, x_b, 0.5), knowing(x_a, x_b, 0.5), x_a)]
     change = [(now / lengths[2] - 1).abs() for now in lengths[:2]]
     assert float(change[1][alpha < 500].mean()) > float(change[0][alpha < 500].mean())
-
-
-def test_coarse_values_by_hand() -> None:
-    # Two clusters of two vertices, and one alone; edges 01, 12, 23, 34 and coarse edges between clusters.
-    fine = Energy(Mesh.of(torch.tensor([[0, 1, 2], [2, 3, 4]]), 5), [Stretch()]).parts[0]
-    coarse = Energy(Mesh.of(torch.tensor([[0, 1, 2]]), 3), [Stretch()]).parts[0]
-    assert fine.corners.T.tolist() == [[0, 1], [0, 2], [1, 2], [2, 3], [2, 4], [3, 4]]
-    clusters = torch.tensor([0, 0, 1, 1, 2])
-    values = torch.tensor([[1.0, 2.0, 3.0, 4.0, 5.0, 6.0]])
-    # Cluster 0 has the ends of 1, 1, 2, 3; cluster 1 of 2, 3, 4, 4, 5, 6; cluster 2 of 5, 6.
-    zero, one, two = 7 / 4, 24 / 6, 11 / 2
-    found = coarse_values(values, fine, coarse, clusters, 3)
-    assert found[0].tolist() == pytest.approx([(zero + one) / 2, (zero + two) / 2, (one + two) / 2])
-    assert torch.equal(coarse_values(values[:, :1], fine, coarse, clusters, 3), values[:, :1])
 
 
 @pytest.mark.parametrize("shape", [(4,), (3, 2)])

@@ -113,14 +113,6 @@ def test_gradcheck(function: Callable[[Tensor], Tensor], angle: float) -> None:
     assert gradgradcheck(function, start)
 
 
-@pytest.mark.parametrize("axis", [[1, 0, 0], [0, -1, 0], [1, -2, 0.5]])
-def test_gradients_at_half_a_turn_are_those_of_one_side(axis: list[float]) -> None:
-    side = sum(a * b for a, b in zip(axis, HALF_TURN_SIDE, strict=True))
-    w = torch.tensor(axis, dtype=F64) * math.copysign(math.pi, side) / math.hypot(*axis)
-    jacobian = torch.func.jacrev(lambda w: log(exp(w)))(w)
-    torch.testing.assert_close(jacobian, torch.eye(3, dtype=F64), rtol=0, atol=1e-12)
-
-
 @pytest.mark.parametrize("w", [[0.0, 0, 0], [1e-5, -2e-5, 0], [BORDER, 1e-3, 0], [0.2, 1.0, -0.4]])
 def test_third_derivatives_are_those_of_the_matrix_exponential(w: list[float]) -> None:
     def third(function: Callable[[Tensor], Tensor]) -> Tensor:
@@ -133,19 +125,3 @@ def test_third_derivatives_are_those_of_the_matrix_exponential(w: list[float]) -
 
 
 # ------------------------------------------------------------------------------------------------------- transforms
-@pytest.mark.parametrize("function", [exp, lambda w: log(exp(w)), through_quaternions], ids=["exp", "log", "all"])
-def test_vmap_and_its_gradients(function: Callable[[Tensor], Tensor]) -> None:
-    w = torch.cat([turns(angle, 2) for angle in ANGLES]).reshape(-1, 2, 3)
-    torch.testing.assert_close(torch.func.vmap(function)(w), torch.stack([function(one) for one in w]))
-    slopes = torch.func.vmap(torch.func.grad(lambda w: function(w).square().sum()))(w)
-    copy = w.clone().requires_grad_()
-    (truth,) = torch.autograd.grad(function(copy).square().sum(), copy)
-    torch.testing.assert_close(slopes, truth)
-
-
-@pytest.mark.slow
-def test_dynamo() -> None:
-    w = torch.cat([turns(angle, 2) for angle in ANGLES])
-    for function in (exp, lambda w: log(exp(w)), through_quaternions):
-        compiled = torch.compile(function, backend="aot_eager", fullgraph=True)
-        torch.testing.assert_close(compiled(w), function(w))

@@ -5,7 +5,6 @@ import pickle
 
 import numpy as np
 import pytest
-import trimesh
 
 from torch_modal.geometry import connectivity
 from torch_modal.geometry.connectivity import Connectivity, connected_pieces
@@ -110,20 +109,6 @@ def test_vertex_areas() -> None:
     # Three right triangles of 1/2 at the origin and one of sqrt(3)/2 opposite; vertex 4 belongs to no face.
     tip = (1 + np.sqrt(3) / 2) / 3
     np.testing.assert_allclose(connectivity.vertex_areas(corner, TETRAHEDRON), [0.5, tip, tip, tip, 0], rtol=1e-14)
-
-
-def test_agrees_with_trimesh(capsule: tuple[np.ndarray, np.ndarray]) -> None:
-    vertices, faces = capsule
-    closed = trimesh.Trimesh(vertices, faces, process=False)
-    mesh = Connectivity(faces)
-    assert (mesh.counts == 2).all()
-    assert len(vertices) - len(mesh.edges) + len(faces) == 2  # Euler, genus 0
-    rows = mesh.hinges
-    key = np.lexsort(np.sort(rows[:, :2], 1).T)
-    theirs = np.lexsort(closed.face_adjacency_edges.T)
-    np.testing.assert_array_equal(np.sort(rows[key, :2], 1), closed.face_adjacency_edges[theirs])
-    np.testing.assert_array_equal(np.sort(rows[key, 2:], 1), np.sort(closed.face_adjacency_unshared[theirs], 1))
-    assert connectivity.vertex_areas(vertices, faces).sum() == pytest.approx(closed.area, rel=1e-12)
 
 
 def test_spanning_forest_takes_what_is_cheap() -> None:

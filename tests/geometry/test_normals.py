@@ -68,10 +68,3 @@ def test_derivatives_and_transforms(shape: tuple[Tensor, Tensor]) -> None:
     batch = torch.stack([y, 2 * y + y.sin()])
     mapped = torch.func.vmap(lambda y: vertex_normals(y, faces))(batch)
     torch.testing.assert_close(mapped, vertex_normals(batch, faces))
-
-
-@pytest.mark.slow
-def test_dynamo(shape: tuple[Tensor, Tensor]) -> None:
-    x, faces = shape
-    compiled = torch.compile(lambda x: vertex_normals(x, faces), backend="aot_eager", fullgraph=True)
-    torch.testing.assert_close(compiled(x), vertex_normals(x, faces))

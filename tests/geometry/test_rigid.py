@@ -192,40 +192,7 @@ def test_half_turn_is_a_choice_and_no_nan(axis: list[float], cloud: Tensor) -> N
     assert gradient.isfinite().all()
 
 
-def test_gradcheck_fraction() -> None:
-    source, target = (torch.tensor(x, dtype=torch.float64, requires_grad=True) for x in ([1.0, 2, 3], [4.0, 0, 1]))
-    t = time(0.4).requires_grad_()
-    for angle in (0.0, 1e-7, 2.0):
-        # Through a rotation vector, as a rotation matrix must not be perturbed freely.
-        start = about([1, 2, -1], angle)
-
-        def part(w: Tensor, t: Tensor, s: Tensor, e: Tensor, start: Tensor = start) -> Tensor:
-            zero = torch.zeros_like(w[0])
-            skew = torch.stack([zero, -w[2], w[1], w[2], zero, -w[0], -w[1], w[0], zero]).reshape(3, 3)
-            moved = motion_by(torch.linalg.matrix_exp(skew) @ start, s, e).fraction(t)
-            return torch.cat([moved.rotation.flatten(), moved.target])
-
-        w = torch.zeros(3, dtype=torch.float64, requires_grad=True)
-        assert gradcheck(part, (w, t, source, target), atol=1e-6), f"angle {angle}"
-
-
 # ------------------------------------------------------------------------------------------------------- blend
-
-
-@pytest.fixture
-def deformed(cloud: Tensor, generator: torch.Generator) -> Tensor:
-    noise = torch.randn(cloud.shape, dtype=torch.float64, generator=generator)
-    return (cloud + 0.5 * noise) @ about([0, 1, 1], 1.5).mT + 3
-
-
-def test_blend_commutes_with_rigid_motions(
-    cloud: Tensor, deformed: Tensor, weights: Tensor, generator: torch.Generator
-) -> None:
-    turn, move = random_rotation(generator), torch.tensor([7.0, -8.0, 9.0], dtype=torch.float64)
-    for t in (0.0, 0.25, 0.5, 0.9):
-        moved_before = blend(cloud @ turn.mT + move, deformed @ turn.mT + move, time(t), weights)
-        moved_after = blend(cloud, deformed, time(t), weights) @ turn.mT + move
-        torch.testing.assert_close(moved_before, moved_after, atol=1e-11, rtol=0)
 
 
 def distances(x: Tensor) -> Tensor:

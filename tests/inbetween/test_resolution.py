@@ -5,13 +5,11 @@ import pytest
 import torch
 import trimesh
 from bodies import body
-from conftest import Shapes
 
 import torch_modal as tm
-from torch_modal.energy.term import Mesh
 from torch_modal.geometry.connectivity import Connectivity, connected_pieces
-from torch_modal.inbetween.coarse import ENOUGH_FACES, spread, stretching
-from torch_modal.precompute.coarsening import FACES_OF_PIECE, coarsen
+from torch_modal.inbetween.coarse import ENOUGH_FACES
+from torch_modal.modes.coarsening import FACES_OF_PIECE, coarsen
 
 
 @pytest.mark.parametrize("name, most", [("wire bent 60", 0.1), ("bar twisted 60", 0.05)])
@@ -32,25 +30,6 @@ def test_fast_resolves_thin_limbs(name: str, most: float) -> None:
     assert error(found) < most * error((first + last) / 2)
     n_faces = len(layer.core.space.coarse.faces)
     assert n_faces <= (ENOUGH_FACES if name.startswith("wire") else 300), "more than a body of one thickness needs"
-
-
-def test_spread_by_hand() -> None:
-    fine = torch.diag(torch.tensor([1.0, 100.0, 4.0], dtype=torch.float64))
-    assert spread(fine, 0.1 * fine) == pytest.approx(1.0, rel=1e-4)
-    assert spread(fine, torch.diag(torch.tensor([0.5, 100.0, 12.0], dtype=torch.float64))) == pytest.approx(6, rel=1e-4)
-    # Directions in which neither has any stiffness count as alike, up to the uniform factor.
-    loose = torch.diag(torch.tensor([1.0, 100.0, 0.0], dtype=torch.float64))
-    assert spread(loose, 3 * loose) == pytest.approx(1.5, rel=1e-4)
-    assert spread(fine, loose) > 1e4
-
-
-def test_stretching_is_the_hessian_of_the_energy(bars: Shapes) -> None:
-    x, modes = bars.keyframes[0], bars.bases[0].modes[:3]
-    shell = tm.ShellEnergy(bars.faces, alpha=1.0, beta=0.0, gamma=0.0)
-    amplitudes = torch.zeros(3, dtype=torch.float64)
-    hessian = torch.autograd.functional.hessian(lambda a: shell(x + torch.einsum("k,kvc->vc", a, modes), x), amplitudes)
-    found = stretching(Mesh.of(bars.faces, len(x)), x, modes)
-    torch.testing.assert_close(2 * found, hessian)
 
 
 def test_pieces_keep_faces() -> None:

@@ -17,7 +17,7 @@ from torch_modal.energy.volume import encloses
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.rigid import blend
 from torch_modal.inbetween.coarse import resolving
-from torch_modal.precompute.coarsening import Collapses, coarsen
+from torch_modal.modes.coarsening import coarsen, collapsed
 from torch_modal.solve.minimise import Status
 
 BACKENDS = ["torch", "warp"]
@@ -66,29 +66,6 @@ def test_a_strip_rolls_up(backend: str, dtype: torch.dtype, turns: float) -> Non
         truth = roll(float(time), turns)
         assert edge_error(x.double(), truth, faces()) < 0.03 * edge_error(linear(flat, end), roll(0.5, turns), faces())
     assert edge_error(result.shapes[1].double(), roll(0.5, turns), faces()) < 0.01
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_gradients_of_a_roll(backend: str) -> None:
-    """Against finite differences, in a random direction of both key-frames and the time."""
-    generator = torch.Generator().manual_seed(0)
-    ends = torch.stack([roll(0), roll(1)])
-    layer = tm.InBetween(bases(*ends), faces(), solver=tm.Solver(backend=backend, tolerance=1e-10))
-    ends = ends + 0.003 * torch.randn(ends.shape, dtype=torch.float64, generator=generator)
-    weights, move = (torch.randn(ends.shape, dtype=torch.float64, generator=generator) for _ in range(2))
-    t = torch.tensor(0.4, dtype=torch.float64)
-
-    def value(ends: Tensor, t: Tensor) -> Tensor:
-        return (weights[0] * layer(ends[0], ends[1], t)).sum()
-
-    given = [ends.requires_grad_(), t.requires_grad_()]
-    by_ends, by_time = torch.autograd.grad(value(*given), given)
-    step = 1e-6
-    with torch.no_grad():
-        found = (value(ends + step * move, t) - value(ends - step * move, t)) / (2 * step)
-        in_time = (value(ends, t + step) - value(ends, t - step)) / (2 * step)
-    torch.testing.assert_close((by_ends * move).sum(), found, rtol=1e-3, atol=1e-3 * float(by_ends.norm()))
-    torch.testing.assert_close(by_time, in_time, rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -163,7 +140,7 @@ def test_the_coarse_mesh_is_that_of_the_curved_key_frame() -> None:
     """Edge collapses of a flat sheet are arbitrary, and leave no more edges where it is going to bend."""
     shapes = torch.stack([fold(0), fold(1)]) * 20
     found = resolving(shapes, faces(), 100, ())
-    curved = Collapses(strip()[1]).of(range(2), shapes.numpy())(1, len(found.faces))
+    curved = collapsed(shapes[1].numpy(), strip()[1], len(found.faces))
     np.testing.assert_array_equal(found.clusters, curved.clusters)
     both_flat = resolving(shapes[:1].repeat(2, 1, 1), faces(), 100, ())
     np.testing.assert_array_equal(both_flat.clusters, coarsen(shapes[:1].numpy(), strip()[1], 1000).clusters)
@@ -186,9 +163,3 @@ def test_layers_of_a_sheet_that_are_close_are_no_contact() -> None:
     free, held = (layer.solve(flat, end, torch.tensor([0.5, 0.9])) for layer in made)
     torch.testing.assert_close(held.shapes, free.shapes, rtol=0, atol=1e-12)
     assert (held.solution.n_crossing == 0).all()
-
-
-def test_flat_key_frames_pass_the_checks() -> None:
-    with pytest.warns(tm.MeshWarning, match="is open") as caught:
-        tm.check_keyframes(torch.stack([roll(0), roll(0)]), faces())
-    assert len(caught) == 1

@@ -9,35 +9,34 @@ from textured import bend, textured_obj
 import torch_modal as tm
 from torch_modal.cli import main as cli
 from torch_modal.errors import MeshWarning
-from torch_modal.io.formats import ANIMATION_FORMATS, MESH_FORMATS
+from torch_modal.io.formats import ANIMATION_FORMATS, MESH_FORMATS, OutputFormat
 
 FACES = np.array([[0, 1, 2]])
 FRAMES = np.arange(18.0).reshape(2, 3, 3)
 
 
+def xyz(vertices: np.ndarray, faces: np.ndarray, asset: tm.Asset | None) -> bytes:
+    return "".join(f"{x} {y} {z}\n" for x, y, z in vertices).encode()
+
+
+def csv(animation: tm.Animation, path: Path) -> None:
+    times, shown = animation.timing.knots()
+    np.savetxt(path, np.column_stack([times, animation.shapes[shown].reshape(len(times), -1)]), delimiter=",")
+
+
 @pytest.fixture(autouse=True)
 def own_formats(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Three formats, which are registered during one test."""
-    for suffix, table in {".xyz": MESH_FORMATS, ".csv": ANIMATION_FORMATS, ".needs": ANIMATION_FORMATS}.items():
-        monkeypatch.setitem(table, suffix, table[".glb"])  # which is undone at the end
-
-    @tm.mesh_format(".xyz", holds=("polygons", "texcoords", "normals"))
-    def xyz(vertices: np.ndarray, faces: np.ndarray, asset: tm.Asset | None) -> bytes:
-        return "".join(f"{x} {y} {z}\n" for x, y, z in vertices).encode()
-
-    @tm.animation_format(".csv")
-    def csv(animation: tm.Animation, path: Path) -> None:
-        times, shown = animation.timing.knots()
-        np.savetxt(path, np.column_stack([times, animation.shapes[shown].reshape(len(times), -1)]), delimiter=",")
-
-    @tm.animation_format(".needs", modules=("no_such_module",), extra="none")
-    def needs(animation: tm.Animation, path: Path) -> None:
-        raise AssertionError
+    """Formats that are registered during one test; one stands in the place of a built-in one."""
+    monkeypatch.setitem(MESH_FORMATS, ".xyz", OutputFormat(xyz, holds=("polygons", "texcoords", "normals")))
+    monkeypatch.setitem(MESH_FORMATS, ".off", OutputFormat(xyz))
+    monkeypatch.setitem(ANIMATION_FORMATS, ".csv", OutputFormat(csv))
+    monkeypatch.setitem(ANIMATION_FORMATS, ".needs", OutputFormat(csv, modules=("no_such_module",), extra="none"))
 
 
 def test_own_formats_write(tmp_path: Path) -> None:
-    paths = tm.save_frames(FRAMES, FACES, tmp_path, "xyz")
-    np.testing.assert_array_equal([np.loadtxt(path) for path in paths], FRAMES)
+    for fmt in ("xyz", "off"):
+        paths = tm.save_frames(FRAMES, FACES, tmp_path, fmt)
+        np.testing.assert_array_equal([np.loadtxt(path) for path in paths], FRAMES)
     rows = np.loadtxt(tm.save_animation(FRAMES, FACES, tmp_path / "a.csv", duration=3), delimiter=",")
     np.testing.assert_array_equal(rows[:, 0], [0, 3])
     np.testing.assert_array_equal(rows[:, 1:], FRAMES.reshape(2, 9))
@@ -45,17 +44,10 @@ def test_own_formats_write(tmp_path: Path) -> None:
         tm.save_animation(FRAMES, FACES, tmp_path / "a.csv")
     with pytest.raises(ImportError, match="no_such_module"):
         tm.save_animation(FRAMES, FACES, tmp_path / "a.needs")
-    assert sorted(path.suffix for path in tmp_path.iterdir()) == [".csv", ".xyz", ".xyz"]
+    assert sorted(path.suffix for path in tmp_path.iterdir()) == [".csv", ".off", ".off", ".xyz", ".xyz"]
     asset = tm.open_asset(textured_obj(tmp_path / "in", "bar.obj"))
     with pytest.warns(MeshWarning, match=r"frame-000.xyz is without the vertex colours, 2 materials and groups"):
         tm.save_frames(bend(asset.positions)[None], asset.faces, tmp_path / "out", "xyz", asset=asset)
-
-
-def test_own_formats_replace_built_in_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(MESH_FORMATS, ".off", MESH_FORMATS[".off"])
-    tm.mesh_format(".off")(lambda vertices, faces, asset: b"own")
-    (path,) = tm.save_frames(FRAMES[:1], FACES, tmp_path, "off")
-    assert path.read_bytes() == b"own"
 
 
 def test_messages_and_help_list_all_formats(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

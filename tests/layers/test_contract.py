@@ -17,7 +17,7 @@ import torch
 from conftest import Shapes, random_rotation
 from every_layer import CASES, LAYERS
 from torch import Tensor
-from torch.func import grad, jvp, vmap
+from torch.func import functional_call, grad, jvp, vmap
 from torch.multiprocessing import get_context
 
 import torch_modal as tm
@@ -239,7 +239,7 @@ def test_inference_mode_leaves_plain_bases_and_draws(small_bars: Shapes) -> None
         basis = tm.ModalBasis(own.reference.clone(), own.eigenvalues * 1, own.modes * 1, own.rigid_eigenvalues * 1)
         motion(small_bars.keyframes)
     assert not any(getattr(basis, name).is_inference() for name in ("reference", "modes", "eigenvalues"))
-    assert gradient(lambda x: motion(x, motion.params), small_bars.keyframes).any()
+    assert gradient(lambda x: motion(x, params=motion.params), small_bars.keyframes).any()
 
 
 @every_layer
@@ -267,17 +267,33 @@ def test_nothing_is_left_of_a_gradient(name: str, made: Made) -> None:
 # -------------------------------------------------------------------------------------------------- state and copies
 
 
-@pytest.mark.parametrize("assign", [False, True])
+@pytest.mark.parametrize("how", ["copied", "assigned", "functional_call"])
 @every_layer
-def test_loaded_state(name: str, assign: bool, made: Made) -> None:
+def test_loaded_state(name: str, how: str, made: Made) -> None:
     """All that a state has in it decides, whatever the layer was made of and used for before."""
     bases = [replace(b, reference=2.0 * b.reference, modes=b.modes.flip(0)) for b in made.shapes.bases[::-1]]
     other = made.case.make(Shapes(2.0 * made.x.flip(0), made.shapes.faces, bases))
-    made.call(made.x, other)
+    before = made.call(made.x, other)
     state = made.layer.state_dict()
-    other.load_state_dict(copy.deepcopy(state), assign=assign)
+    if how == "functional_call":
+        if name in ("ModalDecoder", "Passengers, rotations", "Passengers, gradients", "InBetween, fast"):
+            pytest.skip("more than its forward is called, or its coarse mesh is no buffer")
+        whole = dict(made.layer.named_buffers())  # what follows from the state, too
+        found = made.call(made.x, lambda *given: functional_call(other, whole, given, tie_weights=False))
+        assert_near(made.call(made.x, other), before)
+    else:
+        other.load_state_dict(copy.deepcopy(state), assign=how == "assigned")
+        found = made.call(made.x, other)
     if state:
-        assert_near(made.call(made.x, other), made.truth)
+        assert_near(found, made.truth)
+
+
+@pytest.mark.slow
+@every_layer
+def test_compiled(name: str, made: Made) -> None:
+    """What a layer makes at its first use is made outside of the trace: SciPy cannot be traced."""
+    new = made.case.make(made.shapes)
+    assert_near(torch.compile(lambda x: made.call(x, new), backend="eager")(made.x), made.truth, 1e-9)
 
 
 @every_layer

@@ -5,10 +5,9 @@ from typing import Any
 
 import pytest
 import torch
-from conftest import Shapes, modal, random_rotation
+from conftest import Shapes, modal
 from shapes import diagonal, edge_error, largest
 from torch import Tensor
-from torch.func import functional_call
 
 from torch_modal.energy.modal_energy import ModalEnergy
 from torch_modal.energy.shell import ShellEnergy
@@ -16,16 +15,8 @@ from torch_modal.geometry import connectivity
 from torch_modal.geometry.rigid import blend
 from torch_modal.inbetween.settings import Objective, Solver
 from torch_modal.layers.mid_shape import MidShape
-from torch_modal.precompute.basis import ModalBasis
 
 SPACES = ["joint", "paired"]
-
-
-def moved(basis: ModalBasis, rotation: Tensor, move: Tensor, factor: float = 1.0) -> ModalBasis:
-    """The basis of the same shape elsewhere, in other units."""
-    reference = factor * basis.reference @ rotation.mT + move
-    modes = basis.modes @ rotation.mT * factor**-1.5
-    return replace(basis, reference=reference, modes=modes, eigenvalues=basis.eigenvalues / factor**2)
 
 
 def linear(x_a: Tensor, x_b: Tensor, faces: Tensor) -> Tensor:
@@ -40,11 +31,8 @@ def space(request: pytest.FixtureRequest) -> str:
 
 @pytest.fixture(scope="module")
 def bent(bars: Shapes) -> Shapes:
-    """The bent and the twisted bar, the second somewhere else."""
-    generator = torch.Generator().manual_seed(5)
-    turn, move = random_rotation(generator), torch.tensor([6.0, -4.0, 3.0], dtype=torch.float64)
-    bases = [bars.bases[1], moved(bars.bases[2], turn, move)]
-    return Shapes(torch.stack([bars.keyframes[1], bars.keyframes[2] @ turn.mT + move]), bars.faces, bases)
+    """The bent and the twisted bar."""
+    return bars.pick(1, 2)
 
 
 @pytest.fixture(scope="module")
@@ -97,23 +85,6 @@ def test_a_vertex_of_no_face_has_no_say(middle: Tensor, bent: Shapes, space: str
 # ------------------------------------------------------------------------------------- shapes, dtypes, borders
 
 
-def test_state_dict_and_functional_call(layer: MidShape, middle: Tensor, bent: Shapes, space: str) -> None:
-    """What is saved are the bases; what follows from them is made anew when others are loaded."""
-    before = [basis.reference.clone() for basis in bent.bases]
-    bases = [replace(basis, modes=basis.modes.roll(1, 1)) for basis in bent.bases]
-    other = MidShape(bases, bent.faces, space, **modal(coarse_faces=200))
-    buffers, own = dict(layer.named_buffers()), other(*bent.keyframes)
-    assert largest(own - middle) > 1e-6
-    torch.testing.assert_close(functional_call(other, buffers, tuple(bent.keyframes)), middle, rtol=0, atol=1e-9)
-    state = layer.state_dict()
-    assert sorted(state) == sorted(f"in_between.bases.{i}.{name}" for i in range(2) for name in ("reference", "modes"))
-    other.load_state_dict(state)
-    assert torch.equal(other(*bent.keyframes), middle)
-    assert all(torch.equal(a, b.reference) for a, b in zip(before, bent.bases, strict=True))
-    with pytest.raises(ValueError, match="zero size"):
-        other.load_state_dict({name: torch.zeros_like(tensor) for name, tensor in state.items()})
-
-
 def test_stiffnesses_count(bent: Shapes, middle: Tensor, space: str) -> None:
     """A large volume stiffness keeps the volume; a common factor of all changes nothing."""
     x_a, x_b = bent.keyframes
@@ -129,13 +100,6 @@ def test_stiffnesses_count(bent: Shapes, middle: Tensor, space: str) -> None:
     options.update(anchor=10 * Objective().anchor, coarse_faces=200)
     factor = MidShape(bent.bases, bent.faces, space, **modal(**options))(x_a, x_b)
     assert largest(factor - middle) < 1e-7 * diagonal(x_a)
-
-
-def test_exception(bent: Shapes) -> None:
-    with pytest.raises(ValueError, match="space is one of 'joint', 'paired'; got 'both'"):
-        MidShape(bent.bases, bent.faces, "both", **modal())
-    with pytest.raises(ValueError, match="between two bases, got 1"):
-        MidShape(bent.bases[:1], bent.faces, **modal())
 
 
 def test_coincident_vertices_are_survived(bars: Shapes) -> None:
@@ -159,10 +123,7 @@ def test_coincident_vertices_are_survived(bars: Shapes) -> None:
     ("ends", "truth", "bound"), [((0, 4), 2, 0.05), ((0, 2), 1, 0.011), ((2, 4), 3, 0.018)], ids=["0-8", "0-4", "4-8"]
 )
 def test_hand_that_closes(ends: tuple[int, int], truth: int, bound: float, hands: Shapes) -> None:
-    """Linear interpolation: 27.5 %, 6.2 %, 8.2 %. Measured here: 4.0 %, 0.90 %, 1.5 %, in about 20 steps.
-
-    They vary with the meshing, which is not deterministic.
-    """
+    """Linear interpolation: 27.5 %, 6.2 %, 8.2 %; measured here: 4.0 %, 0.90 %, 1.5 %. The paper lies between."""
     pair = hands.pick(*ends)
     found = MidShape(pair.bases, pair.faces, **modal()).solve(*pair.keyframes)
     wanted = hands.keyframes[truth]
@@ -171,20 +132,15 @@ def test_hand_that_closes(ends: tuple[int, int], truth: int, bound: float, hands
         assert found.solution.converged
         assert found.solution.gradient_norm <= 3e-7
         assert found.solution.n_steps <= 30
-    assert edge_error(found.shapes, wanted, hands.faces) <= bound
+    error = edge_error(found.shapes, wanted, hands.faces)
+    assert error <= bound
+    paired = MidShape(pair.bases, pair.faces, "paired", **modal()).solve(*pair.keyframes).shapes
+    assert (
+        error
+        < edge_error(paired, wanted, hands.faces)
+        < edge_error(linear(*pair.keyframes, pair.faces), wanted, hands.faces)
+    )
     assert float(shell.measure(found.shapes).volume) == pytest.approx(float(shell.measure(wanted).volume), rel=0.03)
-
-
-def test_hand_without_its_rigid_motion(hands: Shapes, generator: torch.Generator) -> None:
-    """On a real mesh, through coarsening, with the second key-frame turned away from the first."""
-    pair = hands.pick(0, 2)
-    turn, move = random_rotation(generator), torch.tensor([9.0, 8.0, 7.0], dtype=torch.float64)
-    layer = MidShape(pair.bases, pair.faces, **modal())
-    x_a, x_b = pair.keyframes
-    here, away = layer.solve(x_a, x_b), layer.solve(x_a, x_b @ turn.mT + move)
-    assert float(away.solution.energy) == pytest.approx(float(here.solution.energy), rel=1e-9)
-    lengths = [ShellEnergy(pair.faces).measure(x.shapes).length for x in (here, away)]
-    torch.testing.assert_close(*lengths, rtol=1e-7, atol=0)
 
 
 @pytest.mark.slow

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 import torch
 from conftest import Shapes
-from every_layer import CASES, Step
+from every_layer import CASES, Step, in_between
 from torch import Tensor
 from torch.func import grad, vmap
 
@@ -16,9 +16,11 @@ TIMES = torch.tensor([0.5, 1.5, 1.0, 0.0], dtype=DOUBLE)
 THIRDS = torch.full((3,), 1 / 3, dtype=DOUBLE)
 
 
-@pytest.mark.parametrize("name", ["Path", "Path, pairs"])
+@pytest.mark.parametrize("name", ["Path", "Path, pairs", "ModalDecoder"])
 def test_mapped_times(name: str, small_bars: Shapes) -> None:
     layer, x = CASES[name].make(small_bars), small_bars.keyframes
+    if name == "ModalDecoder":
+        x = torch.linspace(-1, 1, layer.n_modes, dtype=DOUBLE)
 
     def slope(t: Tensor) -> Tensor:
         return grad(lambda u: layer(x, u).square().sum())(t)
@@ -50,14 +52,12 @@ def test_steps_of_one_sample(small_bars: Shapes) -> None:
     ("name", "call"),
     [
         ("InBetween", lambda layer, x: layer(x[0], x[1], TIMES[:0])),
-        ("InBetween", lambda layer, x: layer(x[:0], x[:0], 0.5)),
         ("Blend", lambda layer, x: layer(x, THIRDS.expand(0, 3))),
         ("Path", lambda layer, x: layer(x, TIMES[:0])),
         ("Path, pairs", lambda layer, x: layer(x, TIMES[:0])),
         ("Path, contact", lambda layer, x: layer(x, TIMES[:0])),
         ("ModalDecoder", lambda layer, x: layer(torch.zeros(0, 3, dtype=DOUBLE), 0.5)),
         ("ModalDecoder", lambda layer, x: layer(torch.zeros(3, dtype=DOUBLE), TIMES[:0])),
-        ("Passengers", lambda layer, x: layer.gradients(x[:0])),
         *((name, lambda layer, x: layer(x[:0])) for name in CASES if name.startswith("Random")),
     ],
 )
@@ -92,6 +92,15 @@ def test_export_of_what_reads_no_numbers(name: str, small_bars: Shapes) -> None:
     program = torch.export.export(layer, given, dynamic_shapes=sizes, strict=False).module()
     other = (1.01 * x[:batch], x.flip(0)[:batch])[:n]
     torch.testing.assert_close(program(*other), layer(*other), rtol=0, atol=1e-12)
+
+
+@pytest.mark.slow
+def test_export_of_fixed_steps(small_bars: Shapes) -> None:
+    solver = tm.Solver(local_steps=0, gradient="unroll", max_steps=3)
+    layer, (x_a, x_b) = in_between(small_bars, solver=solver), small_bars.keyframes[:2]
+    exported = torch.export.export(layer, (x_a, x_b, TIMES[:1]), strict=False).module()
+    others = (1.01 * x_a, x_b + 0.1 * x_a, TIMES[:1] + 0.1)
+    torch.testing.assert_close(exported(*others), layer(*others), rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -75,28 +75,11 @@ def test_open_surfaces_have_no_volume(generator: torch.Generator) -> None:
     assert bool(loss(noisy(x, generator), x).isfinite())
 
 
-def test_gradients_and_double_backward(bars: Shapes, generator: torch.Generator) -> None:
-    loss = tm.losses.ShellLoss(bars.faces, beta=0.01, gamma=0.1)
-    x, rest = (noisy(bars.keyframes[k], generator) for k in (1, 0))
-    move = torch.randn(2, *x.shape, generator=generator, dtype=DOUBLE)
-
-    def value(s: float) -> Tensor:
-        return loss(x + s * move[0], rest + s * move[1])
-
-    ends = [value(s).item() for s in (1e-6, -1e-6)]
-    leaves = [y.clone().requires_grad_() for y in (x, rest)]
-    first = torch.autograd.grad(loss(*leaves), leaves, create_graph=True)
-    along = sum((part * way).sum() for part, way in zip(first, move, strict=True))
-    assert isinstance(along, Tensor)
-    assert along.item() == pytest.approx((ends[0] - ends[1]) / 2e-6, rel=1e-6)
-    second = torch.autograd.grad(along, leaves)
-    twice = float(sum((part * way).sum() for part, way in zip(second, move, strict=True)))
-    slopes = []
-    for s in (1e-5, -1e-5):
-        moved = [(y + s * way).requires_grad_() for y, way in zip((x, rest), move, strict=True)]
-        found = torch.autograd.grad(loss(*moved), moved)
-        slopes.append(float(sum((part * way).sum() for part, way in zip(found, move, strict=True))))
-    assert twice == pytest.approx((slopes[0] - slopes[1]) / 2e-5, rel=1e-5)
+def test_gradients_and_double_backward(small_bars: Shapes, generator: torch.Generator) -> None:
+    loss = tm.losses.ShellLoss(small_bars.faces, beta=0.01, gamma=0.1)
+    leaves = [noisy(small_bars.keyframes[k], generator).requires_grad_() for k in (1, 0)]
+    assert torch.autograd.gradcheck(loss, leaves, fast_mode=True)
+    assert torch.autograd.gradgradcheck(loss, leaves, fast_mode=True)
 
 
 def test_batches_broadcast(bars: Shapes, generator: torch.Generator) -> None:
@@ -105,8 +88,6 @@ def test_batches_broadcast(bars: Shapes, generator: torch.Generator) -> None:
     found = loss(x, bars.keyframes[2])
     assert found.shape == (2, 2)
     torch.testing.assert_close(found[1, 0], loss(x[1, 0], bars.keyframes[2]))
-    per_shape = torch.func.vmap(loss, in_dims=(0, None))(x[0], bars.keyframes[2])
-    torch.testing.assert_close(per_shape, found[0])
 
 
 def test_shapes_without_extent_have_finite_gradients(bars: Shapes) -> None:

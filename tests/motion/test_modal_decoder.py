@@ -1,6 +1,5 @@
 """The decoder of amplitudes: a function of its state, whatever it was used for before."""
 
-import copy
 import os
 import subprocess
 import sys
@@ -10,7 +9,6 @@ import pytest
 import torch
 from conftest import Shapes
 from torch import Tensor
-from torch.func import grad, vmap
 
 import torch_modal as tm
 
@@ -38,16 +36,6 @@ def others(small_bars: Shapes) -> Shapes:
     return Shapes(2.0 * small_bars.keyframes.flip(0), small_bars.faces, bases)
 
 
-@pytest.mark.parametrize("assign", [False, True])
-def test_a_loaded_state(small_bars: Shapes, others: Shapes, assign: bool) -> None:
-    decoder, other = decoder_of(small_bars), decoder_of(others, 1)
-    before, wanted = values(decoder), values(other)
-    assert float((before - wanted).abs().max()) > 1
-    decoder.load_state_dict(copy.deepcopy(other.state_dict()), assign=assign)
-    torch.testing.assert_close(values(decoder), wanted, rtol=0, atol=1e-12)
-    assert torch.equal(decoder.size, other.size)
-
-
 def test_loose_pieces_come_along_with_a_loaded_state(small_bars: Shapes, others: Shapes) -> None:
     n = small_bars.keyframes.shape[1]
 
@@ -68,21 +56,6 @@ def test_loose_pieces_come_along_with_a_loaded_state(small_bars: Shapes, others:
     values(decoder)
     decoder.load_state_dict(other.state_dict())
     torch.testing.assert_close(values(decoder), values(other), rtol=0, atol=1e-12)
-
-
-def test_mapped_times(small_bars: Shapes) -> None:
-    layer, times = decoder_of(small_bars), torch.tensor([0.5, 1.5, 1.0, 0.0], dtype=DOUBLE)
-    a = torch.linspace(-1, 1, 4 * layer.n_modes, dtype=DOUBLE).view(4, -1)
-
-    def slope(a: Tensor, t: Tensor) -> Tensor:
-        return grad(lambda u: layer(a, u).square().sum())(t)
-
-    truth = torch.stack([slope(*own) for own in zip(a, times, strict=True)])
-    torch.testing.assert_close(vmap(layer)(a, times), layer(a, times), rtol=0, atol=1e-12)
-    torch.testing.assert_close(vmap(slope)(a, times), truth, rtol=0, atol=1e-9)
-    for call in (vmap(lambda t: layer(a[0], t)), grad(lambda t: layer(a[0], t[0]).sum())):
-        with pytest.raises(ValueError, match="t lies between the times"):
-            call(times + 9)
 
 
 def exported(layer: tm.ModalDecoder, given: tuple[Tensor, ...]) -> torch.export.ExportedProgram:

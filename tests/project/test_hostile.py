@@ -9,7 +9,6 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from conftest import listen_to_ctrl_c
@@ -18,7 +17,7 @@ from torch.utils.data import DataLoader, Dataset
 
 import torch_modal as tm
 from torch_modal.io.cache import cache_content
-from torch_modal.precompute.parallel import n_cpus
+from torch_modal.modes.parallel import n_cpus
 
 ROOT = Path(tm.__file__).parents[1]
 TESTS = Path(__file__).parents[1]
@@ -60,7 +59,7 @@ for basis in tm.extract_bases(np.stack([v, v * (1, 1, 1.2)]), f, 10, mesher="tet
 FINE = CALL.replace('"tetwild"', "tm.TetWild(0.02, 1e-3, 10.0, 10_000)")
 EACH = """
 import torch_modal as tm
-from torch_modal.precompute import carrying
+from torch_modal.modes import carrying
 carrying.MAX_FIT = -1  # no tetrahedra are carried
 
 class OneByLattice:
@@ -127,18 +126,6 @@ def test_a_killed_worker_is_an_error_that_says_so(running: tuple["subprocess.Pop
 
 
 @POSIX
-def test_ctrl_c_in_the_middle_leaves_nothing_behind(
-    running: tuple["subprocess.Popen[str]", int], tmp_path: Path
-) -> None:
-    process, worker = running
-    process.send_signal(signal.SIGINT)
-    _, errors = process.communicate(timeout=60)
-    assert errors.splitlines()[-1] == "KeyboardInterrupt"
-    assert not Path(f"/proc/{worker}").exists()
-    assert cache_content(tmp_path / "cache").n_entries == 0
-
-
-@POSIX
 def test_ctrl_c_ends_all_of_several_workers(tmp_path: Path) -> None:
     if not Path("/proc/self/stat").exists():
         pytest.skip("workers are found through /proc, which this system does not have")
@@ -156,17 +143,6 @@ def test_ctrl_c_ends_all_of_several_workers(tmp_path: Path) -> None:
     assert errors.splitlines()[-1] == "KeyboardInterrupt"
     assert not any(Path(f"/proc/{worker}").exists() for worker in workers)
     assert cache_content(tmp_path / "cache").n_entries <= 2, errors  # those of the first key-frame
-
-
-@pytest.mark.slow
-def test_two_processes_fill_the_same_cache(tmp_path: Path) -> None:
-    processes = [start(tmp_path) for _ in range(2)]
-    first = [process.communicate(timeout=240) for process in processes]
-    assert [process.returncode for process in processes] == [0, 0], first
-    # The mesher is not deterministic, so they may differ from each other; what was kept is whole and used from now on.
-    again = [start(tmp_path).communicate(timeout=240)[0] for _ in range(2)]
-    assert again[0] == again[1] != ""
-    assert np.allclose(*[[float(line) for line in out.split()] for out, _ in first], rtol=0.2)
 
 
 class Bars(Dataset):  # type: ignore[type-arg]

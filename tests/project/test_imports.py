@@ -26,7 +26,7 @@ FLOORS = [
     "io",
     "keyframes",
     "energy",
-    "precompute",
+    "modes",
     "backends",
     "solve",
     "inbetween",
@@ -84,7 +84,7 @@ def floor(module: str) -> int:
 
 def test_every_module_has_its_floor() -> None:
     assert {module.split(".")[0] for module in MODULES} == set(FLOORS)
-    assert "precompute.extract" in own("motion.subdivide"), "imports are not seen"
+    assert "modes.extract" in own("motion.subdivide"), "imports are not seen"
     assert "geometry.inspect" in own("registration.maps"), "from torch_modal.geometry import inspect is not seen"
 
 
@@ -102,19 +102,19 @@ def test_no_imports_go_round() -> None:
     graphlib.TopologicalSorter({module: own(module) - {module} for module in MODULES}).prepare()
 
 
-def test_precompute_is_without_torch() -> None:
+def test_modes_are_without_torch() -> None:
     """Besides the basis: ``extract.py`` alone makes tensors, for ``basis.py``."""
     with_torch = {
         name
         for name in MODULES
-        if name.startswith("precompute.") and "torch" in {found.split(".")[0] for found in imported(name)}
+        if name.startswith("modes.") and "torch" in {found.split(".")[0] for found in imported(name)}
     }
-    assert with_torch == {"precompute.basis", "precompute.extract"}
+    assert with_torch == {"modes.basis", "modes.extract"}
 
 
 def test_layers_are_torch_only() -> None:
     """Bases are what comes in; only the coarse mesh and segments, made once on the host, use more."""
-    allowed = {"inbetween.coarse": {"precompute.coarsening"}, "inbetween.regions": {"numpy"}}
+    allowed = {"inbetween.coarse": {"modes.coarsening"}, "inbetween.regions": {"numpy"}}
     # What kernels are given once comes in arrays of the host, which are NumPy's for Warp.
     allowed |= {name: {"numpy"} for name in MODULES if name.startswith("backends.warp.")}
     foreign = {
@@ -122,7 +122,7 @@ def test_layers_are_torch_only() -> None:
         for module in MODULES
         if module.split(".")[0] in LAYERS
         for name in {found if found in MODULES else found.split(".")[0] for found in imported(module)}
-        if name in FOREIGN_TO_LAYERS or (name.startswith("precompute.") and name != "precompute.basis")
+        if name in FOREIGN_TO_LAYERS or (name.startswith("modes.") and name != "modes.basis")
         if name not in allowed.get(module, ())
     }
     assert not foreign
@@ -141,7 +141,7 @@ def test_one_door_leads_to_the_backends() -> None:
 def test_one_lock_guards_the_decimation() -> None:
     """fast-simplification is not thread-safe; the worker is a process of its own."""
     users = [name for name in MODULES if "fast_simplification" in imported(name)]
-    assert users == ["geometry.decimation", "precompute._tetwild_worker"]
+    assert users == ["geometry.decimation", "modes._tetwild_worker"]
 
 
 def printed(code: str) -> list[str]:
@@ -153,7 +153,7 @@ def printed(code: str) -> list[str]:
 
 
 def test_import_loads_nothing_heavy() -> None:
-    heavy = ["pyvista", "vtk", "matplotlib", "pygltflib", "pytetwild", "torch_geometric", "torch._dynamo"]
+    heavy = ["pyvista", "vtk", "matplotlib", "pygltflib", "pytetwild", "torch._dynamo"]
     heavy += ["scipy.interpolate", "sympy", "warp"]
     code = (
         "import sys, torch_modal; torch_modal.extract_bases, torch_modal.subdivide, torch_modal.InBetween; "

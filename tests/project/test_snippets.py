@@ -91,18 +91,3 @@ def run_command(block: Block, words: list[str]) -> None:
         script = (ROOT / arguments[0]).read_text()
         for option in (word for word in arguments[1:] if word.startswith("--")):
             assert f'"{option}"' in script or arguments[0].endswith(".sh"), f"{block}: {option}"
-
-
-def test_a_block_that_fails_is_seen(tmp_path: Path) -> None:
-    page = tmp_path / "page.md"
-    page.write_text(
-        "```python\nx = 1\n```\n\n*Not run by the tests: no.*\n\n```python\ny\n```\n\n```python\n\nx / 0\n```\n"
-    )
-    first, second, third = blocks(page)
-    names: dict[str, object] = {}
-    run_python(first, names)
-    assert first.is_run and not second.is_run and third.is_run
-    with pytest.raises(ZeroDivisionError) as caught:
-        run_python(third, names)
-    assert caught.traceback[-1].lineno + 1 == 13  # the page's own
-    assert names["x"] == 1

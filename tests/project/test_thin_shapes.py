@@ -13,11 +13,11 @@ from torch import Tensor
 
 import torch_modal as tm
 from torch_modal.cli import main as cli
-from torch_modal.data.stored import open_set
+from torch_modal.data.stored import StoredSet
 from torch_modal.geometry.canonical import size
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.io.frames import save_frames
-from torch_modal.precompute.sheet import THICKNESS
+from torch_modal.modes.sheet import THICKNESS
 
 pytestmark = pytest.mark.filterwarnings("ignore::torch_modal.keyframes.check.MeshWarning")
 
@@ -94,5 +94,5 @@ def test_commands_and_trees(
     assert cli.main([*tree, "--method", "solid"]) == 3
     assert cli.main([*tree, "--method", "shell"]) == 0
     here = tm.extract_bases(shapes, FACES, 8, method="shell", cache=False)
-    for mine, its in zip(here, open_set(tmp_path / "bases" / "roll").bases, strict=True):
+    for mine, its in zip(here, StoredSet(tmp_path / "bases" / "roll").bases, strict=True):
         torch.testing.assert_close(its.eigenvalues, mine.eigenvalues)

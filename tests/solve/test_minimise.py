@@ -15,6 +15,7 @@ from torch_modal.energy.modal_energy import ModalEnergy
 from torch_modal.energy.shell import ShellEnergy
 from torch_modal.energy.term import periodic_square
 from torch_modal.inbetween.results import ConvergenceError, report
+from torch_modal.inbetween.settings import Solver
 from torch_modal.layers.mid_shape import MidShape
 from torch_modal.solve import minimise as minimisation
 from torch_modal.solve.gauss_newton import GaussNewtonStep
@@ -43,22 +44,6 @@ def test_across_negative_curvature() -> None:
     solution = minimise(Waves(), first, None, tolerance=1e-6)
     assert solution.converged.all()
     assert (solution.energy < 1e-6).all()
-
-
-def test_never_uphill_from_a_bent_valley() -> None:
-    """A hard start: steps are shortened, and the energy never rises."""
-
-    class Recorded(Rosenbrock):
-        def value_and_gradient(self, a: Tensor, placement: Any) -> tuple[Tensor, Tensor]:
-            tried.append(float(self.value(a, placement)))
-            return super().value_and_gradient(a, placement)
-
-    tried: list[float] = []
-    first = start([-1.2, 1.0])
-    solution = minimise(Recorded(), first, None)
-    assert solution.converged.all()
-    torch.testing.assert_close(solution.amplitudes, torch.ones_like(first), rtol=0, atol=1e-6)
-    assert max(tried) > float(Rosenbrock().value(first, None)), "no step was too long: the test is too easy"
 
 
 def test_another_hessian_for_what_has_not_converged(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -92,7 +77,7 @@ def test_what_cannot_go_on_says_why() -> None:
     invalid = minimise(Rosenbrock(), start([float("nan"), 1.0], [0.0, 0.0]), None)
     assert invalid.status.tolist() == [Status.INVALID, Status.CONVERGED]
     with pytest.raises(ConvergenceError, match="did not converge"):
-        report(stalled, max_steps=40, forbid=True)
+        report(stalled, Solver(unconverged="raise"))
 
 
 # --------------------------------------------------------------------------------------------------- on shells
@@ -183,36 +168,6 @@ def test_a_sample_does_not_depend_on_its_batch(tolerance: float, layer: MidShape
         torch.testing.assert_close(alone.amplitudes[0], together.amplitudes[i], rtol=0, atol=1e-10)
         assert tolerance < 1e-8 or alone.n_steps[0] == together.n_steps[i]
     assert len(set(together.n_steps.tolist())) > 1, "they end at different times"
-
-
-def test_one_bad_sample_spoils_no_other(layer: MidShape, bars: Shapes) -> None:
-    bends = [0.5, 1.0, 1.5]
-    alone = solve(layer, bars, bends)
-    energy, a, (coarse,) = problem(layer, bars, bends)
-    base = coarse.base.clone()
-    base[1, :, 7] = torch.nan
-    solution = minimise(energy, a, (coarse._replace(base=base),), tolerance=1e-8)
-    assert solution.converged.tolist() == [True, False, True]
-    assert solution.status[1] == Status.INVALID
-    for i in (0, 2):
-        torch.testing.assert_close(solution.amplitudes[i], alone.amplitudes[i], rtol=0, atol=1e-7)
-        assert solution.n_steps[i] == alone.n_steps[i]
-
-
-def test_gives_up_and_says_so(layer: MidShape, bars: Shapes) -> None:
-    energy, a, placement = problem(layer, bars, [1.0, 0.0])
-    none = minimise(energy, a, placement, max_steps=0)
-    assert none.n_steps.tolist() == [0, 0]
-    assert none.gradient_norm[0] == 1
-    one = minimise(energy, a, placement, max_steps=1)
-    assert one.n_steps[0] == 1
-    assert one.converged.tolist() == [False, True], "between equal shapes there is nothing to do"
-    assert 1e-8 < float(one.gradient_norm[0]) < 1
-
-
-def test_equal_key_frames_need_no_deformation(layer: MidShape, bars: Shapes) -> None:
-    solution = solve(layer, bars, [0.0])
-    assert solution.converged.all() and solution.amplitudes.abs().max() < 1e-9
 
 
 def test_damped_steps_never_go_uphill(layer: MidShape, bars: Shapes, generator: torch.Generator) -> None:

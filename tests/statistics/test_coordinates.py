@@ -8,11 +8,10 @@ from conftest import Shapes
 
 import torch_modal as tm
 from torch_modal.data.samples import load_sample
-from torch_modal.geometry.local_rotations import _turn_between
 from torch_modal.geometry.rigid import best_fit
 from torch_modal.geometry.rotations import exp
-from torch_modal.geometry.triangle_frames import BentTriangles, bending_between, bent_sides, frames, sides
-from torch_modal.statistics.coordinates import BendingCoordinates, Components
+from torch_modal.statistics.components import Components
+from torch_modal.statistics.coordinates import BendingCoordinates
 from torch_modal.statistics.variation import Variation
 
 
@@ -48,8 +47,7 @@ def with_second_piece(shapes: torch.Tensor, faces: torch.Tensor) -> tuple[torch.
 def test_second_pieces_and_vertices_of_no_face(bars: Shapes) -> None:
     shapes, faces = with_second_piece(bars.keyframes, bars.faces)
     variation = Variation(shapes + 100, faces)
-    bending = variation.average + variation.deviations
-    components = Components(variation.coordinates, bending, 2, variation.origin)
+    components = Components(variation, 2)
     back = components.shapes(components.coordinates(shapes))
     assert max(far(x, y) for x, y in zip(back, shapes, strict=True)) < 1e-9
     assert components.coordinates(shapes[:0]).shape == (0, 2) and components.shapes(torch.zeros(0, 2)).shape[0] == 0
@@ -64,22 +62,6 @@ def test_collapsed_triangles_turn_with_their_neighbours(bars: Shapes) -> None:
         found = coordinates.of(shapes)
         assert bool(found.isfinite().all())
         assert max(far(x, y) for x, y in zip(coordinates.shapes(found), shapes, strict=True)) < 0.02
-
-
-def test_a_bend_is_found_again(bars: Shapes, generator: torch.Generator) -> None:
-    own = frames(sides(bars.keyframes[0].mT[:, None].contiguous(), bars.faces))
-    n = own.xx.shape[1]
-    turn = torch.randn(3, 1, n, generator=generator, dtype=torch.float64)
-    strain = tuple(0.3 * torch.randn(1, n, generator=generator, dtype=torch.float64) for _ in range(3))
-    other = frames(bent_sides(BentTriangles(turn, strain), own))  # type: ignore[arg-type]
-    quaternions = _turn_between(own, other)
-    found = bending_between(own, other, quaternions)
-    # Of both signs of a quaternion, one is the turn that was made.
-    opposite = bending_between(own, other, -quaternions)
-    off = torch.minimum((found.turn - turn).norm(dim=0), (opposite.turn - turn).norm(dim=0))
-    assert float(off.max()) < 1e-9
-    for one, other_one in zip(found.strain, strain, strict=True):
-        torch.testing.assert_close(one, other_one, rtol=0, atol=1e-9)
 
 
 def test_large_stretches_are_kept(bars: Shapes) -> None:

@@ -3,13 +3,11 @@
 import argparse
 import os
 import re
+import sys
 from collections.abc import Callable, Collection, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from torch_modal.io.formats import PICTURES
-
-OVERWRITE = "replace files that exist (default: refuse)"
 CACHE_DIR = "folder of tetrahedra and modes (default: TORCH_MODAL_CACHE, or the user's cache folder)"
 
 
@@ -29,14 +27,6 @@ def number(kind: Callable[[str], Any], low: float, above: bool = False) -> Calla
     return convert
 
 
-def times(text: str) -> list[float]:
-    """An argument type: numbers with commas between them."""
-    try:
-        return [float(word) for word in text.split(",")]
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is no list of numbers such as 0,0.4,1") from None
-
-
 def file_name(suffixes: Collection[str]) -> Callable[[str], Path]:
     """An argument type: a file with one of these endings."""
 
@@ -47,23 +37,6 @@ def file_name(suffixes: Collection[str]) -> Callable[[str], Path]:
         return Path(text)
 
     return convert
-
-
-def add_meshes(sub: argparse.ArgumentParser, text: str) -> None:
-    """The meshes that a command reads."""
-    sub.add_argument("meshes", nargs="+", type=Path, metavar="MESH", help=text)
-
-
-def add_out(
-    sub: argparse.ArgumentParser, metavar: str, text: str, kind: Callable[[str], Path] = Path, required: bool = True
-) -> None:
-    """``--out``."""
-    sub.add_argument("--out", type=kind, required=required, metavar=metavar, help=text)
-
-
-def add_picture(sub: argparse.ArgumentParser, text: str) -> None:
-    """``--picture``."""
-    sub.add_argument("--picture", type=file_name(PICTURES), metavar="FILE", help=f"{text}, as .png or .pdf")
 
 
 def add_levels(sub: argparse.ArgumentParser, lowest: int) -> None:
@@ -79,76 +52,58 @@ def add_levels(sub: argparse.ArgumentParser, lowest: int) -> None:
 
 def add_modes(sub: argparse.ArgumentParser) -> None:
     """Options of `extract_bases`."""
-    sub.add_argument(
-        "--modes",
-        type=number(int, 1),
-        default=30,
-        metavar="N",
-        help="elastic modes of each key-frame; 20 to 100 are usual (default: %(default)s)",
-    )
-    sub.add_argument(
-        "--method",
-        choices=("auto", "solid", "shell"),
-        default="auto",
-        help="modes of the solid inside, of the surface itself (sheets, thin and open bodies), or what fits (default: "
-        "%(default)s)",
-    )
-    sub.add_argument(
-        "--mesher",
-        choices=("lattice", "tetwild"),
-        default="lattice",
-        help="what fills surfaces for solids: a lattice of cubes (deterministic, takes every surface), or fTetWild "
-        "(default: %(default)s)",
-    )
+    add, default = sub.add_argument, "(default: %(default)s)"
+    text = f"elastic modes of each key-frame; 20 to 100 are usual {default}"
+    add("--modes", type=number(int, 1), default=30, metavar="N", help=text)
+    text = f"modes of the solid inside, of the surface itself (sheets, thin and open bodies), or what fits {default}"
+    add("--method", choices=("auto", "solid", "shell"), default="auto", help=text)
+    text = f"what fills solids: a lattice of cubes (deterministic, takes every surface), or fTetWild {default}"
+    add("--mesher", choices=("lattice", "tetwild"), default="lattice", help=text)
 
 
 def add_registration(sub: argparse.ArgumentParser) -> None:
     """Options of the registration of meshes of different connectivity."""
-    sub.add_argument(
-        "--landmarks",
-        type=Path,
-        metavar="FILE",
-        help="lines of vertex numbers, counted from 0, or of coordinates: a column for each mesh",
-    )
-    sub.add_argument(
-        "--across", action="store_true", help="the meshes are different subjects; needs five landmarks or more"
-    )
+    text = "lines of vertex numbers, counted from 0, or of coordinates: a column for each mesh"
+    sub.add_argument("--landmarks", type=Path, metavar="FILE", help=text)
+    text = "the meshes are different subjects; needs five landmarks or more"
+    sub.add_argument("--across", action="store_true", help=text)
 
 
 def add_common(
-    sub: argparse.ArgumentParser, *, overwrite: str = OVERWRITE, cache_dir: str | None = CACHE_DIR, all_of: bool = True
+    sub: argparse.ArgumentParser,
+    overwrite: str = "replace files that exist (default: refuse)",
+    cache_dir: str | None = None,
 ) -> None:
-    """The group "files and messages".
-
-    Args:
-        sub: The command's parser.
-        overwrite: Help of ``--overwrite``.
-        cache_dir: Help of ``--cache-dir``; None: there is no such option.
-        all_of: Add ``--no-cache`` and ``--verbose`` too.
-    """
+    """The group "files and messages"; with ``cache_dir``, the help of that option, if the command has it."""
     group = sub.add_argument_group("files and messages")
     group.add_argument("--overwrite", action="store_true", help=overwrite)
-    if cache_dir is not None:
+    if cache_dir:
         group.add_argument("--cache-dir", metavar="DIR", help=cache_dir)
-    if all_of:
+    if cache_dir == CACHE_DIR:
         group.add_argument("--no-cache", action="store_true", help="neither read the cache nor write to it")
         group.add_argument("--verbose", action="store_true", help="also report each step")
     group.add_argument("--quiet", action="store_true", help="report warnings and errors only")
 
 
 def caching(args: argparse.Namespace) -> dict[str, Any]:
-    """Options of computations from the group "files and messages"."""
+    """Options of computations that are kept in the cache."""
     return {"cache_dir": args.cache_dir, "cache": not args.no_cache, "progress": False if args.quiet else None}
 
 
 def mode_options(args: argparse.Namespace) -> dict[str, Any]:
-    """Options of `extract_bases` besides the number of modes."""
-    return {"method": args.method, "mesher": args.mesher, **caching(args)}
+    """Options of `extract_bases`."""
+    return {"n_modes": args.modes, "method": args.method, "mesher": args.mesher, **caching(args)}
 
 
 def reporter(args: argparse.Namespace) -> Callable[[str], None]:
-    """Print a line at once, unless --quiet."""
-    return (lambda _: None) if args.quiet else (lambda line: print(line, flush=True))
+    """Print a line at once, unless --quiet; escapes characters that the terminal cannot show."""
+
+    def report(line: str) -> None:
+        if not args.quiet:
+            encoding = sys.stdout.encoding or "utf-8"
+            print(line.encode(encoding, "backslashreplace").decode(encoding), flush=True)
+
+    return report
 
 
 def is_file(args: argparse.Namespace, suffixes: Collection[str]) -> bool:
@@ -163,16 +118,7 @@ def is_file(args: argparse.Namespace, suffixes: Collection[str]) -> bool:
 
 
 def check_output(files: Sequence[Path], inputs: Iterable[Path], overwrite: bool) -> None:
-    """Raise if an output file could not or must not be written.
-
-    Args:
-        files: Files that will be written, or that exist and belong to an earlier result.
-        inputs: Files that are read, and must not be replaced.
-        overwrite: Files that exist may be replaced.
-
-    Raises:
-        ValueError: The message names the file and the reason.
-    """
+    """Raise ValueError if files could not or must not be written, those that are read among them."""
     read = {path.resolve() for path in inputs}
     for file in files:
         if file.resolve() in read:

@@ -1,4 +1,4 @@
-"""Commands of one step each: ``register``, ``check``, ``carry``, ``modes`` and ``cache`` of ``torch-modal``.
+"""Commands on meshes: ``register``, ``check`` and ``carry`` of ``torch-modal``.
 
 Each checks its output paths before any heavy import and any work.
 """
@@ -11,19 +11,13 @@ from pathlib import Path
 from torch_modal.cli.arguments import (
     CACHE_DIR,
     add_common,
-    add_meshes,
-    add_modes,
-    add_out,
-    add_picture,
     add_registration,
     caching,
     check_output,
     file_name,
-    is_file,
-    mode_options,
     reporter,
 )
-from torch_modal.io.formats import MESH_FORMATS
+from torch_modal.io.formats import MESH_FORMATS, PICTURES
 
 CROSSES = 3
 """Exit status of `check` when parts newly pass through each other."""
@@ -33,10 +27,10 @@ def add_register(sub: argparse.ArgumentParser) -> None:
     """Arguments of ``register``."""
     sub.add_argument("meshes", nargs=2, type=Path, metavar="MESH", help="the template, and the target")
     text = f"the template laid onto the target, {', '.join(MESH_FORMATS)}"
-    add_out(sub, "FILE", text, file_name(MESH_FORMATS))
+    sub.add_argument("--out", type=file_name(MESH_FORMATS), required=True, metavar="FILE", help=text)
     sub.add_argument("--keep-doubtful", action="store_true", help="write a doubtful result too, with a warning")
     add_registration(sub)
-    add_common(sub)
+    add_common(sub, cache_dir=CACHE_DIR)
 
 
 def register(args: argparse.Namespace) -> None:
@@ -59,20 +53,15 @@ def register(args: argparse.Namespace) -> None:
 
     import torch_modal as tm
     from torch_modal.io.frames import save_mesh
-    from torch_modal.registration.landmarks import landmark_table
     from torch_modal.registration.load import ADVICE
 
     template, target = map(tm.open_asset, args.meshes)
-    marks = None
-    if args.landmarks is not None:
-        table = landmark_table(args.landmarks, [template.positions, target.positions])
-        marks = table[:, 0], table[:, 1]
     found = tm.register(
         template.positions,
         template.faces,
         target.positions,
         target.faces,
-        landmarks=marks,
+        landmarks=args.landmarks,
         same_subject=not args.across,
         **caching(args),
     )
@@ -89,12 +78,13 @@ def register(args: argparse.Namespace) -> None:
 
 def add_check(sub: argparse.ArgumentParser) -> None:
     """Arguments of ``check``."""
-    add_meshes(sub, "meshes of one connectivity")
-    sub.add_argument(
-        "--keyframes", nargs="+", type=Path, default=[], metavar="FILE", help="meshes whose own crossings are known"
-    )
-    add_picture(sub, "draw the meshes with crossings in colour")
-    add_common(sub, overwrite="replace the picture if it exists (default: refuse)", cache_dir=None, all_of=False)
+    add = sub.add_argument
+    add("meshes", nargs="+", type=Path, metavar="MESH", help="meshes of one connectivity")
+    text = "meshes whose own crossings are known"
+    add("--keyframes", nargs="+", type=Path, default=[], metavar="FILE", help=text)
+    text = "draw the meshes with crossings in colour, as .png or .pdf"
+    add("--picture", type=file_name(PICTURES), metavar="FILE", help=text)
+    add_common(sub, "replace the picture if it exists (default: refuse)")
 
 
 def check(args: argparse.Namespace) -> int:
@@ -159,10 +149,11 @@ def check(args: argparse.Namespace) -> int:
 
 def add_carry(sub: argparse.ArgumentParser) -> None:
     """Arguments of ``carry``."""
-    add_meshes(sub, "meshes of one connectivity; the points lie on the first")
-    sub.add_argument("--points", type=Path, required=True, metavar="FILE.ply", help="points, or splats")
-    add_out(sub, "FOLDER", "for a PLY file for each mesh")
-    add_common(sub, cache_dir=None, all_of=False)
+    add, text = sub.add_argument, "meshes of one connectivity; the points lie on the first"
+    add("meshes", nargs="+", type=Path, metavar="MESH", help=text)
+    add("--points", type=Path, required=True, metavar="FILE.ply", help="points, or splats")
+    add("--out", type=Path, required=True, metavar="FOLDER", help="for a PLY file for each mesh")
+    add_common(sub)
 
 
 def carry(args: argparse.Namespace) -> None:
@@ -200,91 +191,3 @@ def carry(args: argparse.Namespace) -> None:
         write_files(moved())
     kind = "splats" if given.is_splats else "points"
     reporter(args)(f"{len(passengers)} {kind}: {files[0]} to {files[-1].name}")
-
-
-def add_modes_command(sub: argparse.ArgumentParser) -> None:
-    """Arguments of ``modes``."""
-    add_meshes(sub, "key-frames of one connectivity")
-    add_out(sub, "FILE_OR_FOLDER", "FILE.safetensors for one mesh, or a folder for a file of each mesh's name")
-    add_modes(sub)
-    add_common(sub)
-
-
-def modes(args: argparse.Namespace) -> None:
-    """Vibration modes of key-frames, as safetensors.
-
-    Compute the vibration modes of key-frames: the lowest elastic modes of the solid
-    that each surface encloses, restricted to the surface, or of the surface itself
-    where it is open or thin.
-
-    They are what `subdivide` computes first. Read the files with
-    torch_modal.ModalBasis.load. With --mesher tetwild, which is not deterministic, two
-    runs without the cache give slightly different modes.
-
-    Examples:
-      torch-modal modes horse.obj --out horse.safetensors
-      torch-modal modes gait-?.ply --modes 50 --out bases
-    """
-    files = [args.out]
-    if not is_file(args, [".safetensors"]):
-        files = [args.out / f"{mesh.stem}.safetensors" for mesh in args.meshes]
-        if len(set(files)) < len(files):
-            args.fail("two meshes have the same file name, so their bases would too; take them one by one")
-    elif len(args.meshes) > 1:
-        args.fail(f"--out {args.out} is one file, but there are {len(args.meshes)} meshes; name a folder")
-    check_output(files, args.meshes, args.overwrite)
-
-    import torch_modal as tm
-
-    keyframes, faces = tm.load_keyframes(args.meshes)
-    bases = tm.extract_bases(keyframes, faces, args.modes, **mode_options(args))
-    report = reporter(args)
-    shown = min(8, args.modes)
-    report(f"{'lowest elastic modes':24s}" + "".join(f"{i + 1:>10d}" for i in range(shown)))
-    for file, mesh, basis in zip(files, args.meshes, bases, strict=True):
-        file.parent.mkdir(parents=True, exist_ok=True)
-        basis.save(file)
-        values = basis.eigenvalues[:shown].tolist()
-        first = next((value for value in basis.eigenvalues.tolist() if value > 0), 1.0)
-        report(f"{mesh.name:24s}" + "".join(f"{value:>10.3g}" for value in values))
-        report(f"{'  frequency / first':24s}" + "".join(f"{(value / first) ** 0.5:>10.3f}" for value in values))
-    report("eigenvalues are squared frequencies, in 1 / (unit of the mesh)^2; solids and shells differ in stiffness")
-    report(f"bases: {files[0]}" + (f" to {files[-1].name}" if len(files) > 1 else ""))
-
-
-def add_cache(sub: argparse.ArgumentParser) -> None:
-    """Arguments of ``cache``."""
-    which = sub.add_mutually_exclusive_group()
-    which.add_argument("--clear", action="store_true", help="remove what is in it; other files in the folder stay")
-    which.add_argument(
-        "--shrink",
-        metavar="SIZE",
-        help="remove what was not used for the longest, until the rest is no larger than SIZE (500M, 4G)",
-    )
-    sub.add_argument("--cache-dir", metavar="DIR", help=CACHE_DIR)
-
-
-def cache(args: argparse.Namespace) -> None:
-    """Size of the cache of tetrahedra and modes.
-
-    Say how large the cache is, where tetrahedra and modes are kept between runs.
-
-    It never takes more than 4 GiB, or what the environment variable TORCH_MODAL_CACHE_LIMIT
-    says (500M, 10G): what was not used for the longest makes room for what is new.
-
-    Examples:
-      torch-modal cache --shrink 1G
-      torch-modal cache --clear
-    """
-    from torch_modal.io import cache as cached
-
-    folder = args.cache_dir or cached.default_cache_dir()
-    removed = None
-    if args.clear:
-        removed = cached.clear_cache(folder)
-    elif args.shrink is not None:
-        removed = cached.shrink_cache(cached.parse_size(args.shrink), folder)
-    n_entries, n_bytes = removed or cached.cache_content(folder)
-    size = f"{n_entries} entries, {n_bytes / 2**20:.1f} MiB"
-    limit = f"{cached.size_limit() / 2**20:g} MiB"
-    print(f"{size} removed from {folder}" if removed else f"{size} in {folder} (limit: {limit})")

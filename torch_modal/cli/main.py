@@ -2,6 +2,7 @@
 
 import argparse
 import contextlib
+import functools
 import inspect
 import logging
 import os
@@ -10,7 +11,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
-from torch_modal.cli import commands, demo, precompute, subdivide, view
+from torch_modal.cli import bases, commands, demo, subdivide, view
 from torch_modal.version import __version__
 
 PROGRAM = "torch-modal"
@@ -28,23 +29,19 @@ start here:
   torch-modal subdivide a.obj scan.ply --register --out between.glb   of different connectivity
   torch-modal subdivide --help                            all that can be set"""
 
-COMMANDS: dict[str, tuple[Callable[[Any], None], Callable[[Any], int | None], str | None]] = {
-    "subdivide": (subdivide.add_arguments, subdivide.run, subdivide.run.__doc__),
-    "register": (commands.add_register, commands.register, commands.register.__doc__),
-    "check": (commands.add_check, commands.check, commands.check.__doc__),
-    "carry": (commands.add_carry, commands.carry, commands.carry.__doc__),
-    "modes": (commands.add_modes_command, commands.modes, commands.modes.__doc__),
-    "precompute": (
-        precompute.add_arguments,
-        precompute.run,
-        "\n\n".join((precompute.SUMMARY, precompute.DESCRIPTION, precompute.EXAMPLES)),
-    ),
-    "view": (view.add_arguments, view.run, view.run.__doc__),
-    "demo": (demo.add_arguments, demo.run, demo.run.__doc__),
-    "cache": (commands.add_cache, commands.cache, commands.cache.__doc__),
+COMMANDS: dict[str, tuple[Callable[[Any], None], Callable[[Any], int | None]]] = {
+    "subdivide": (subdivide.add_arguments, subdivide.run),
+    "register": (commands.add_register, commands.register),
+    "check": (commands.add_check, commands.check),
+    "carry": (commands.add_carry, commands.carry),
+    "modes": (bases.add_modes_command, bases.modes),
+    "precompute": (bases.add_precompute, bases.precompute),
+    "view": (view.add_arguments, view.run),
+    "demo": (demo.add_arguments, demo.run),
+    "cache": (bases.add_cache, bases.cache),
 }
-"""Of each command: a function that declares its arguments, one that runs it (None or an exit status), and its help:
-summary, description and examples with empty lines between them."""
+"""Of each command: a function that declares its arguments, and one that runs it (None or an exit status), whose
+docstring is its help: summary, description and examples with empty lines between them."""
 
 EXPECTED = (ValueError, OSError, MemoryError, ImportError)
 """Errors of input, files and machine, which become one line; all others are bugs and show their traceback."""
@@ -52,11 +49,7 @@ EXPECTED_NAMES = ("TetrahedralizationError", "ModalAnalysisError")
 """Further ones, whose modules are heavy."""
 
 
-class Formatter(argparse.RawDescriptionHelpFormatter):
-    """Help texts as they are, with a wide column for options."""
-
-    def __init__(self, prog: str) -> None:
-        super().__init__(prog, max_help_position=30, width=100)
+Formatter = functools.partial(argparse.RawDescriptionHelpFormatter, max_help_position=30, width=100)
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -64,8 +57,8 @@ def build_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog=PROGRAM, description=DESCRIPTION, epilog=EXAMPLES, formatter_class=Formatter)
     parser.add_argument("--version", action="version", version=f"{PROGRAM} {__version__}")
     subparsers = parser.add_subparsers(title="commands", required=True, metavar="COMMAND ...")
-    for name, (add_arguments, run, text) in COMMANDS.items():
-        summary, _, rest = inspect.cleandoc(text or "").partition("\n\n")
+    for name, (add_arguments, run) in COMMANDS.items():
+        summary, _, rest = inspect.cleandoc(run.__doc__ or "").partition("\n\n")
         description, _, examples = rest.rpartition("\n\n")
         sub = subparsers.add_parser(
             name,
@@ -83,18 +76,14 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line.
+    """Run the command line with these arguments, or with those of the process; the exit code.
 
-    Args:
-        argv: Arguments; by default those of the process.
-
-    Returns:
-        The exit code: 0, 1 after an error, 130 after Ctrl-C; `precompute` has one of its own when some sets have no
-        result, `check` when parts pass through each other. Wrong usage leaves with ``SystemExit(2)``.
+    It is 0, 1 after an error, 130 after Ctrl-C; 3 of `precompute` when some sets have no result, and of `check` when
+    parts pass through each other. Wrong usage leaves with ``SystemExit(2)``.
     """
     try:
         args = build_parser().parse_args(argv)
-        with _warnings_as_lines(), _log_as_lines(args):
+        with _messages_as_lines(args):
             code = args.command(args) or 0
         sys.stdout.flush()
         return code
@@ -125,8 +114,8 @@ def _say(message: str) -> None:
 
 
 @contextlib.contextmanager
-def _warnings_as_lines() -> Iterator[None]:
-    """Show each warning about input or result once; ignore those of libraries."""
+def _messages_as_lines(args: argparse.Namespace) -> Iterator[None]:
+    """Show the package's log, all of it with --verbose, and each warning about input or result once, as lines."""
     seen = set()
 
     def show(message: Warning | str, category: type[Warning], *_: Any) -> None:
@@ -134,24 +123,16 @@ def _warnings_as_lines() -> Iterator[None]:
             seen.add(str(message))
             _say(f"warning: {message}")
 
-    with warnings.catch_warnings():
-        warnings.simplefilter("always", UserWarning)
-        warnings.showwarning = show  # type: ignore[assignment]
-        yield
-
-
-@contextlib.contextmanager
-def _log_as_lines(args: argparse.Namespace) -> Iterator[None]:
-    """Show the package's log on the error output: warnings only with --quiet, all with --verbose."""
-    logger = logging.getLogger("torch_modal")
-    handler = logging.StreamHandler()
+    logger, handler = logging.getLogger("torch_modal"), logging.StreamHandler()
     handler.setFormatter(logging.Formatter(f"{PROGRAM}: %(message)s"))
-    level = logger.level
-    verbose, quiet = (getattr(args, name, False) for name in ("verbose", "quiet"))
+    verbose, quiet, level = getattr(args, "verbose", False), getattr(args, "quiet", False), logger.level
     logger.setLevel(logging.DEBUG if verbose else logging.WARNING if quiet else logging.INFO)
     logger.addHandler(handler)
     try:
-        yield
+        with warnings.catch_warnings():
+            warnings.simplefilter("always", UserWarning)
+            warnings.showwarning = show  # type: ignore[assignment]
+            yield
     finally:
         logger.removeHandler(handler)
         logger.setLevel(level)

@@ -2,102 +2,76 @@
 
 import argparse
 import warnings
+from functools import partial
+from pathlib import Path
 
 from torch_modal.cli.arguments import (
+    CACHE_DIR,
     add_common,
     add_levels,
-    add_meshes,
     add_modes,
-    add_out,
-    add_picture,
     add_registration,
     caching,
     check_output,
+    file_name,
     is_file,
     mode_options,
     number,
     reporter,
-    times,
 )
-from torch_modal.io.formats import ANIMATION_FORMATS, MESH_FORMATS
+from torch_modal.io.formats import ANIMATION_FORMATS, MESH_FORMATS, PICTURES
 
 
 def add_arguments(sub: argparse.ArgumentParser) -> None:
     """Arguments of ``subdivide``."""
-    add_meshes(sub, "key-frames, two or more, in their order")
-    animations = ", ".join(ANIMATION_FORMATS)
-    add_out(sub, "FILE_OR_FOLDER", f"the animation alone: {animations}; a folder: numbered frames and animation.glb")
+    add, positive = sub.add_argument, number(float, 0, above=True)
+    add("meshes", nargs="+", type=Path, metavar="MESH", help="key-frames, two or more, in their order")
+    text = f"the animation alone: {', '.join(ANIMATION_FORMATS)}; a folder: numbered frames and animation.glb"
+    add("--out", type=Path, required=True, metavar="FILE_OR_FOLDER", help=text)
     add_levels(sub, 0)
-    sub.add_argument(
-        "--frames",
-        type=number(int, 2),
-        metavar="N",
-        help="number of frames of the result (default: those of the levels)",
+    text = "number of frames of the result (default: those of the levels)"
+    add("--frames", type=number(int, 2), metavar="N", help=text)
+    add("--cyclic", action="store_true", help="the last key-frame leads on to the first")
+    text = "when the key-frames are, ascending, in any unit; of a cycle, with the time when it begins again"
+    add("--times", type=times, metavar="T,T,...", help=text)
+    text = "treat each pair of key-frames alone, without what its neighbours in time know"
+    add("--no-smooth", dest="smooth", action="store_const", const=False, help=text)
+    text = "keep parts from passing through each other (extra contact)"
+    add("--contact", action="store_true", help=text)
+    text = (
+        "a coarser mesh of N vertices moves, and carries the detail; 0: the mesh itself (default: 20000, for meshes "
+        "of more than 100000 vertices)"
     )
-    sub.add_argument("--cyclic", action="store_true", help="the last key-frame leads on to the first")
-    sub.add_argument(
-        "--times",
-        type=times,
-        metavar="T,T,...",
-        help="when the key-frames are, ascending, in any unit; of a cycle, with the time when it begins again",
-    )
-    sub.add_argument(
-        "--no-smooth",
-        dest="smooth",
-        action="store_const",
-        const=False,
-        help="treat each pair of key-frames alone, without what its neighbours in time know",
-    )
-    sub.add_argument(
-        "--contact", action="store_true", help="keep parts from passing through each other (extra contact)"
-    )
-    sub.add_argument(
-        "--proxy",
-        type=number(int, 0),
-        metavar="N",
-        help="a coarser mesh of N vertices moves, and carries the detail; 0: the mesh itself (default: 20000, for "
-        "meshes of more than 100000 vertices)",
-    )
-    sub.add_argument(
-        "--preset",
-        choices=("accurate", "fast", "paper"),
-        default="accurate",
-        help="accurate; fast, without steps on the fine mesh; paper, its method whole (default: %(default)s)",
-    )
-    sub.add_argument("--mu", type=number(float, 0), metavar="X", help="with --preset paper: weight of the similarity")
-    sub.add_argument(
-        "--regions",
-        type=number(int, 0),
-        metavar="N",
-        help="with --preset paper: segments, the worst of 24, that are interpolated locally (default: 8)",
-    )
-    sub.add_argument(
-        "--format",
-        choices=[suffix[1:] for suffix in MESH_FORMATS],
-        help="of the numbered frames (default: that of the first key-frame, with all that its file carries)",
-    )
-    group, positive = sub.add_argument_group("animation"), number(float, 0, above=True)
-    group.add_argument(
-        "--duration",
-        type=positive,
-        metavar="SECONDS",
-        help="of the sequence once (default: 1 for a cycle, 2 for two key-frames, 1 an interval of more)",
-    )
-    group.add_argument(
-        "--fps",
-        type=positive,
-        metavar="X",
-        help="frames a second; with --duration, pictures or samples a second of videos and point caches (default: 24)",
-    )
+    add("--proxy", type=number(int, 0), metavar="N", help=text)
+    text = "accurate; fast, without steps on the fine mesh; paper, its method whole (default: %(default)s)"
+    add("--preset", choices=("accurate", "fast", "paper"), default="accurate", help=text)
+    add("--mu", type=number(float, 0), metavar="X", help="with --preset paper: weight of the similarity")
+    text = "with --preset paper: segments, the worst of 24, that are interpolated locally (default: 8)"
+    add("--regions", type=number(int, 0), metavar="N", help=text)
+    text = "of the numbered frames (default: that of the first key-frame, with all that its file carries)"
+    add("--format", choices=[suffix[1:] for suffix in MESH_FORMATS], help=text)
+    text = "also draw the sequence beside linear interpolation, as .png or .pdf"
+    add("--picture", type=file_name(PICTURES), metavar="FILE", help=text)
+    group = sub.add_argument_group("animation")
+    text = "of the sequence once (default: 1 for a cycle, 2 for two key-frames, 1 an interval of more)"
+    group.add_argument("--duration", type=positive, metavar="SECONDS", help=text)
+    text = "frames a second; with --duration, pictures or samples a second of videos and point caches (default: 24)"
+    group.add_argument("--fps", type=positive, metavar="X", help=text)
     group.add_argument("--ping-pong", action="store_true", help="there and back again")
     group.add_argument("--ease", action="store_true", help="slow at both ends")
-    add_picture(sub, "also draw the sequence beside linear interpolation")
-    sub.add_argument(
-        "--register", action="store_true", help="the meshes have different connectivity: lay the first onto the others"
-    )
+    text = "the meshes have different connectivity: lay the first onto the others"
+    add("--register", action="store_true", help=text)
     add_registration(sub)
     add_modes(sub)
-    add_common(sub)
+    add_common(sub, cache_dir=CACHE_DIR)
+
+
+def times(text: str) -> list[float]:
+    """An argument type: numbers with commas between them."""
+    try:
+        return [float(word) for word in text.split(",")]
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is no list of numbers such as 0,0.4,1") from None
 
 
 def run(args: argparse.Namespace) -> None:
@@ -137,7 +111,7 @@ def run(args: argparse.Namespace) -> None:
     check_output([animation, *([args.picture] if args.picture else []), *earlier], args.meshes, args.overwrite)
 
     import torch_modal as tm
-    from torch_modal.passengers.proxy import Proxy, proxy_size
+    from torch_modal.passengers.proxy import proxy_size
     from torch_modal.view.animation import require_packages
 
     require_packages(animation)
@@ -150,14 +124,11 @@ def run(args: argparse.Namespace) -> None:
     asset = tm.open_asset(args.meshes[0])
     welded = tm.weld_seams(keyframes, faces)
     progress = False if args.quiet else None
-    n_proxy = proxy_size(args.proxy, welded.keyframes.shape[1])
-    carrier = Proxy(welded.keyframes, welded.faces, n_proxy) if n_proxy else None
-    moving = (carrier.keyframes, carrier.faces) if carrier else (welded.keyframes, welded.faces)
-    bases = tm.extract_bases(*moving, args.modes, **mode_options(args))
     solved = tm.subdivide(
-        *moving,
+        welded.keyframes,
+        welded.faces,
         args.levels,
-        bases=bases,
+        bases=partial(tm.extract_bases, **mode_options(args)),
         **spread,
         smooth=args.smooth,
         progress=progress,
@@ -165,10 +136,11 @@ def run(args: argparse.Namespace) -> None:
         contact=args.contact,
         mu=args.mu,
         regions=args.regions,
+        proxy=args.proxy,
     )
-    if carrier:
-        report(f"moved by a proxy of {carrier.keyframes.shape[1]} vertices (--proxy 0: by the whole mesh)")
-        solved = carrier.carried(solved, places, welded.keyframes)
+    n_proxy = proxy_size(args.proxy, welded.keyframes.shape[1])
+    if n_proxy:
+        report(f"moved by a proxy of about {n_proxy} vertices (--proxy 0: by the whole mesh)")
     frames = welded.scatter(solved)
     keys = [place for place in places if place < len(frames)]
     frames[keys] = keyframes

@@ -7,9 +7,9 @@ import tempfile
 import webbrowser
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from torch_modal.cli.arguments import add_common, add_meshes, check_output, file_name, number
+from torch_modal.cli.arguments import add_common, check_output, file_name, number, reporter
 from torch_modal.io.formats import PAGES
 
 if TYPE_CHECKING:
@@ -18,44 +18,23 @@ if TYPE_CHECKING:
 
 def add_arguments(sub: argparse.ArgumentParser) -> None:
     """Arguments of ``view``."""
-    add_meshes(sub, "shapes in their order, a folder, or one GLB")
-    sub.add_argument(
-        "--compare",
-        nargs="+",
-        type=Path,
-        action="append",
-        default=[],
-        metavar="FILE",
-        help="another sequence of as many shapes, of the same faces; may be given several times",
-    )
-    sub.add_argument(
-        "--linear", action="store_true", help="also show linear interpolation of the key-frames of the first sequence"
-    )
-    sub.add_argument(
-        "--keyframes",
-        nargs="+",
-        type=number(int, 0),
-        metavar="N",
-        help="which frames are key-frames, from 0 (default: the GLB's, or the first and the last)",
-    )
-    sub.add_argument("--cyclic", action="store_true", help="the last frame leads on to the first")
-    rate = number(float, 0, above=True)
-    sub.add_argument("--fps", type=rate, metavar="X", help="frames a second (default: the GLB's, or 24)")
-    sub.add_argument("--up", choices=("y", "z"), help="what is up (default: Y, unless the first shape is flat in Y)")
-    sub.add_argument(
-        "--page",
-        type=file_name(PAGES),
-        metavar="FILE",
-        help="write the page there, as .html (default: a temporary file, opened)",
-    )
-    sub.add_argument(
-        "--landmarks",
-        nargs="?",
-        const=True,
-        metavar="FILE",
-        help="a page to pick landmarks of two meshes or more; with a FILE, those of it are there already",
-    )
-    add_common(sub, overwrite="replace the file if it exists (default: refuse)", cache_dir=None, all_of=False)
+    add = sub.add_argument
+    add("meshes", nargs="+", type=Path, metavar="MESH", help="shapes in their order, a folder, or one GLB")
+    text = "another sequence of as many shapes, of the same faces; may be given several times"
+    add("--compare", nargs="+", type=Path, action="append", default=[], metavar="FILE", help=text)
+    text = "also show linear interpolation of the key-frames of the first sequence"
+    add("--linear", action="store_true", help=text)
+    text = "which frames are key-frames, from 0 (default: the GLB's, or the first and the last)"
+    add("--keyframes", nargs="+", type=number(int, 0), metavar="N", help=text)
+    add("--cyclic", action="store_true", help="the last frame leads on to the first")
+    text = "frames a second (default: the GLB's, or 24)"
+    add("--fps", type=number(float, 0, above=True), metavar="X", help=text)
+    add("--up", choices=("y", "z"), help="what is up (default: Y, unless the first shape is flat in Y)")
+    text = "write the page there, as .html (default: a temporary file, opened)"
+    add("--page", type=file_name(PAGES), metavar="FILE", help=text)
+    text = "a page to pick landmarks of two meshes or more; with a FILE, those of it are there already"
+    add("--landmarks", nargs="?", const=True, metavar="FILE", help=text)
+    add_common(sub, "replace the file if it exists (default: refuse)")
 
 
 def run(args: argparse.Namespace) -> None:
@@ -79,65 +58,66 @@ def run(args: argparse.Namespace) -> None:
         torch-modal view cat.obj dog.obj --landmarks
     """
     given = [args.meshes, *args.compare]
-    names = [path.name for path in args.meshes] if args.landmarks else [_name(paths) for paths in given]
     if args.landmarks and (args.compare or args.linear or args.keyframes):
         args.fail("--compare, --linear and --keyframes belong to sequences; --landmarks shows single meshes")
-    if args.landmarks and len(names) < 2:
+    if args.landmarks and len(args.meshes) < 2:
         args.fail("--landmarks needs two meshes or more")
-    if args.linear:
-        names.append("linear")
-    if len(set(names)) < len(names):
-        names = [f"{name} {number}" for number, name in enumerate(names, 1)]
     if args.page:
         inputs = [] if args.landmarks in (None, True) else [Path(args.landmarks)]
         check_output([args.page], [*chain(*given), *inputs], args.overwrite)
 
-    page, what = (_landmarks if args.landmarks else _sequences)(names, given, args)
+    page, what = _landmarks(args) if args.landmarks else _sequences(given, args)
     # Without --page it goes to a temporary folder, and stays: the browser reads it after this process.
     path = page.save(args.page or Path(tempfile.mkdtemp(prefix="torch_modal-"), "page.html"), args.overwrite)
-    if not args.quiet:
-        print(f"{what}: {path}", flush=True)
+    reporter(args)(f"{what}: {path}")
     if not args.page and not webbrowser.open(path.absolute().as_uri()):
         print(f"no browser was found to open it; open it yourself, or write it elsewhere with --page: {path}")
 
 
-def _landmarks(names: list[str], given: list[list[Path]], args: argparse.Namespace) -> tuple[Page, str]:
+def _landmarks(args: argparse.Namespace) -> tuple[Page, str]:
     """A page to pick landmarks on meshes of any connectivity, and what it shows."""
     import torch_modal as tm
     from torch_modal.io.read import read_mesh
     from torch_modal.registration.landmarks import landmark_vertices
 
-    meshes = [read_mesh(path) for path in given[0]]
+    meshes = [read_mesh(path) for path in args.meshes]
     rows = None if args.landmarks is True else landmark_vertices(args.landmarks, [points for points, _ in meshes])
+    names = _numbered([path.name for path in args.meshes])
     page = tm.show_landmarks(dict(zip(names, meshes, strict=True)), rows, title="Landmarks")
     return page, f"{len(meshes)} meshes to pick landmarks on"
 
 
-def _sequences(names: list[str], given: list[list[Path]], args: argparse.Namespace) -> tuple[Page, str]:
+def _sequences(given: list[list[Path]], args: argparse.Namespace) -> tuple[Page, str]:
     """A page that plays sequences of the same faces, and what it shows."""
+    import torch
+
     import torch_modal as tm
     from torch_modal.io.read import require_same_mesh
     from torch_modal.view.page_input import read_shapes
 
     first, faces, options = read_shapes(given[0])
-    shapes = [first]
+    names, shapes, n = [_name(paths) for paths in given], [first], len(first)
     for paths in given[1:]:
         frames, other_faces, _ = read_shapes(paths)
         require_same_mesh(given[0][0], first[0], faces, paths[0], frames[0], other_faces)
-        if len(frames) != len(first):
+        if len(frames) != n:
             raise ValueError(
-                f"{paths[0]} has {len(frames)} shapes, {given[0][0]} has {len(first)}; sequences are compared shape by "
-                "shape, so both need as many"
+                f"{paths[0]} has {len(frames)} shapes, {given[0][0]} has {n}; sequences are compared shape by shape, "
+                "so both need as many"
             )
         shapes.append(frames)
     asked = {"keyframe_indices": args.keyframes, "fps": args.fps, "cyclic": args.cyclic or None, "up": args.up}
     options |= {name: value for name, value in asked.items() if value is not None}
     if args.linear:
-        keys = options.get("keyframe_indices") or [0, len(first) - 1]
-        shapes.append(_linear(first, sorted(set(keys)), options.get("cyclic", False)))
-    page = tm.show(dict(zip(names, shapes, strict=True)), faces, **options, title=names[0])
+        keys, cyclic = sorted(set(options.get("keyframe_indices") or [0, n - 1])), options.get("cyclic", False)
+        if keys[0] != 0 or keys[-1] >= n or (keys[-1] != n - 1 and not cyclic):
+            ends = "the first frame (0)" if cyclic else f"the first frame (0) and the last ({n - 1})"
+            raise ValueError(f"--linear needs {ends} among the key-frames, got {' '.join(map(str, keys))}")
+        names.append("linear")
+        shapes.append(tm.linear_sequence(torch.from_numpy(first[keys]), [*keys, n] if cyclic else keys).numpy())
+    page = tm.show(dict(zip(_numbered(names), shapes, strict=True)), faces, **options, title=names[0])
     times = f"{len(shapes)} x " if len(shapes) > 1 else ""
-    return page, f"{times}{len(first)} shapes of {first.shape[1]} vertices"
+    return page, f"{times}{n} shapes of {first.shape[1]} vertices"
 
 
 def _name(paths: list[Path]) -> str:
@@ -146,15 +126,6 @@ def _name(paths: list[Path]) -> str:
     return path.stem if path.is_file() else path.name
 
 
-def _linear(frames: Any, keys: list[int], cyclic: bool) -> Any:
-    """Straight lines between the key-frames, for as many frames."""
-    import torch
-
-    import torch_modal as tm
-
-    last = len(frames) - 1
-    if keys[0] != 0 or keys[-1] > last or (keys[-1] != last and not cyclic):
-        ends = "the first frame (0)" if cyclic else f"the first frame (0) and the last ({last})"
-        raise ValueError(f"--linear needs {ends} among the key-frames, got {' '.join(map(str, keys))}")
-    places = [*keys, len(frames)] if cyclic else keys
-    return tm.linear_sequence(torch.from_numpy(frames[keys]), places).numpy()
+def _numbered(names: list[str]) -> list[str]:
+    """Names with a number each, if some are equal."""
+    return names if len(set(names)) == len(names) else [f"{name} {i}" for i, name in enumerate(names, 1)]

@@ -26,28 +26,22 @@ QUANTILE = 0.95
 
 
 class FittedFrames(NamedTuple):
-    """Amplitudes, rigid motions and errors of frames."""
+    """Amplitudes, rigid motions, and mean distances of the vertices over the diagonal, of T frames.
+
+    *Shape:* ``(T, k), (T, 6), (T,)``.
+    """
 
     amplitudes: Tensor
-    """*Shape:* ``(T, k)``."""
     motions: Tensor
-    """*Shape:* ``(T, 6)``."""
     errors: Tensor
-    """Mean distance of the vertices, over the diagonal. *Shape:* ``(T,)``."""
 
 
 def fit(
     decoder: ModalDecoder, frames: Tensor, times: Tensor, on_frame: Callable[[], object] = lambda: None
 ) -> FittedFrames:
-    """Fit amplitudes and rigid motions of frames.
+    """Fit amplitudes and rigid motions of frames at some times, near key-frames of a decoder. *Shape:* ``(T, V, 3)``.
 
     Each frame starts from the amplitudes of the one before, as long as both are in the same interval of key-frames.
-
-    Args:
-        decoder: With key-frames near those frames.
-        frames: *Shape:* ``(T, V, 3)``.
-        times: Of the frames. *Shape:* ``(T,)``.
-        on_frame: Called after each frame.
     """
     n, k = len(frames), decoder.n_modes
     found = FittedFrames(torch.zeros(n, k).double(), torch.zeros(n, 6).double(), torch.zeros(n).double())

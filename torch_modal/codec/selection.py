@@ -10,8 +10,8 @@ from torch import Tensor
 from torch_modal.codec.fit import fit
 from torch_modal.keyframes.arrays import checked_times
 from torch_modal.keyframes.check import check_keyframes
+from torch_modal.modes.extract import extract_modes
 from torch_modal.motion.decoder import ModalDecoder
-from torch_modal.precompute.extract import extract_modes
 from torch_modal.progress import Progress, ProgressReport
 
 ERROR = 0.002
@@ -64,25 +64,15 @@ def select_keyframes(
 
 
 def checked_motion(frames: Any, faces: Any, times: Any, cyclic: bool) -> tuple[Tensor, Tensor, Tensor]:
-    """Checked frames (float64), faces and times; of a cycle, also the time when the first frame comes again.
-
-    Raises:
-        MeshError: Frames that cannot be used.
-        ValueError: Times that do not ascend or do not fit the frames.
-    """
+    """Checked frames (float64), faces and times; raises as :func:`torch_modal.encode`."""
     shapes, triangles = check_keyframes(frames, faces, min_keyframes=2, warn=False)
     return shapes.detach().cpu().double(), triangles.cpu(), checked_times(times, len(shapes), cyclic)
 
 
 class Selection:
-    """Search for the key-frames of a motion; the error of an interval is computed once.
+    """Search for the key-frames of a checked motion with modes of its first frame, ``(k, V, 3)``.
 
-    Args:
-        frames: float64. *Shape:* ``(T, V, 3)``.
-        faces: *Shape:* ``(F, 3)``.
-        times: Of the frames; of a cycle, also when the first comes again. *Shape:* ``(T,)`` or ``(T + 1,)``.
-        cyclic: Whether the last frame leads on to the first.
-        modes: Of the first frame. *Shape:* ``(k, V, 3)``.
+    The error of an interval is computed once.
     """
 
     def __init__(self, frames: Tensor, faces: Tensor, times: Tensor, cyclic: bool, modes: Tensor) -> None:

@@ -14,8 +14,8 @@ from torch_modal.codec.fit import FittedFrames, fit
 from torch_modal.codec.selection import ERROR, Selection, checked_motion
 from torch_modal.io.tensors import TensorFile, write_tensors
 from torch_modal.keyframes.check import check_keyframes
+from torch_modal.modes.extract import extract_modes
 from torch_modal.motion.decoder import ModalDecoder
-from torch_modal.precompute.extract import extract_modes
 from torch_modal.progress import Progress, ProgressReport
 
 FORMAT = "torch_modal.sequence"
@@ -79,11 +79,6 @@ class ModalSequence:
         return len(self.keyframe_times) > len(self.keyframes)
 
     @property
-    def n_frames(self) -> int:
-        """Number of frames, T."""
-        return len(self.times)
-
-    @property
     def n_modes(self) -> int:
         """Number of amplitudes of a frame, k."""
         return self.amplitudes.shape[1]
@@ -94,7 +89,7 @@ class ModalSequence:
 
         Without modes, which :func:`torch_modal.extract_modes` computes again from the first key-frame.
         """
-        others = self.n_frames - int(self.is_keyframe.sum())
+        others = len(self.times) - int(self.is_keyframe.sum())
         return self.keyframes.numel() + len(self.keyframe_times) + others * (self.n_modes + 7)
 
     @property
@@ -121,7 +116,7 @@ class ModalSequence:
                 times, a, motions = self.times, self.amplitudes, self.motions
             else:
                 times = torch.as_tensor(t, dtype=torch.float64).reshape(-1)
-                a, motions = self.at(times)
+                a, motions = self._at(times)
             out = torch.empty(len(times), *self.keyframes.shape[1:], dtype=torch.float64)
             with ProgressReport(len(times), "decoded frames", progress) as bar:
                 for rows in torch.arange(len(times)).split(CHUNK):
@@ -154,7 +149,7 @@ class ModalSequence:
             )
         return fit(self.decoder, x, t)
 
-    def at(self, t: Tensor) -> tuple[Tensor, Tensor]:
+    def _at(self, t: Tensor) -> tuple[Tensor, Tensor]:
         """Amplitudes and rigid motions at any time. *Shape:* ``(N,) -> (N, k), (N, 6)``."""
         knots, values = self.times, torch.cat([self.amplitudes, self.motions], 1)
         if self.cyclic:
@@ -240,30 +235,20 @@ def encode(
     modes = extract_modes(x[0], triangles, n_modes, cache_dir=cache_dir, cache=cache).modes
     if not given:
         keys = Selection(x, triangles, when, cyclic, modes).run(keyframes, error, progress)  # type: ignore[arg-type]
+    n, k = len(x), len(modes)
     while True:
-        sequence = _encoded(x, triangles, when, cyclic, keys, modes, progress)
-        if keyframes is not None or float(sequence.errors.max()) <= error:
+        key_times = when[[*keys, n]] if cyclic else when[keys]
+        amplitudes, motions, errors = (torch.zeros(n, *size, dtype=torch.float64) for size in ((k,), (6,), ()))
+        sequence = ModalSequence(x[keys], triangles, key_times, when[:n], amplitudes, motions, modes, errors)
+        others = torch.nonzero(~sequence.is_keyframe)[:, 0]
+        with ProgressReport(len(others), "encoded frames", progress) as bar:
+            found = fit(sequence.decoder, x[others], when[others], bar.update)
+        amplitudes[others], motions[others], errors[others] = found
+        if keyframes is not None or float(errors.max()) <= error:
             return sequence
         # Errors were estimated from samples: add the worst frame of each interval that has one above the error.
-        ends = pairwise([*keys, len(x)])
-        worst = [a + int(sequence.errors[a:b].argmax()) for a, b in ends]
-        keys = sorted({*keys, *(f for f in worst if float(sequence.errors[f]) > error)})
-
-
-def _encoded(
-    frames: Tensor, faces: Tensor, times: Tensor, cyclic: bool, keys: list[int], modes: Tensor, progress: Progress
-) -> ModalSequence:
-    """A motion with given key-frames."""
-    n, k = len(frames), len(modes)
-    key_times = times[[*keys, n]] if cyclic else times[keys]
-    amplitudes, motions, errors = torch.zeros(n, k).double(), torch.zeros(n, 6).double(), torch.zeros(n).double()
-    sequence = ModalSequence(frames[keys], faces, key_times, times[:n], amplitudes, motions, modes, errors)
-    others = torch.nonzero(~sequence.is_keyframe)[:, 0]
-    with ProgressReport(len(others), "encoded frames", progress) as bar:
-        amplitudes[others], motions[others], errors[others] = fit(
-            sequence.decoder, frames[others], times[others], bar.update
-        )
-    return sequence
+        worst = [a + int(errors[a:b].argmax()) for a, b in pairwise([*keys, n])]
+        keys = sorted({*keys, *(f for f in worst if float(errors[f]) > error)})
 
 
 def _checked_keys(keyframes: Any, n_frames: int, cyclic: bool) -> list[int]:

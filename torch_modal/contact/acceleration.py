@@ -58,13 +58,8 @@ class AccelerationLimit:
         """Find the displacement nearest to a wanted one, in least squares, that keeps each vertex below the bound.
 
         It is a convex problem for each vertex, solved by the alternating direction method of multipliers (Boyd et al.
-        2011). Vertices below the bound stay as they are.
-
-        Args:
-            wanted: At each time. *Shape:* ``(T, V, 3)``.
-
-        Returns:
-            The displacement, and the vertices that were limited. *Shape:* ``(T, V, 3), (m,)``.
+        2011). Vertices below the bound stay as they are; the others are returned, too.
+        *Shape:* ``(T, V, 3) -> (T, V, 3), (m,)``.
         """
         rows, seen = self.differences, torch.einsum("tij,tvj->tvi", self.rotations, wanted.double())
         added = self.trajectory + torch.tensordot(rows, seen, 1)

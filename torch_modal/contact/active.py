@@ -26,11 +26,7 @@ STIFFNESS = 3000.0
 
 
 def refuse_transforms(x: Tensor) -> None:
-    """Refuse shapes whose numbers cannot be read, or whose tangents would be lost: the search is not torch's.
-
-    Raises:
-        RuntimeError: They are within a transform of ``torch.func``, or have a tangent.
-    """
+    """Raise for shapes within transforms of ``torch.func``, or with tangents: the search is not torch's."""
     if transformed(x):
         raise RuntimeError(
             "shapes with contact have no forward mode, and no transforms of torch.func: take torch.autograd.grad, or "
@@ -53,15 +49,11 @@ class Contacts(NamedTuple):
 
     def beside(self, former: "Contacts") -> "Contacts":
         """Add the former contacts of vertices that have none now: without them, what was pushed out falls back."""
-        own, before = (each.shapes * (1 + _last(self, former)) + each.elements[:, 3] for each in (self, former))
+        n = 1 + max(int(each.elements.max()) if len(each.elements) else 0 for each in (self, former))
+        own, before = (each.shapes * n + each.elements[:, 3] for each in (self, former))
         kept = ~torch.isin(before, own)
         shapes = torch.cat([self.shapes, former.shapes[kept]])
         return Contacts(shapes, torch.cat([self.elements, former.elements[kept]]))
-
-
-def _last(*contacts: Contacts) -> int:
-    """Largest vertex index."""
-    return max(int(each.elements.max()) if len(each.elements) else 0 for each in contacts)
 
 
 class ContactSearch:
@@ -70,7 +62,7 @@ class ContactSearch:
     Vertices beside an intersection are watched in all later searches.
 
     Args:
-        mesh: The mesh.
+        mesh: Their connectivity.
         known: Shapes whose own intersections stay as they are, in the frame. *Shape:* ``(K, V, 3)``.
         areas: Areas of the vertices, constants of the gradient. *Shape:* ``(V,)``.
         n_shapes: T.
@@ -98,12 +90,11 @@ class ContactSearch:
             if not bool(x[i].isfinite().all()):
                 n_far.append(0)
                 continue
-            found = self.search(_numbers(x[i]), self.watched[i])
-            self.watched[i] = found.watched
-            vertices, faces = torch.from_numpy(found.vertices), torch.from_numpy(found.faces)
+            *found, n = self.search(_numbers(x[i]), self.watched[i])
+            vertices, faces = map(torch.from_numpy, found)
             shapes.append(torch.full_like(vertices, i))
             elements.append(torch.cat([self.faces[faces], vertices[:, None]], 1))
-            n_far.append(found.n_far)
+            n_far.append(n)
         every = torch.cat([torch.zeros(0, dtype=torch.int64), *shapes]).to(x.device)
         corners = torch.cat([torch.zeros(0, 4, dtype=torch.int64), *elements]).to(x.device)
         return Contacts(every, corners), torch.tensor(n_far, dtype=torch.int64, device=x.device)
@@ -134,13 +125,7 @@ def _numbers(x: Tensor) -> FloatArray:
 
 
 class ContactEnergy:
-    """Energy of the active contacts of a batch, beside that of the mesh.
-
-    Args:
-        contacts: Those of the batch.
-        areas: Areas of the vertices. *Shape:* ``(V,)``.
-        like: The batch, whose dtype it has. *Shape:* ``(B, V, 3)``.
-    """
+    """Energy of the active contacts of a batch, from areas of the vertices. *Shape:* ``(V,), (B, V, 3)``."""
 
     def __init__(self, contacts: Contacts, areas: Tensor, like: Tensor) -> None:
         self.shapes, elements = contacts
@@ -149,14 +134,9 @@ class ContactEnergy:
         self.weights = STIFFNESS * areas.to(like)[elements[:, 3]]
 
     def missing(self, x: Tensor, near: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Missing distances, at most zero, and gradients of the heights in the corners.
+        """Missing distances, at most zero, and gradients of the heights in the corners, of all contacts or of some.
 
-        Args:
-            x: *Shape:* ``(B, V, 3)``.
-            near: Contacts to look at. Default: all. *Shape:* ``(n,)``.
-
-        Returns:
-            *Shape:* ``(n,), (4, 3, n)``.
+        *Shape:* ``(B, V, 3), (n,) -> (n,), (4, 3, n)``.
         """
         corners = self.corners if near is None else self.corners[:, near]
         first, *others = (pick(_rows(x), corner) for corner in corners)
@@ -200,12 +180,10 @@ class ContactEnergy:
 
 
 class Pull(NamedTuple):
-    """Springs that pull vertices to places."""
+    """Springs that pull vertices to places, with weights of the squared distances. *Shape:* ``(B, V, 3), (V,)``."""
 
     to: Tensor
-    """The places. *Shape:* ``(B, V, 3)``."""
     weights: Tensor
-    """Weights of the squared distances. *Shape:* ``(V,)``."""
 
     def value(self, x: Tensor) -> Tensor:
         """Energy of each shape. *Shape:* ``(B, V, 3) -> (B,)``."""

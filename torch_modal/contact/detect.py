@@ -4,7 +4,7 @@ A contact pairs a vertex with a face where parts pass through each other, or nea
 pairs a vertex with a face that it was behind in a known shape: a self-intersection of a key-frame stays as it is there.
 """
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy.sparse.csgraph import connected_components
@@ -33,25 +33,8 @@ _NEAREST = 64
 """Number of faces, by their centres, among which the nearest is searched; four times as many from inside."""
 
 
-class FoundContacts(NamedTuple):
-    """Vertices and faces that face each other in one shape."""
-
-    vertices: IntArray
-    """*Shape:* ``(n,)``."""
-    faces: IntArray
-    """*Shape:* ``(n,)``."""
-    n_far: int
-    """Number of far pairs of triangles."""
-    watched: BoolArray
-    """Vertices beside intersections of this and of earlier searches. *Shape:* ``(V,)``."""
-
-
 class Search:
-    """Search for active contacts.
-
-    Args:
-        crossings: Of the connectivity, with the key-frames as its known shapes.
-    """
+    """Search for active contacts between parts of a connectivity, with the key-frames as its known shapes."""
 
     def __init__(self, crossings: Crossings) -> None:
         self.crossings = crossings
@@ -59,28 +42,25 @@ class Search:
         self._edge = float(np.linalg.norm(crossings.like[i] - crossings.like[j], axis=1).mean())
         self._known = [Surface(crossings, x) for x in crossings.known]
 
-    def __call__(self, x: FloatArray, watched: BoolArray) -> FoundContacts:
-        """Find the contacts of a shape; none where no parts pass through each other.
+    def __call__(self, x: FloatArray, watched: BoolArray) -> tuple[IntArray, IntArray, int]:
+        """Vertices and faces that face each other, and the number of far pairs; none where nothing intersects.
 
-        Args:
-            x: *Shape:* ``(V, 3)``.
-            watched: Vertices of earlier searches. *Shape:* ``(V,)``.
+        Vertices beside the intersections are added to ``watched``. *Shape:* ``(V, 3), (V,) -> (n,), (n,)``.
         """
         crossings = self.crossings
         pairs = crossings.far_pairs(x)
         if not len(pairs):
             none = np.zeros(0, np.int64)
-            return FoundContacts(none, none, 0, watched)
+            return none, none, 0
         corners = np.zeros(len(x), dtype=bool)
         corners[crossings.mesh.faces[pairs.reshape(-1)]] = True
         before = crossings.known_inside
         surface = Surface(crossings, x)
         winds = crossings.winds(surface, crossings.within(corners, DEEP) | (watched & before))
         inside = crossings.hanging(winds & ~before, corners)
-        seeds = watched | crossings.grown(np.flatnonzero(corners), 2) | crossings.grown(np.flatnonzero(inside))
+        watched |= crossings.grown(np.flatnonzero(corners), 2) | crossings.grown(np.flatnonzero(inside))
         # What was inside in a key-frame is not to go in elsewhere.
-        stuck = winds & before & seeds
-        return FoundContacts(*self.opposite(surface, seeds, inside, stuck), len(pairs), seeds)
+        return *self.opposite(surface, watched, inside, winds & before & watched), len(pairs)
 
     def opposite(
         self, surface: Surface, seeds: BoolArray, inside: BoolArray, stuck: BoolArray
@@ -91,7 +71,7 @@ class Search:
             surface: The shape.
             seeds: Requested vertices, and corners of faces that may be found. *Shape:* ``(V,)``.
             inside: Vertices that are inside the surface, and were not in any known shape. *Shape:* ``(V,)``.
-            stuck: Vertices that are inside the surface, and were in a known shape. *Shape:* ``(V,)``.
+            stuck: Those that are, and were. *Shape:* ``(V,)``.
 
         Returns:
             Vertices and faces. *Shape:* ``(n,), (n,)``.
@@ -131,12 +111,7 @@ class Search:
 
         It is the distance to the nearest face that faces them, other than of the patch that went in with them.
 
-        Args:
-            x: *Shape:* ``(V, 3)``.
-            pairs: Faces that cross. *Shape:* ``(P, 2)``.
-
-        Returns:
-            *Shape:* ``(V,)``.
+        *Shape:* ``(V, 3), (P, 2) -> (V,)``, with the pairs of faces that cross.
         """
         crossings, faces = self.crossings, self.crossings.mesh.faces
         deep = np.zeros(len(x))
@@ -149,9 +124,8 @@ class Search:
         of_face = np.where((patch[faces] == patch[faces[:, :1]]).all(1), patch[faces[:, 0]], -1)
         surface = Surface(crossings, x)
         n = min(_NEAREST, len(faces))
-        near = np.asarray(cKDTree(surface.centres).query(x[own], n)[1]).reshape(-1)
         v: Any = np.repeat(own, n)
-        f: Any = near
+        f: Any = np.asarray(cKDTree(surface.centres).query(x[own], n)[1]).reshape(-1)
         facing = dot(surface.vertex_normals[v], surface.normals[f]) < FACING
         v, f = _kept(facing & (of_face[f] != patch[v]), v, f)
         v, f = _kept(_heights(surface, v, f) < 0, v, f)
@@ -173,17 +147,8 @@ def _distances(surface: Surface, v: IntArray, f: IntArray) -> FloatArray:
 
 
 def _nearest_faces(v: IntArray, f: IntArray, distance: FloatArray, height: FloatArray) -> IntArray:
-    """Indices of the pairs of each vertex with its nearest face.
-
-    Several faces may share the nearest point, and rounding would choose among them: the face whose plane is farthest
-    is used, and the first of those in one plane.
-
-    Args:
-        v: Vertices. *Shape:* ``(n,)``.
-        f: Faces. *Shape:* ``(n,)``.
-        distance: Distances from the faces. *Shape:* ``(n,)``.
-        height: Heights over their planes. *Shape:* ``(n,)``.
-    """
+    """Indices of the pairs of each vertex with its nearest face; of equally near ones, that of the farthest plane."""
+    # Faces share nearest points, and rounding would choose among them; of those in one plane, the first is taken.
     chosen = np.arange(len(v))
     for lengths, sign in ((distance, 1), (np.abs(height), -1)):
         least = np.full(v.max(initial=0) + 1, np.inf)

@@ -8,8 +8,8 @@ from torch import Tensor
 
 from torch_modal.backends.torch.fine_steps import Beside
 from torch_modal.contact.acceleration import AccelerationLimit
-from torch_modal.contact.active import ContactSearch, refuse_transforms
-from torch_modal.contact.modal import ModalModel
+from torch_modal.contact.active import ContactEnergy, ContactSearch, refuse_transforms
+from torch_modal.contact.modal import modal_displacement
 from torch_modal.contact.separate import Timeline, separate, through
 from torch_modal.energy.energy import RestShapes
 from torch_modal.geometry.connectivity import vertex_areas
@@ -17,7 +17,6 @@ from torch_modal.inbetween.alignment import Pose
 from torch_modal.inbetween.joint import JointSpace
 from torch_modal.inbetween.results import InBetweenResult, Samples
 from torch_modal.inbetween.solver import InBetweenSolver
-from torch_modal.solve.implicit import Report
 from torch_modal.solve.minimise import Solution
 
 PRODUCTS = 20
@@ -30,17 +29,17 @@ class ContactSolver(InBetweenSolver):
     Samples are separated independently; those without intersections are the ones without contact.
     """
 
-    def forward(self, samples: Samples, report: Report | None) -> InBetweenResult:
+    def forward(self, samples: Samples) -> InBetweenResult:
         """Solve. Arguments as for :class:`InBetweenSolver`.
 
         Samples with contacts are solved again alone: rounding depends on the batch, and contacts amplify it.
         """
-        whole = super().forward(samples, report)
+        whole = super().forward(samples)
         n_crossing = whole.solution.n_crossing
         if len(samples.weights) == 1 or n_crossing is None or not bool(n_crossing.any()):
             return whole
         some = torch.nonzero(n_crossing).flatten()
-        parts = [super(ContactSolver, self).forward(samples.rows(slice(i, i + 1)), None) for i in some.tolist()]
+        parts = [super(ContactSolver, self).forward(samples.rows(slice(i, i + 1))) for i in some.tolist()]
         each = zip(whole.solution, *(part.solution for part in parts), strict=True)
         merged = (values[0].index_copy(0, some, torch.cat(values[1:])) for values in each)  # type: ignore[union-attr, arg-type]
         shapes = whole.shapes.index_copy(0, some, torch.cat([part.shapes for part in parts]))
@@ -51,7 +50,7 @@ class ContactSolver(InBetweenSolver):
         refuse_transforms(x)
         searches = [contact_search(self, own, 1) for own in rests.shapes]
         if len(x) == 1:
-            x, _, n_crossing = separate(x, _steps(self, rests), searches[0])
+            x, n_crossing = separate(x, _steps(self, rests), searches[0])
         else:
             counts = [search.count(own[None]) for search, own in zip(searches, x, strict=True)]
             n_crossing = torch.cat([torch.zeros_like(solution.status[:0]), *counts])
@@ -59,28 +58,22 @@ class ContactSolver(InBetweenSolver):
 
 
 class Displacement(NamedTuple):
-    """The displacement that separates the shapes between two key-frames, at all times."""
+    """The displacement that separates the shapes between two key-frames, in their frame, at all times.
+
+    The field is None where nothing intersects; ``n_crossing`` are the far pairs that are left.
+    *Shape:* ``(T, V, 3), (T,), (T,)``.
+    """
 
     field: Tensor | None
-    """At the times of the shapes, in their frame; None where nothing intersects. *Shape:* ``(T, V, 3)``."""
     times: Tensor
-    """*Shape:* ``(T,)``."""
     n_crossing: Tensor
-    """Numbers of far pairs that are left. *Shape:* ``(T,)``, int64."""
     search: ContactSearch
 
     def apply(self, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
-        """Displace shapes at any times; between those of the field, along a cubic spline.
+        """Displace shapes at any times, by a spline between those of the field; and the far pairs left in each.
 
         A shape that would have more far pairs stays as it is. The gradient reaches shapes and times; the field is a
-        constant.
-
-        Args:
-            x: In the frame. *Shape:* ``(B, V, 3)``.
-            u: *Shape:* ``(B,)``.
-
-        Returns:
-            The shapes, and the far pairs that are left in each. *Shape:* ``(B, V, 3), (B,)``.
+        constant. *Shape:* ``(B, V, 3), (B,) -> (B, V, 3), (B,)``.
         """
         if self.field is None:
             return x, torch.zeros_like(u, dtype=torch.int64)
@@ -110,19 +103,20 @@ def push_apart(
     seen = torch.cat([ends[1, :1], core.alignment.restore(x, pose), ends[1, 1:]]) * scale
     limit = AccelerationLimit(seen, pose.rotation, goes_on)
 
-    def model(some: Tensor) -> ModalModel:
+    def in_modes(some: Tensor, contact: ContactEnergy, accelerations: Tensor) -> Tensor:
         space = core.space
         placement = space.place(x[some], rests.rows(some), u[some])
         zeros = x.new_zeros(len(some), space.n_amplitudes)
-        found = space.derivatives(zeros, placement, second_order=False)
-        stiffness = found.gauss_newton - space.anchor * torch.eye(zeros.shape[1]).to(found.gauss_newton)
-        return ModalModel(space.basis.fine, core.alignment.weights, found.gradient.to(u), stiffness.to(u))
+        at = space.derivatives(zeros, placement, second_order=False)
+        stiffness = at.gauss_newton - space.anchor * torch.eye(zeros.shape[1]).to(at.gauss_newton)
+        basis = space.basis.fine, core.alignment.weights, at.gradient.to(u), stiffness.to(u)
+        return modal_displacement(*basis, x[some], contact, accelerations)
 
     search = contact_search(core, ends[0], len(u))
-    timeline = Timeline(u, limit, model if isinstance(core.space, JointSpace) else None)
-    found = separate(x, _steps(core, rests), search, timeline)
-    field = None if found.x is x else found.x - x
-    return Displacement(field, u, found.n_crossing, contact_search(core, ends[0], 1))
+    timeline = Timeline(u, limit, in_modes if isinstance(core.space, JointSpace) else None)
+    pushed, n_crossing = separate(x, _steps(core, rests), search, timeline)
+    field = None if pushed is x else pushed - x
+    return Displacement(field, u, n_crossing, contact_search(core, ends[0], 1))
 
 
 def contact_search(core: InBetweenSolver, ends: Tensor, n_shapes: int) -> ContactSearch:

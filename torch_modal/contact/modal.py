@@ -7,8 +7,6 @@ With amplitudes :math:`c_s` at the times of some shapes, and the cubic spline th
 for the energies with contact, of which the elastic part is replaced with its second-order model at the shapes.
 """
 
-from typing import NamedTuple
-
 import torch
 from torch import Tensor
 
@@ -23,24 +21,22 @@ STEPS = 2
 """Newton steps."""
 
 
-class ModalModel(NamedTuple):
-    """Second-order model of the elastic energy of S shapes in n modes."""
-
-    modes: Tensor
-    """*Shape:* ``(n, V, 3)``."""
-    masses: Tensor
-    """Masses of the vertices, parts of the whole. *Shape:* ``(V,)``."""
-    gradient: Tensor
-    """*Shape:* ``(S, n)``."""
-    stiffness: Tensor
-    """*Shape:* ``(S, n, n)``."""
-
-
-def modal_displacement(model: ModalModel, x: Tensor, contact: ContactEnergy, accelerations: Tensor) -> Tensor:
+def modal_displacement(
+    modes: Tensor,
+    masses: Tensor,
+    slope: Tensor,
+    stiffness: Tensor,
+    x: Tensor,
+    contact: ContactEnergy,
+    accelerations: Tensor,
+) -> Tensor:
     """Take Newton steps, never uphill.
 
     Args:
-        model: Model of the shapes.
+        modes: *Shape:* ``(n, V, 3)``.
+        masses: Masses of the vertices, parts of the whole. *Shape:* ``(V,)``.
+        slope: Gradient of the elastic energy of each shape in the modes. *Shape:* ``(S, n)``.
+        stiffness: Its Hessian. *Shape:* ``(S, n, n)``.
         x: The shapes. *Shape:* ``(S, V, 3)``.
         contact: Their active contacts.
         accelerations: Second differences of the spline through values of the shapes, between N even times.
@@ -49,26 +45,24 @@ def modal_displacement(model: ModalModel, x: Tensor, contact: ContactEnergy, acc
     Returns:
         The displacement of the shapes. *Shape:* ``(S, V, 3)``.
     """
-    modes, rate = model.modes.flatten(1), len(accelerations) + 1
-    gram = (model.modes * model.masses[:, None]).flatten(1) @ modes.T
+    flat, rate = modes.flatten(1), len(accelerations) + 1
     # Half the Hessian of the squared acceleration, by row and column of the amplitudes of each shape.
     bend = rate**3 * accelerations.T @ accelerations
-    smooth = SMOOTHNESS * bend[:, None, :, None] * gram[:, None, :]
+    smooth = SMOOTHNESS * bend[:, None, :, None] * ((modes * masses[:, None]).flatten(1) @ flat.T)[:, None, :]
 
     def displaced(a: Tensor) -> Tensor:
-        return x + (a @ modes).view_as(x)
+        return x + (a @ flat).view_as(x)
 
     def value(a: Tensor) -> Tensor:
-        elastic = (model.gradient * a).sum() + 0.5 * torch.einsum("si,sij,sj->", a, model.stiffness, a)
+        elastic = (slope * a).sum() + 0.5 * torch.einsum("si,sij,sj->", a, stiffness, a)
         return elastic + SOFTNESS * contact.value(displaced(a)).sum() + torch.einsum("ia,iajb,jb->", a, smooth, a)
 
-    a = torch.zeros_like(model.gradient)
+    a = torch.zeros_like(slope)
     for _ in range(STEPS):
-        pushed, hardened = _in_modes(contact, displaced(a), model.modes)
-        gradient = model.gradient + torch.einsum("sij,sj->si", model.stiffness, a) + SOFTNESS * pushed
+        pushed, hardened = _in_modes(contact, displaced(a), modes)
+        gradient = slope + torch.einsum("sij,sj->si", stiffness, a) + SOFTNESS * pushed
         gradient = gradient + 2 * torch.einsum("iajb,jb->ia", smooth, a)
-        own = model.stiffness + SOFTNESS * hardened
-        hessian = 2 * smooth.reshape(a.numel(), -1) + torch.block_diag(*own)
+        hessian = 2 * smooth.reshape(a.numel(), -1) + torch.block_diag(*(stiffness + SOFTNESS * hardened))
         ridge = 1e-9 * hessian.diagonal().mean()
         factor, info = torch.linalg.cholesky_ex(hessian + ridge * torch.eye(len(hessian)).to(hessian))
         if int(info):
@@ -79,10 +73,7 @@ def modal_displacement(model: ModalModel, x: Tensor, contact: ContactEnergy, acc
 
 
 def _in_modes(contact: ContactEnergy, x: Tensor, modes: Tensor) -> tuple[Tensor, Tensor]:
-    """Gradient and Gauss-Newton Hessian of the contact energy in the modes.
-
-    *Shape:* ``(S, V, 3), (n, V, 3) -> (S, n), (S, n, n)``.
-    """
+    """Gradient and Gauss-Newton Hessian in the modes. *Shape:* ``(S, V, 3), (n, V, 3) -> (S, n), (S, n, n)``."""
     missing, gradients = contact.missing(x)
     n, (n_shapes, n_vertices) = len(modes), x.shape[:2]
     gradient, hessian = x.new_zeros(n_shapes, n), x.new_zeros(n_shapes, n, n)

@@ -39,10 +39,6 @@ class SelfContacts(NamedTuple):
     n_far: Tensor
     """Number of far pairs. *Shape:* ``(...)``."""
 
-    def of(self, i: int) -> Tensor:
-        """Pairs of one shape. *Shape:* ``(n, 2)``."""
-        return self.pairs[self.shape == i]
-
 
 def self_contacts(x: Any, faces: Any, ignore: Any = None) -> SelfContacts:
     """Find self-intersections of shapes.

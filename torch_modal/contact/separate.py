@@ -19,7 +19,6 @@ from torch import Tensor
 from torch_modal.backends.torch.fine_steps import Beside
 from torch_modal.contact.acceleration import AccelerationLimit
 from torch_modal.contact.active import ContactEnergy, Contacts, ContactSearch, Pull
-from torch_modal.contact.modal import ModalModel, modal_displacement
 
 LOOKED_AT = 8
 """Number of shapes that are looked at first: without intersections there, nothing is done."""
@@ -40,25 +39,14 @@ FADE = 0.0625
 
 
 class Timeline(NamedTuple):
-    """Shapes at T even times between two ends, which have no displacement."""
+    """Shapes at T even times in (0, 1) between two ends, which have no displacement."""
 
     t: Tensor
-    """Times in (0, 1). *Shape:* ``(T,)``."""
     limit: AccelerationLimit
-    """The bound on accelerations."""
-    model: Callable[[Tensor], ModalModel] | None
-    """Model of the elastic energy of some of the shapes in modes, *shape* ``(S,)``; None: without a start in modes."""
+    in_modes: Callable[[Tensor, ContactEnergy, Tensor], Tensor] | None
+    """First displacement of some of the shapes, from their indices, contacts and second differences in time.
 
-
-class Separated(NamedTuple):
-    """Shapes after the separation."""
-
-    x: Tensor
-    """*Shape:* ``(T, V, 3)``."""
-    n_before: Tensor
-    """Number of far pairs of triangles of each shape before. *Shape:* ``(T,)``."""
-    n_crossing: Tensor
-    """Number of far pairs that are left. *Shape:* ``(T,)``."""
+    *Shape:* ``(S,), (N, S) -> (S, V, 3)``; None: without a start in modes."""
 
 
 def separate(
@@ -66,7 +54,7 @@ def separate(
     relax: Callable[[Tensor, Tensor, Beside], Tensor],
     search: ContactSearch,
     timeline: Timeline | None = None,
-) -> Separated:
+) -> tuple[Tensor, Tensor]:
     """Separate the parts of T shapes that pass through each other; the shapes as they are, where none do.
 
     No shape has more far pairs than before. Of one shape, no vertex is moved by more than :data:`MOST_MOVED` times the
@@ -77,29 +65,31 @@ def separate(
         relax: Takes a Newton step of all vertices of some of the shapes, given those, their indices and energies beside
             the elastic one. *Shape:* ``(S, V, 3), (S,) -> (S, V, 3)``.
         search: Search for contacts between the known shapes.
-        timeline: Times, limit and modes of several shapes; None for one shape alone.
+        timeline: Of several shapes; None for one alone.
+
+    Returns:
+        The shapes, and the number of far pairs of triangles that are left in each. *Shape:* ``(T, V, 3), (T,)``.
     """
     n, device = len(start), start.device
     every, nothing = torch.arange(n, device=device), torch.zeros(n, dtype=torch.int64, device=device)
     stride = -(-n // LOOKED_AT)
     if not bool(search.count(start[stride - 1 :: stride]).any()):
-        return Separated(start, nothing, nothing)
+        return start, nothing
     active, n_before = search(start, every)
     if not len(active.shapes):
-        return Separated(start, n_before, n_before)
+        return start, n_before
     search.watch(active, AROUND)
     chosen = every if timeline is None else _chosen(timeline.t, search)
     x = start
-    if timeline is not None and timeline.model is not None:
+    if timeline is not None and timeline.in_modes is not None:
         contact = ContactEnergy(active.rows(chosen), search.areas, start)
         spline = through(timeline.t[chosen], timeline.t)
         bend = (timeline.limit.differences[:n] @ spline.double()).to(start)
-        moved = modal_displacement(timeline.model(chosen), start[chosen], contact, bend)
-        x = start + torch.tensordot(spline, moved, 1)
+        x = start + torch.tensordot(spline, timeline.in_modes(chosen, contact, bend), 1)
     x, n_crossing = _settled(start, x, relax, search, timeline, active, chosen, n_before)
     if timeline is not None and x is not start:
         x, n_crossing = _never_worse(start, x - start, search, timeline, n_before)
-    return Separated(x, n_before, n_crossing)
+    return x, n_crossing
 
 
 def _chosen(t: Tensor, search: ContactSearch) -> Tensor:
@@ -123,22 +113,7 @@ def _settled(
     chosen: Tensor,
     n_before: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """Alternate the steps of each shape with the bound on all, and use the round with the fewest far pairs.
-
-    Args:
-        start: Without contact. *Shape:* ``(T, V, 3)``.
-        x: Where the rounds begin. *Shape:* ``(T, V, 3)``.
-        relax: As for :func:`separate`.
-        search: Likewise.
-        timeline: Likewise.
-        active: Contacts of all shapes.
-        chosen: Shapes that take steps. *Shape:* ``(S,)``.
-        n_before: Far pairs of ``start``. *Shape:* ``(T,)``.
-
-    Returns:
-        The shapes, ``start`` where no round has fewer pairs, and their numbers of far pairs.
-        *Shape:* ``(T, V, 3), (T,)``.
-    """
+    """Shapes and their far pairs in the best round of steps of the chosen shapes, from ``x`` on, or at the start."""
     every, n_far, best, n_best = torch.arange(len(x), device=x.device), n_before, start, n_before
     most = MOST_MOVED * search.depth(start[0]) if timeline is None else math.inf
     # Shapes that relax on their own, what the bound took from them so far, and springs of the vertices it limits.
@@ -186,21 +161,7 @@ def _energies(active: Contacts, pull: Pull, areas: Tensor) -> Beside:
 def _never_worse(
     start: Tensor, field: Tensor, search: ContactSearch, timeline: Timeline, n_before: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Fade the displacement out around shapes in which it adds far pairs.
-
-    Where that adds some to other shapes, it is faded out around these, too, and where it does not help, twice as far:
-    at last, nothing is moved.
-
-    Args:
-        start: Without contact. *Shape:* ``(T, V, 3)``.
-        field: The displacement. *Shape:* ``(T, V, 3)``.
-        search: As for :func:`separate`.
-        timeline: Likewise.
-        n_before: Far pairs of ``start``. *Shape:* ``(T,)``.
-
-    Returns:
-        The shapes, and their numbers of far pairs. *Shape:* ``(T, V, 3), (T,)``.
-    """
+    """Shapes and their far pairs, with the displacement faded out, farther and farther, where it adds some."""
     t, found, reach, bad = timeline.t, field, FADE, torch.zeros_like(n_before, dtype=torch.bool)
     while reach <= 1:
         n_far = search.count(start + found)

@@ -1,65 +1,34 @@
-"""The base class of random transforms of shapes, with the conventions of kornia's augmentations."""
+"""The base class of random transforms of shapes, with the conventions of kornia's augmentations, and chains of them."""
 
 import math
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from torch_modal.autograd import full_precision, require_numbers
+from torch_modal.data.shape_batch import ShapeBatch, check_labels, check_shapes
 from torch_modal.data.space import ShapeSpace
+from torch_modal.geometry.vectors import vertex_normals
+
+DATA_KEYS = ("shapes", "normals", "vertex_labels", "shape_labels")
 
 Parameters = dict[str, Tensor]
 
 
-class ShapeBatch(NamedTuple):
-    """Shapes with their key-frames and labels."""
-
-    shapes: Tensor
-    """*Shape:* ``(B, V, 3)``."""
-    nearest: Tensor | None = None
-    """Index of the key-frame whose modes a shape uses; None: the nearest one. On the CPU. *Shape:* ``(B,)``."""
-    is_keyframe: Tensor | None = None
-    """True for shapes that equal that key-frame; None: none does. On the CPU. *Shape:* ``(B,)``, bool."""
-    vertex_labels: Tensor | None = None
-    """*Shape:* ``(B, V, ...)``."""
-    shape_labels: Tensor | None = None
-    """*Shape:* ``(B, ...)``."""
-
-    @classmethod
-    def of_keyframes(
-        cls,
-        space: ShapeSpace,
-        like: Tensor | None = None,
-        vertex_labels: Tensor | None = None,
-        shape_labels: Tensor | None = None,
-    ) -> "ShapeBatch":
-        """The key-frames of a space.
-
-        Args:
-            space: The space.
-            like: A tensor of the wanted dtype and device.
-            vertex_labels: *Shape:* ``(K, V, ...)``.
-            shape_labels: *Shape:* ``(K, ...)``.
-        """
-        every = torch.arange(len(space))
-        return cls(space.keyframes(like), every, every >= 0, vertex_labels, shape_labels)
-
-    def rows(self, index: Tensor) -> "ShapeBatch":
-        """Some of the shapes."""
-        return ShapeBatch._make(None if part is None else part[index.to(part.device)] for part in self)
-
-    def put(self, index: Tensor, other: "ShapeBatch") -> "ShapeBatch":
-        """A copy with some of the shapes replaced."""
-        parts = (
-            mine if mine is None or its is None else mine.index_copy(0, index.to(mine.device), its)
-            for mine, its in zip(self, other, strict=True)
-        )
-        return ShapeBatch._make(parts)
-
-
 class ShapeAugmentation(nn.Module):
-    """A random transform of shapes of one connectivity, batched, differentiable in the shapes.
+    """A random transform of shapes of one connectivity and their labels, batched, differentiable in the shapes.
+
+    A call takes one argument for each data key and returns as many, in the same order:
+
+    - ``"shapes"``: vertex positions, ``(B, V, 3)`` or ``(V, 3)``;
+    - ``"normals"``: replaced by the vertex normals of the new shapes; the argument may be None;
+    - ``"vertex_labels"``: ``(B, V, ...)``, or ``(V, ...)`` for one shape;
+    - ``"shape_labels"``: ``(B, ...)``, or of one shape without the B.
+
+    Vertices keep their order, so that labels, landmarks and correspondences stay valid. Only transforms with a second
+    shape change labels (``blend_labels``).
 
     Parameters are drawn for each sample on the device of the generator, independent of the shapes' device and dtype.
     :attr:`params` has those of the last call, ``batch_prob`` (which shapes were transformed) among them; a call with
@@ -69,12 +38,18 @@ class ShapeAugmentation(nn.Module):
         p: Probability that a shape is transformed.
         same_on_batch: Whether all shapes of a batch get the same parameters.
         keepdim: Whether one shape ``(V, 3)`` gives ``(V, 3)`` rather than a batch of one.
+        data_keys: Arguments and results of a call; ``"shapes"`` must be among them.
         generator: Source of random numbers; by default PyTorch's own generator.
         space: Default key-frames and modes of the calls.
 
     Raises:
-        ValueError: ``p`` is no probability.
+        ValueError: ``p`` is no probability, a data key is unknown or doubled, or there are no shapes.
     """
+
+    uses_keyframes = True
+    """True if the transform needs key-frames and modes."""
+    shown: tuple[str, ...] = ()
+    """Settings of a subclass that its ``repr`` shows."""
 
     def __init__(
         self,
@@ -82,23 +57,24 @@ class ShapeAugmentation(nn.Module):
         same_on_batch: bool = False,
         keepdim: bool = False,
         *,
+        data_keys: Sequence[str] = ("shapes",),
         generator: torch.Generator | None = None,
         space: ShapeSpace | None = None,
     ) -> None:
         super().__init__()
         if not 0 <= p <= 1:
             raise ValueError(f"p is a probability, from 0 to 1; got {p}")
+        self.data_keys = tuple(data_keys)
+        if "shapes" not in self.data_keys or len(set(self.data_keys)) < len(self.data_keys):
+            raise ValueError(f"data_keys name each thing once, 'shapes' among them; got {self.data_keys}")
+        if set(self.data_keys) - set(DATA_KEYS):
+            raise ValueError(f"data_keys are of {DATA_KEYS}; got {self.data_keys}")
         self.p = p
         self.same_on_batch = same_on_batch
         self.keepdim = keepdim
         self.generator = generator
         self.space = space
-        self.params: Parameters = {}
-
-    uses_keyframes = True
-    """True if the transform needs key-frames and modes."""
-    shown: tuple[str, ...] = ()
-    """Settings of a subclass that its ``repr`` shows."""
+        self.params: Any = {}
 
     def extra_repr(self) -> str:
         """Settings, as kornia shows them."""
@@ -127,27 +103,23 @@ class ShapeAugmentation(nn.Module):
 
     # -------------------------------------------------------------------------------------------------------- calls
     def forward_parameters(
-        self,
-        n: int,
-        space: ShapeSpace | None = None,
-        generator: torch.Generator | None = None,
-        same_on_batch: bool | None = None,
-    ) -> Parameters:
+        self, n: int, space: ShapeSpace | None = None, generator: torch.Generator | None = None
+    ) -> Any:
         """Draw parameters for ``n`` shapes, and which of them are transformed.
 
         Args:
             n: Number of shapes.
             space: Key-frames and modes; by default the module's.
             generator: By default the module's.
-            same_on_batch: By default the module's.
+
+        Returns:
+            A dict; of :class:`AugmentationSequential` a list with one for each transform.
 
         Raises:
             ValueError: There is no space, and the transform needs one.
         """
-        space = self._space(space)
-        generator = self.generator if generator is None else generator
-        same = self.same_on_batch if same_on_batch is None else same_on_batch
-        drawn = 1 if same and n else n
+        space, generator = self._space(space), self.generator if generator is None else generator
+        drawn = 1 if self.same_on_batch and n else n
         with torch.inference_mode(False):  # a later call, with gradients, may repeat them
             chosen = uniform(drawn, generator) < self.p
             params = {"batch_prob": chosen, **self.generate_parameters(drawn, space, generator)}
@@ -155,11 +127,7 @@ class ShapeAugmentation(nn.Module):
 
     @full_precision
     def transform(
-        self,
-        batch: ShapeBatch,
-        params: Parameters,
-        space: ShapeSpace | None = None,
-        pool: ShapeBatch | None = None,
+        self, batch: ShapeBatch, params: Any, space: ShapeSpace | None = None, pool: ShapeBatch | None = None
     ) -> ShapeBatch:
         """Transform the shapes that the parameters select, and their labels.
 
@@ -184,10 +152,10 @@ class ShapeAugmentation(nn.Module):
         if not len(chosen):
             return batch
         if self.uses_keyframes:
-            batch = _located(batch, space, torch.promote_types(dtype, space.least_dtype))
+            batch = batch.located(space, torch.promote_types(dtype, space.least_dtype))
         mine, partners = batch.rows(chosen), None
         if "partner" in params:
-            partners = _partners(params["partner"].cpu()[chosen], batch, chosen, space, pool)
+            partners = batch.partners(chosen, params["partner"].cpu()[chosen], space, pool)
             if partners is None:
                 return batch._replace(shapes=batch.shapes.to(dtype))
         own = {}
@@ -197,38 +165,56 @@ class ShapeAugmentation(nn.Module):
         found = self.apply_transform(mine, own, space, partners)
         if batch.is_keyframe is not None:
             found = found._replace(is_keyframe=torch.zeros(len(chosen), dtype=torch.bool))
-        batch = batch.put(chosen, found)
+        parts = (
+            before if before is None or after is None else before.index_copy(0, chosen.to(before.device), after)
+            for before, after in zip(batch, found, strict=True)
+        )
+        batch = ShapeBatch._make(parts)
         return batch._replace(shapes=batch.shapes.to(dtype))
 
     def forward(
         self,
-        shapes: Tensor,
-        params: Parameters | None = None,
-        *,
+        *inputs: Tensor | None,
+        params: Any = None,
         space: ShapeSpace | None = None,
         pool: ShapeBatch | None = None,
-    ) -> Tensor:
-        """Transform shapes.
+    ) -> Any:
+        """Transform shapes, their normals and labels.
 
         Args:
-            shapes: Vertex positions. *Shape:* ``(B, V, 3)`` or ``(V, 3)``.
+            inputs: One for each data key.
             params: Parameters of an earlier call, to repeat it.
             space: Key-frames and modes; by default the module's.
-            pool: As for :meth:`transform`.
+            pool: As for :meth:`transform`, with labels if ``inputs`` have any.
 
         Returns:
-            *Shape:* ``(B, V, 3)``; ``(V, 3)`` for one shape if ``keepdim`` is set.
+            A tensor, or a tuple of one for each data key. One shape gives a batch of one, unless ``keepdim`` is set.
 
         Raises:
-            ValueError: The shapes do not fit; or as for :meth:`transform`.
+            ValueError: The inputs do not fit the data keys, each other or the space; or as for :meth:`transform`.
         """
         space = self._space(space)
-        check_shapes(shapes, space)
-        single = shapes.dim() == 2
-        batch = ShapeBatch(shapes[None] if single else shapes)
+        if len(inputs) != len(self.data_keys):
+            raise ValueError(f"the data keys are {self.data_keys}; got {len(inputs)} arguments")
+        named: dict[str, Any] = dict(zip(self.data_keys, inputs, strict=True))
+        check_shapes(named["shapes"], space)
+        single = named["shapes"].dim() == 2
+        if single:
+            named = {name: None if value is None else value[None] for name, value in named.items()}
+        check_labels(named["shapes"].shape[:2], named)
+        batch = ShapeBatch(**{name: value for name, value in named.items() if name != "normals"})
         self.params = self.forward_parameters(len(batch.shapes), space) if params is None else params
-        out = self.transform(batch, self.params, space, pool).shapes
-        return out[0] if single and self.keepdim else out
+        out = self.transform(batch, self.params, space, pool)
+        if "normals" in named:
+            own = (each.space for each in self.modules() if isinstance(each, ShapeAugmentation))
+            known = [each for each in (space, *own) if each is not None]
+            if not known:
+                raise ValueError("normals need faces: pass space=ShapeSpace(bases, faces) when it is made or called")
+            normals = vertex_normals(out.shapes, known[0].faces)
+        found = [normals if name == "normals" else getattr(out, name) for name in named]
+        if single and self.keepdim:
+            found = [None if value is None else value[0] for value in found]
+        return found[0] if len(found) == 1 else tuple(found)
 
     def _space(self, space: ShapeSpace | None) -> Any:
         space = self.space if space is None else space
@@ -240,65 +226,57 @@ class ShapeAugmentation(nn.Module):
         return space
 
 
-def _located(batch: ShapeBatch, space: ShapeSpace, dtype: torch.dtype) -> ShapeBatch:
-    """A batch in a dtype, with the nearest key-frame of each shape."""
-    shapes = batch.shapes.to(dtype)
-    nearest = space.nearest(shapes) if batch.nearest is None else batch.nearest
-    none = torch.zeros(len(shapes), dtype=torch.bool)
-    return batch._replace(
-        shapes=shapes, nearest=nearest, is_keyframe=none if batch.is_keyframe is None else batch.is_keyframe
-    )
-
-
-def _partners(
-    draw: Tensor, batch: ShapeBatch, chosen: Tensor, space: ShapeSpace, pool: ShapeBatch | None
-) -> ShapeBatch | None:
-    """A second shape for each of the chosen ones; None if there is no other.
+class AugmentationSequential(ShapeAugmentation):
+    """Random transforms in sequence; named after kornia's.
 
     Args:
-        draw: Its place among the other shapes, in [0, 1); of key-frames in a motion, that before (below 0.5) or after.
-            *Shape:* ``(n,)``.
-        batch: All shapes.
-        chosen: *Shape:* ``(n,)``.
-        space: The space.
-        pool: Its key-frames, if partners are drawn from these.
-    """
-    size = len(batch.shapes) if pool is None else len(pool.shapes)
-    if pool is not None and size != len(space):
-        raise ValueError(f"a pool holds the {len(space)} key-frames of the space; got {size} shapes")
-    if size < 2:
-        return None
-    if pool is not None:
-        assert batch.nearest is not None
-        pool, own = _located(pool, space, batch.shapes.dtype), batch.nearest[chosen]
-        if space.motion is not None:
-            return pool.rows(space.motion.neighbours[own, (draw >= 0.5).long()])
-    else:
-        pool, own = batch, chosen
-    return pool.rows((own + (draw * (size - 1)).long().clamp(0, size - 2) + 1) % size)
-
-
-def check_shapes(shapes: Tensor, space: ShapeSpace | None) -> None:
-    """Raise unless a tensor is a batch of shapes of a space.
+        transforms: The transforms, in order.
+        data_keys: As for :class:`ShapeAugmentation`; only those of the sequence count.
+        keepdim: Likewise.
+        generator: Source of random numbers of all transforms; by default each has its own.
+        space: Key-frames and modes, for all transforms; by default each has its own.
 
     Raises:
-        ValueError: The message names shape and dtype.
+        ValueError: An unknown or doubled data key, or no shapes.
     """
-    v: Any = "V" if space is None else space.n_vertices
-    fits = shapes.dim() in (2, 3) and shapes.shape[-1] == 3 and (space is None or shapes.shape[-2] == v)
-    if not fits or shapes.dtype not in (torch.float32, torch.float64):
-        raise ValueError(
-            f"shapes must be float32 or float64 of the shape (B, {v}, 3) or ({v}, 3); got {tuple(shapes.shape)} of "
-            f"{shapes.dtype}"
-        )
+
+    uses_keyframes = False
+
+    def __init__(
+        self,
+        *transforms: ShapeAugmentation,
+        data_keys: Sequence[str] = ("shapes",),
+        keepdim: bool = False,
+        generator: torch.Generator | None = None,
+        space: ShapeSpace | None = None,
+    ) -> None:
+        super().__init__(1.0, keepdim=keepdim, data_keys=data_keys, generator=generator, space=space)
+        self.transforms: Any = nn.ModuleList(transforms)
+
+    def forward_parameters(
+        self, n: int, space: ShapeSpace | None = None, generator: torch.Generator | None = None
+    ) -> list[Parameters]:
+        """Draw parameters for ``n`` shapes, of each transform."""
+        space, generator = self._space(space), self.generator if generator is None else generator
+        return [one.forward_parameters(n, space, generator) for one in self.transforms]
+
+    def transform(
+        self, batch: ShapeBatch, params: Any, space: ShapeSpace | None = None, pool: ShapeBatch | None = None
+    ) -> ShapeBatch:
+        """Transform a batch with given parameters; arguments as for :meth:`ShapeAugmentation.transform`.
+
+        Raises:
+            ValueError: As there, or as many sets of parameters as transforms are not given.
+        """
+        if len(params) != len(self.transforms):
+            raise ValueError(f"{len(self.transforms)} transforms need as many sets of parameters; got {len(params)}")
+        for one, own in zip(self.transforms, params, strict=True):
+            batch = one.transform(batch, own, self._space(space), pool)
+        return batch
 
 
 def check_range(name: str, given: tuple[float, float], lowest: float, highest: float) -> tuple[float, float]:
-    """Check a range of numbers.
-
-    Raises:
-        ValueError: It is no range within the bounds.
-    """
+    """A range of numbers; raises a ValueError unless it is one within the bounds."""
     try:
         low, high = map(float, given)
     except (TypeError, ValueError):
@@ -308,10 +286,11 @@ def check_range(name: str, given: tuple[float, float], lowest: float, highest: f
     return low, high
 
 
-def uniform(n: int, generator: torch.Generator | None, *size: int) -> Tensor:
-    """Uniform numbers in [0, 1), float64. *Shape:* ``(n, ...)``."""
+def uniform(n: int, generator: torch.Generator | None, span: tuple[float, float] = (0.0, 1.0), *size: int) -> Tensor:
+    """Uniform numbers in a range, float64. *Shape:* ``(n, ...)``."""
     device = "cpu" if generator is None else generator.device
-    return torch.rand(n, *size, dtype=torch.float64, generator=generator, device=device)
+    drawn = torch.rand(n, *size, dtype=torch.float64, generator=generator, device=device)
+    return span[0] + (span[1] - span[0]) * drawn
 
 
 def normal(n: int, generator: torch.Generator | None, *size: int) -> Tensor:

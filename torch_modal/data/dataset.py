@@ -8,24 +8,21 @@ import numpy as np
 import torch
 from safetensors.torch import load_file
 from torch import Tensor
-from torch.utils.data import Dataset, Sampler
+from torch.utils.data import BatchSampler, Dataset, Sampler
 
 from torch_modal.autograd import Recent, one_thread
-from torch_modal.data.augmentation import ShapeAugmentation, ShapeBatch
-from torch_modal.data.random_in_between import RandomInBetween
-from torch_modal.data.sequential import AugmentationSequential, check_labels
+from torch_modal.data.augmentation import AugmentationSequential, ShapeAugmentation
+from torch_modal.data.random_transforms import RandomInBetween
+from torch_modal.data.shape_batch import ShapeBatch, check_labels
 from torch_modal.data.space import ShapeSpace
-from torch_modal.data.stored import LABELS_FILE, StoredSet, find_sets, open_set
+from torch_modal.data.stored import LABELS_FILE, StoredSet, find_sets
 from torch_modal.geometry.vectors import vertex_normals
 
 Labels = Mapping[str, Tensor]
 Sample = dict[str, Any]
 
-
-def stored_labels(stored: StoredSet) -> Labels:
-    """The contents of ``labels.safetensors`` in a set's folder, if there is one."""
-    path = stored.folder / LABELS_FILE
-    return load_file(path) if path.is_file() else {}
+OPEN_SETS = 8
+"""How many sets each process keeps open."""
 
 
 class ShapeDataset(Dataset[Sample]):
@@ -44,43 +41,41 @@ class ShapeDataset(Dataset[Sample]):
         transform: Transforms the key-frames; in-betweens by default. Its ``same_on_batch`` has no effect here.
         samples_per_set: Samples of each set in an epoch.
         labels: Returns the labels of a set: ``vertex_labels`` (V, ...) or (K, V, ...), and ``shape_labels`` (K, ...),
-            each if there are any. A function of a module, if workers are spawned. By default those in the file
+            each if there are any. A function of a module, if workers are spawned. By default the tensors in the file
             ``labels.safetensors`` of the set's folder.
         seed: Of all random numbers.
         dtype: Of the vertices.
-        faces: Whether samples have their faces. A loader stacks them with the rest; :meth:`faces` gives them once.
+        faces: Whether samples have their faces. A loader stacks them with the rest; those of a :meth:`space` are there
+            once.
         normals: Whether samples have normals.
-        open_sets: How many sets are kept open, in each process.
         options: Of the spaces (:class:`ShapeSpace`), such as ``preset`` or ``times``.
 
     Raises:
         FileNotFoundError: There is no such folder, or no set in it.
-        ValueError: ``samples_per_set`` or ``open_sets`` is below 1.
+        ValueError: ``samples_per_set`` is below 1.
     """
 
     def __init__(
         self,
         root: str | os.PathLike[str],
-        transform: AugmentationSequential | ShapeAugmentation | None = None,
+        transform: ShapeAugmentation | None = None,
         *,
         samples_per_set: int = 16,
-        labels: Callable[[StoredSet], Labels] = stored_labels,
+        labels: Callable[[StoredSet], Labels] | None = None,
         seed: int = 0,
         dtype: torch.dtype = torch.float32,
         faces: bool = False,
         normals: bool = False,
-        open_sets: int = 8,
         **options: Any,
     ) -> None:
-        if samples_per_set < 1 or open_sets < 1:
-            raise ValueError(f"samples_per_set and open_sets are 1 or more, got {samples_per_set} and {open_sets}")
+        if samples_per_set < 1:
+            raise ValueError(f"samples_per_set is 1 or more, got {samples_per_set}")
         self.sets = [str(path) for path in find_sets(root)]
         if not self.sets:
             raise FileNotFoundError(f"no stored key-frame set in {root}; torch-modal precompute makes them")
         transform = RandomInBetween(p=1.0) if transform is None else transform
-        if not isinstance(transform, AugmentationSequential):
-            transform = AugmentationSequential(transform)
-        self.transform = transform
+        chained = isinstance(transform, AugmentationSequential)
+        self.transform = transform if chained else AugmentationSequential(transform)
         self.samples_per_set = samples_per_set
         self.labels = labels
         self.seed = seed
@@ -90,7 +85,7 @@ class ShapeDataset(Dataset[Sample]):
         self.options = options
         # In shared memory: workers that outlive an epoch see the next one.
         self._epoch = torch.zeros(1, dtype=torch.int64).share_memory_()
-        self._opened = Recent(open_sets)
+        self._opened = Recent(OPEN_SETS)
 
     def __len__(self) -> int:
         """Samples in an epoch."""
@@ -108,10 +103,6 @@ class ShapeDataset(Dataset[Sample]):
     def space(self, number: int) -> ShapeSpace:
         """Key-frames and modes of a set."""
         return self._open(number)[0]
-
-    def faces(self, number: int) -> Tensor:
-        """Faces of a set. *Shape:* ``(F, 3)``."""
-        return self.space(number).faces
 
     def __getitem__(self, index: int) -> Sample:
         """One sample."""
@@ -135,7 +126,11 @@ class ShapeDataset(Dataset[Sample]):
         space, pool = self._open(number)
         turn = self.epoch * self.samples_per_set
         start = torch.tensor([(index % self.samples_per_set + turn) % len(space) for index in indices])
-        drawn = [self.transform.forward_parameters(1, space, self._generator(index)) for index in indices]
+        drawn = []
+        for index in indices:
+            state = np.random.SeedSequence([self.seed, self.epoch, index]).generate_state(1, np.uint64)
+            generator = torch.Generator().manual_seed(int(state[0] >> np.uint64(1)))
+            drawn.append(self.transform.forward_parameters(1, space, generator))
         params = [
             {name: torch.cat([row[name] for row in rows]) for name in rows[0]} for rows in zip(*drawn, strict=True)
         ]
@@ -143,19 +138,14 @@ class ShapeDataset(Dataset[Sample]):
         parts = {"vertices": batch.shapes, "vertex_labels": batch.vertex_labels, "shape_labels": batch.shape_labels}
         if self.with_normals:
             parts["normals"] = vertex_normals(batch.shapes, space.faces)
-        samples: list[Sample] = []
-        for row in range(len(indices)):
-            # Copies: a view would carry the whole batch to another process.
-            sample: Sample = {name: part[row].clone() for name, part in parts.items() if part is not None}
-            sample |= {"set": number, "keyframe": int(start[row])}
-            if self.with_faces:
-                sample["faces"] = space.faces
-            samples.append(sample)
+        # Copies: a view would carry the whole batch to another process.
+        samples: list[Sample] = [
+            {name: part[row].clone() for name, part in parts.items() if part is not None}
+            | {"set": number, "keyframe": int(start[row])}
+            | ({"faces": space.faces} if self.with_faces else {})
+            for row in range(len(indices))
+        ]
         return samples
-
-    def _generator(self, index: int) -> torch.Generator:
-        state = np.random.SeedSequence([self.seed, self.epoch, index]).generate_state(1, np.uint64)
-        return torch.Generator().manual_seed(int(state[0] >> np.uint64(1)))
 
     def _open(self, number: int) -> tuple[ShapeSpace, ShapeBatch]:
         """The space of a set, and its key-frames with their labels."""
@@ -163,9 +153,13 @@ class ShapeDataset(Dataset[Sample]):
         return found
 
     def _read(self, number: int) -> tuple[ShapeSpace, ShapeBatch]:
-        stored = open_set(self.sets[number])
+        stored = StoredSet(self.sets[number])
         space = ShapeSpace.open(stored, dtype=self.dtype, **self.options)
-        labels = dict(self.labels(stored))
+        path = stored.folder / LABELS_FILE
+        if self.labels is not None:
+            labels = dict(self.labels(stored))
+        else:
+            labels = load_file(path) if path.is_file() else {}
         k, v = len(space), space.n_vertices
         of_vertices = labels.get("vertex_labels")
         if of_vertices is not None and of_vertices.shape[:2] != (k, v) and of_vertices.shape[:1] == (v,):
@@ -206,11 +200,10 @@ class SetBatchSampler(Sampler[list[int]]):
     def __iter__(self) -> Iterator[list[int]]:
         size = self.dataset.samples_per_set
         random = np.random.default_rng([self.dataset.seed, self.dataset.epoch])
-        batches = []
+        batches: list[list[int]] = []
         for number in range(len(self.dataset.sets)):
             own = number * size + (random.permutation(size) if self.shuffle else np.arange(size))
-            parts = [own[start : start + self.batch_size].tolist() for start in range(0, size, self.batch_size)]
-            batches += [part for part in parts if len(part) == self.batch_size or not self.drop_last]
+            batches += BatchSampler(own.tolist(), self.batch_size, self.drop_last)
         order = random.permutation(len(batches)) if self.shuffle else np.arange(len(batches))
         for place in order:
             yield batches[place]

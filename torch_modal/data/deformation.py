@@ -6,13 +6,14 @@ import torch
 from torch import Tensor
 
 from torch_modal.autograd import transformed
-from torch_modal.data.augmentation import Parameters, ShapeAugmentation, ShapeBatch, check_range, normal, uniform
+from torch_modal.data.augmentation import Parameters, ShapeAugmentation, check_range, normal, uniform
 from torch_modal.data.in_betweens import by_kind
+from torch_modal.data.shape_batch import ShapeBatch
 from torch_modal.data.space import ShapeSpace
+from torch_modal.data.strain import edge_strains
 from torch_modal.geometry.poisson import Reconstruction
 from torch_modal.geometry.rigid import best_fit
-from torch_modal.geometry.triangle_frames import BentTriangles, bend, bent_sides, frames, sides
-from torch_modal.geometry.vectors import pick
+from torch_modal.geometry.triangle_frames import bend, bent_sides, frames, sides
 
 # A draw beyond the bound is scaled to this part of it; its largest strain is nearly linear in the scale.
 _INSIDE = 0.98
@@ -65,8 +66,7 @@ class RandomModalDeformation(ShapeAugmentation):
 
     def generate_parameters(self, n: int, space: Any, generator: torch.Generator | None) -> Parameters:
         """``noise``, a standard normal number for each mode, and the ``strain``."""
-        strain = self.strain[0] + (self.strain[1] - self.strain[0]) * uniform(n, generator)
-        return {"strain": strain, "noise": normal(n, generator, space.n_modes)}
+        return {"strain": uniform(n, generator, self.strain), "noise": normal(n, generator, space.n_modes)}
 
     def apply_transform(
         self, batch: ShapeBatch, params: Parameters, space: Any, partners: ShapeBatch | None
@@ -103,7 +103,7 @@ class RandomModalDeformation(ShapeAugmentation):
         """The scale of each draw within the bound, ``(B,)``, and the shapes; unchanged shapes if none is found."""
         reconstruction = space.reconstruction(x.device)
         bound = (1 - _ROUNDING) * self.max_strain
-        expected = linear_strain(displacement, keyframe, reconstruction.edges)
+        expected = edge_strains(displacement, keyframe, reconstruction.edges).abs().amax(1)
         scale = (_INSIDE * bound / expected.clamp_min(torch.finfo(x.dtype).tiny)).clamp_max(1)
         shapes = x.clone()
         rows = torch.arange(len(x), device=x.device)
@@ -123,16 +123,9 @@ class RandomModalDeformation(ShapeAugmentation):
 def deform(x: Tensor, displacement: Tensor, keyframe: Tensor, reconstruction: Reconstruction) -> Tensor:
     """Shapes bent as a linear displacement of a key-frame turns and strains its triangles.
 
-    A shape of another pose gets the same rotations, and strains along its own triangles.
+    A shape of another pose gets the same rotations, and strains along its own triangles; results are aligned with them.
 
-    Args:
-        x: Shapes near the key-frame. *Shape:* ``(B, V, 3)``.
-        displacement: Of the key-frame, components first. *Shape:* ``(3, B, V)``.
-        keyframe: *Shape:* ``(V, 3)``.
-        reconstruction: Of its connectivity.
-
-    Returns:
-        Aligned with ``x``. *Shape:* ``(B, V, 3)``.
+    *Shape:* ``(B, V, 3), (3, B, V), (V, 3) -> (B, V, 3)``.
     """
     faces, weights = reconstruction.faces, reconstruction.areas.to(x)
     own = frames(sides(keyframe.mT[:, None].contiguous(), faces))
@@ -140,14 +133,6 @@ def deform(x: Tensor, displacement: Tensor, keyframe: Tensor, reconstruction: Re
     pose = best_fit(keyframe.expand_as(x), x, weights).rotation
     turn = (pose @ turn.movedim(0, 1)).movedim(0, 1)
     rest = x.movedim(-1, 0).contiguous()
-    wanted = bent_sides(BentTriangles(turn, strain), frames(sides(rest, faces)))
+    wanted = bent_sides(turn, strain, frames(sides(rest, faces)))
     bent = reconstruction(wanted, rest).movedim(0, -1)
     return best_fit(bent, x, weights).apply(bent)
-
-
-def linear_strain(displacement: Tensor, keyframe: Tensor, edges: Tensor) -> Tensor:
-    """Largest edge strain of a linear displacement, that of the bent shape to first order. *Shape:* ``(B,)``."""
-    i, j = edges.unbind(1)
-    side = (keyframe[j] - keyframe[i]).mT[:, None]
-    along = ((pick(displacement, j) - pick(displacement, i)) * side).sum(0)
-    return (along / side.square().sum(0).clamp_min(torch.finfo(side.dtype).tiny)).abs().amax(1)

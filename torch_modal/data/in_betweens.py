@@ -3,23 +3,21 @@
 import contextlib
 import os
 import warnings
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from torch_modal.autograd import Recent
-from torch_modal.data.motion import Motion
+from torch_modal.data.stored import Motion
 from torch_modal.inbetween.results import InBetweenResult
-from torch_modal.inbetween.settings import Objective, Solver
+from torch_modal.inbetween.settings import Settings
 from torch_modal.io.cache import CacheWarning, ContentError, code_digest, content_digest
 from torch_modal.io.tensors import TensorFile, write_tensors
 from torch_modal.layers.in_between import InBetween
+from torch_modal.modes.basis import ModalBasis
 from torch_modal.motion.path import Path as MotionPath
-from torch_modal.precompute.basis import ModalBasis
 from torch_modal.solve.implicit import ConvergenceWarning
 from torch_modal.solve.minimise import Status
 from torch_modal.version import __version__
@@ -39,8 +37,7 @@ class InBetweens:
     Args:
         bases: The basis of each key-frame.
         faces: Vertex indices. *Shape:* ``(F, 3)``.
-        objective: What the in-betweens minimise.
-        solver: How they are solved.
+        settings: What the in-betweens minimise, and how they are solved.
         motion: The order of the key-frames in time, if they are a motion.
         times: Number of even times in a table, at least 4; None: there are no tables, and each in-between is solved.
         dtype: Of the tables.
@@ -52,10 +49,9 @@ class InBetweens:
 
     def __init__(
         self,
-        bases: Sequence[ModalBasis],
+        bases: list[ModalBasis],
         faces: Tensor,
-        objective: Objective,
-        solver: Solver,
+        settings: Settings,
         motion: Motion | None,
         times: int | None,
         dtype: torch.dtype,
@@ -63,47 +59,21 @@ class InBetweens:
     ) -> None:
         if times is not None and times < 4:
             raise ValueError(f"times is {times}; cubics need 4 or more, and None solves each in-between")
-        self.bases, self.faces, self.objective, self.solver = bases, faces, objective, solver
-        self.motion = motion
+        self.bases, self.faces, self.settings, self.motion = bases, faces, settings, motion
         self.times, self.dtype = times, dtype
         self.folder = None if folder is None else Path(folder)
-        self._layers, self._paths, self._tables = Recent(32), Recent(32), Recent(64)
+        self._solvers, self._tables = Recent(32), Recent(64)
 
     def __call__(self, x_a: Tensor, x_b: Tensor, t: Tensor, i: Tensor, j: Tensor, keyframes: Tensor) -> Tensor:
-        """In-betweens of a batch.
+        """In-betweens of a batch of shapes ``x_a`` at 0 and ``x_b`` at 1, at the times ``t``. *Shape:* ``(B, V, 3)``.
 
         Args:
-            x_a: Shapes at 0. *Shape:* ``(B, V, 3)``.
-            x_b: Shapes at 1. *Shape:* ``(B, V, 3)``.
-            t: Times. *Shape:* ``(B,)``.
+            x_a: *Shape:* ``(B, V, 3)``.
+            x_b: Likewise.
+            t: *Shape:* ``(B,)``.
             i: The key-frame whose modes serve at 0, on the CPU. *Shape:* ``(B,)``.
-            j: Likewise at 1. *Shape:* ``(B,)``.
+            j: Likewise at 1, perhaps the same.
             keyframes: Whether both shapes are these key-frames, on the CPU. *Shape:* ``(B,)``, bool.
-
-        Returns:
-            *Shape:* ``(B, V, 3)``.
-
-        Raises:
-            ValueError: As for :meth:`of_shapes`.
-        """
-        # The same two key-frames in either order are solved together.
-        swap = (i > j).to(t.device)
-        t = torch.where(swap, 1 - t, t)
-        starts, ends = (torch.where(swap[:, None, None], *pair) for pair in ((x_b, x_a), (x_a, x_b)))
-        kinds = torch.stack([torch.minimum(i, j), torch.maximum(i, j), keyframes.long()], 1)
-
-        def solve(kind: Sequence[int], rows: Tensor) -> Tensor:
-            rows = rows.to(t.device)
-            if kind[2]:
-                return self.of_keyframes(kind[0], kind[1], t[rows])
-            return self.of_shapes(starts[rows], ends[rows], t[rows], kind[0], kind[1])
-
-        return by_kind(kinds, solve)
-
-    def of_shapes(self, x_a: Tensor, x_b: Tensor, t: Tensor, i: int, j: int) -> Tensor:
-        """Shapes between any two, with the modes of two key-frames, which may be the same.
-
-        *Shape:* ``(B, V, 3), (B, V, 3), (B,) -> (B, V, 3)``.
 
         Raises:
             ValueError: A shape is not finite, has no size, or is the mirror image of the other.
@@ -111,27 +81,30 @@ class InBetweens:
         Warns:
             ConvergenceWarning: Some did not converge.
         """
-        if i > j:
-            return self.of_shapes(x_b, x_a, 1 - t, j, i)
-        key = i, j, x_a.dtype, x_a.device
-        return _checked(self._layers.get(key, lambda: self._layer(i, j, x_a)).solve(x_a, x_b, t), i, j)
+        # The same two key-frames in either order are solved together.
+        swap = (i > j).to(t.device)
+        t = torch.where(swap, 1 - t, t)
+        starts, ends = (torch.where(swap[:, None, None], *pair) for pair in ((x_b, x_a), (x_a, x_b)))
+
+        def solve(kind: list[int], rows: Tensor) -> Tensor:
+            first, second, of_keyframes = kind
+            rows = rows.to(t.device)
+            if of_keyframes:
+                return self.of_keyframes(first, second, t[rows])
+            layer = self._layer(first, second, x_a)
+            return _checked(layer.solve(starts[rows], ends[rows], t[rows]), first, second)
+
+        return by_kind(torch.stack([torch.minimum(i, j), torch.maximum(i, j), keyframes.long()], 1), solve)
 
     def of_keyframes(self, i: int, j: int, t: Tensor) -> Tensor:
         """Shapes between two key-frames, from their table if there are tables.
 
-        *Shape:* ``(B,) -> (B, V, 3)``, in the dtype and on the device of ``t``.
-
-        Raises:
-            ValueError: There are no in-betweens of the two.
-
-        Warns:
-            ConvergenceWarning: Some did not converge.
+        *Shape:* ``(B,) -> (B, V, 3)``, in the dtype and on the device of ``t``. Raises and warns as a call.
         """
         if i > j:
             return self.of_keyframes(j, i, 1 - t)  # one table serves both ways
         if self.times is None:
-            key = i, j, t.dtype, t.device
-            return _checked(self._paths.get(key, lambda: self._path(i, j, t))(t), i, j)
+            return _checked(self._solved(i, j, t), i, j)
         return interpolate(self.table(i, j), t.to("cpu", self.dtype)).to(t)
 
     def table(self, i: int, j: int) -> Tensor:
@@ -144,57 +117,63 @@ class InBetweens:
             CacheWarning: The objective has a term of the user's own, so that each process computes its tables again.
             ConvergenceWarning: Some did not converge; the table is not stored, so that each run warns.
         """
-        if self.times is None:
+        times = self.times
+        if times is None:
             raise ValueError("a space of times=None solves each in-between: it has no tables")
-        found: Tensor = self._tables.get((i, j), lambda: self._stored_or_solved(i, j))
+        found: Tensor = self._tables.get((i, j), lambda: self._stored_or_solved(i, j, times))
         return found
 
-    def _stored_or_solved(self, i: int, j: int) -> Tensor:
-        assert self.times is not None
+    def _stored_or_solved(self, i: int, j: int, times: int) -> Tensor:
         key = None if self.folder is None else self._key(i, j)
         path = (self.folder or Path()) / f"between-{i}-{j}.safetensors"
         if key is not None and (stored := read_table(path, key)) is not None:
             return stored
-        t = torch.linspace(0, 1, self.times, dtype=torch.float64)
         with torch.no_grad():
-            result = self._path(i, j, t)(t)
+            result = self._solved(i, j, torch.linspace(0, 1, times, dtype=torch.float64))
         table = _checked(result, i, j).to(self.dtype)
         if key is not None and bool(result.solution.usable.all()):
-            write_table(path, table, key)
+            with contextlib.suppress(OSError):  # the folder may not be writable
+                write_tensors(path, FORMAT, VERSION, {"shapes": table}, key)
         return table
 
     def _layer(self, i: int, j: int, like: Tensor) -> InBetween:
-        ends = [self.bases[i], self.bases[j]]
-        return InBetween(ends, self.faces, objective=self.objective, solver=self.solver).to(like)
+        def made() -> InBetween:
+            ends = [self.bases[i], self.bases[j]]
+            return InBetween(ends, self.faces, **self.settings._asdict()).to(like)
 
-    def _path(self, i: int, j: int, like: Tensor) -> Callable[[Tensor], InBetweenResult]:
-        """Shapes between two key-frames: along the motion if they follow each other in it, else of the pair."""
+        found: InBetween = self._solvers.get((i, j, like.dtype, like.device), made)
+        return found
+
+    def _solved(self, i: int, j: int, t: Tensor) -> InBetweenResult:
+        """Solve between two key-frames: along the motion if they follow each other in it, else of the pair."""
         motion, span = self.motion, None if self.motion is None else self.motion.span(i, j)
-        bases = [self.bases[i], self.bases[j]] if span is None else list(self.bases)
-        shapes = torch.stack([basis.reference for basis in bases]).to(like)
-        if span is None and not self.objective.contact:
-            return partial(self._layer(i, j, like).solve, *shapes)
-        # A path separates contacts the same way at all times, so that tables are smooth.
-        given: dict[str, Any] = {"objective": self.objective, "solver": self.solver}
-        if span is None or motion is None:
-            return partial(MotionPath(bases, self.faces, **given).to(like).solve, shapes)
+        bases = [self.bases[i], self.bases[j]] if span is None else self.bases
+        if span is None and not self.settings.objective.contact:
+            first, last = (basis.reference.to(t.device, t.dtype) for basis in bases)
+            return self._layer(i, j, t).solve(first, last, t)
 
-        def made() -> MotionPath:
-            return MotionPath(bases, self.faces, motion.times, motion.cyclic, **given).to(like)
+        def made() -> tuple[MotionPath, Tensor]:
+            # A path separates contacts the same way at all times, so that tables are smooth.
+            when = (motion.times, motion.cyclic) if motion is not None and span is not None else (None, False)
+            path = MotionPath(bases, self.faces, *when, **self.settings._asdict())
+            return path.to(t), torch.stack([basis.reference for basis in bases]).to(t)
 
-        path = self._paths.get((like.dtype, like.device), made)
-        start, end = torch.tensor(span, dtype=torch.float64, device=like.device)
-        return lambda t: path.solve(shapes, torch.lerp(start, end, t.double()))  # exact at both ends
+        path, shapes = self._solvers.get((span is None and (i, j), t.dtype, t.device), made)
+        if span is not None:
+            start, end = torch.tensor(span, dtype=torch.float64, device=t.device)
+            t = torch.lerp(start, end, t.double())  # exact at both ends
+        found: InBetweenResult = path.solve(shapes, t)
+        return found
 
     def _key(self, i: int, j: int) -> dict[str, str] | None:
-        """Digest of all inputs of a table: bases, times, faces, settings and code; None, with a warning, if unknown."""
+        """Digest of all inputs of a table; None, with a warning, if the objective has terms of the user's own."""
         span = None if self.motion is None else self.motion.span(i, j)
         bases = self.bases if span else [self.bases[place] for place in (i, j)]
         tensors = [(basis.reference, basis.eigenvalues, basis.modes) for basis in bases]
         code = __version__, str(torch.__version__), code_digest()
         when = self.motion and span and (span, self.motion.times)
         try:
-            content = content_digest([*code, tensors, self.faces, when, self.objective, self.solver])
+            content = content_digest([*code, tensors, self.faces, when, *self.settings])
         except ContentError as error:
             warnings.warn(
                 f"tables of in-betweens are not stored in {self.folder}, as their key cannot hold the objective's own "
@@ -207,14 +186,9 @@ class InBetweens:
 
 
 def by_kind(kinds: Tensor, compute: Callable[[list[int], Tensor], Tensor]) -> Tensor:
-    """Results of a batch whose rows of one kind are computed together.
+    """Results of a batch in its order, whose rows of one kind are computed together, from the kind and their indices.
 
-    Args:
-        kinds: On the CPU. *Shape:* ``(B, n)``.
-        compute: Returns the results of the rows of a kind, from the kind and the indices of its rows.
-
-    Returns:
-        In the order of the batch. *Shape:* ``(B, ...)``.
+    Kinds are on the CPU. *Shape:* ``(B, n) -> (B, ...)``.
     """
     each, kind = kinds.unique(dim=0, return_inverse=True)
     rows = [torch.nonzero(kind == number).flatten() for number in range(len(each))]
@@ -227,12 +201,7 @@ def interpolate(table: Tensor, t: Tensor) -> Tensor:
 
     Reads these four only, so that a memory-mapped table is not loaded whole. Exact at the times of the table.
 
-    Args:
-        table: Four shapes or more. *Shape:* ``(T, V, 3)``.
-        t: Times in [0, 1]. *Shape:* ``(B,)``.
-
-    Returns:
-        *Shape:* ``(B, V, 3)``.
+    *Shape:* ``(T, V, 3), (B,) -> (B, V, 3)``, with T of 4 or more.
     """
     n = len(table)
     place = t * (n - 1)
@@ -255,12 +224,6 @@ def read_table(path: Path, key: dict[str, str]) -> Tensor | None:
         if file.metadata == {"format": FORMAT, "version": VERSION, **key}:
             return file.tensor("shapes")
     return None
-
-
-def write_table(path: Path, table: Tensor, key: dict[str, str]) -> None:
-    """Store a table, if its folder is writable."""
-    with contextlib.suppress(OSError):
-        write_tensors(path, FORMAT, VERSION, {"shapes": table}, key)
 
 
 def _checked(result: InBetweenResult, i: int, j: int) -> Tensor:

@@ -28,12 +28,12 @@ from pathlib import Path
 from torch_modal.data.stored import SET_FILE, read_note, write_set
 from torch_modal.data.tree import mesh_files
 from torch_modal.errors import MeshError
-from torch_modal.io.cache import CACHE_VERSION
+from torch_modal.io.cache import CACHE_VERSION, content_digest
 from torch_modal.io.files import write_file
 from torch_modal.keyframes.arrays import checked_times
-from torch_modal.precompute.extract import Method, extract_bases
-from torch_modal.precompute.processes import describe_exit, end_process, last_line
-from torch_modal.precompute.tetwild import TetWild
+from torch_modal.modes.extract import Method, extract_bases
+from torch_modal.modes.processes import describe_exit, end_process, last_line
+from torch_modal.modes.tetwild import TetWild
 from torch_modal.registration.load import load_keyframes
 
 DONE, FAILED, UNFINISHED = "done", "failed", "unfinished"
@@ -71,23 +71,13 @@ class Options:
     """True if the key-frames of a set are a motion, in the order of their files."""
 
     def key(self, files: Sequence[Path]) -> str:
-        """Digest of all that the bases depend on: options, names and contents of the files, those beside them included.
-
-        Args:
-            files: The meshes of the set.
-
-        Raises:
-            OSError: A file cannot be read.
-        """
-        made = [self.n_modes, self.method, self.mesher, self.sequence, CACHE_VERSION]
-        total = hashlib.sha256(json.dumps(made).encode())
+        """Digest of all that the bases depend on: options, names and contents of the files and of those beside them."""
         beside = [files[0].parent / TIMES_FILE] if self.sequence else []
         if any(file.suffix.lower() == ".gltf" for file in files):
             beside += sorted(files[0].parent.glob("*.bin"))
-        for file in (*files, *filter(Path.is_file, beside)):
-            for part in (file.name.encode("utf-8", "surrogateescape"), file.read_bytes()):
-                total.update(hashlib.sha256(part).digest())
-        return total.hexdigest()
+        every = (*files, *filter(Path.is_file, beside))
+        contents = [(file.name, hashlib.sha256(file.read_bytes()).hexdigest()) for file in every]
+        return content_digest([self.n_modes, self.method, self.mesher, self.sequence, CACHE_VERSION, contents])
 
 
 @dataclass(frozen=True)
@@ -181,15 +171,9 @@ def _obstacle(folder: Path, overwrite: bool) -> str:
 def _in_own_process(
     source: Path, target: Path, record: Record, options: Options, stop: threading.Event | None
 ) -> tuple[str | None, str]:
-    """Start a new interpreter for the set and wait for it.
-
-    It has a session of its own, so that Ctrl-C reaches this process alone, and ends itself when the pipe from this
-    process closes.
-
-    Returns:
-        Why there is no result, None if it was stopped; and the end of its output.
-    """
-    end = time.monotonic() + options.timeout
+    """Why an interpreter of its own has no result for the set, None if it was stopped; and the end of its output."""
+    # Ctrl-C reaches this process alone; the other, whose session is new, ends itself when the pipe from here closes.
+    end, ended = time.monotonic() + options.timeout, False
     with tempfile.TemporaryDirectory(prefix="torch_modal-set-", ignore_cleanup_errors=True) as scratch:
         reason_file, log_file = Path(scratch) / "reason.txt", Path(scratch) / "log.txt"
         job = {"source": str(source), "target": str(target), "record": asdict(record), "options": asdict(options)}
@@ -208,40 +192,27 @@ def _in_own_process(
             with contextlib.suppress(BrokenPipeError):  # it ended at once; its exit status says more
                 process.stdin.write(json.dumps(job).encode() + b"\n")
                 process.stdin.flush()
-            in_time = _wait(process, end, stop)
+            while not ended and time.monotonic() < end and not (stop is not None and stop.is_set()):
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    process.wait(min(POLL, max(end - time.monotonic(), 0.0)))
+                    ended = True
         finally:
-            _end(process)
+            # Interrupted first, so that it ends the mesher, whose session is another.
+            if process.poll() is None:
+                process.send_signal(signal.SIGINT if os.name == "posix" else signal.SIGTERM)
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    process.wait(GRACE)
+            end_process(process)
+            with contextlib.suppress(OSError):
+                process.communicate()  # closes the pipe
         said, code = log_file.read_text(errors="replace")[-2000:], process.returncode
-        if in_time is None:
-            return None, said
-        if not in_time:
-            return f"no result after the timeout of {options.timeout:g} s", said
+        if not ended:
+            stopped = stop is not None and stop.is_set()
+            return None if stopped else f"no result after the timeout of {options.timeout:g} s", said
         if reason_file.is_file():
             return reason_file.read_text(), said
         hint = "perhaps memory ran out" if code == -signal.SIGKILL else last_line(said)
         return f"its process ended with {describe_exit(code)}" + (f" ({hint})" if hint else ""), said
-
-
-def _wait(process: subprocess.Popen[bytes], end: float, stop: threading.Event | None) -> bool | None:
-    """Wait for a process: True if it ended before a time, False if not, None if it was stopped."""
-    while stop is None or not stop.is_set():
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            process.wait(min(POLL, max(end - time.monotonic(), 0.0)))
-            return True
-        if time.monotonic() >= end:
-            return False
-    return None
-
-
-def _end(process: subprocess.Popen[bytes]) -> None:
-    """Interrupt a process, so that it ends the mesher, whose session is another; kill it if that does not help."""
-    if process.poll() is None:
-        process.send_signal(signal.SIGINT if os.name == "posix" else signal.SIGTERM)
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            process.wait(GRACE)
-    end_process(process)
-    with contextlib.suppress(OSError):
-        process.communicate()  # closes the pipe
 
 
 # ------------------------------------------------------------------------------------------- in the set's process
@@ -301,11 +272,7 @@ def compute(source: Path, target: Path, record: Record, options: Options) -> Non
 
 
 def _times(file: Path, n_keyframes: int) -> list[float]:
-    """Times of the key-frames of a motion, with the end of a cycle: those in a file, or even ones without it.
-
-    Raises:
-        ValueError: The file does not hold such times.
-    """
+    """Times of the key-frames of a motion, with the end of a cycle: those in a file, or even ones without it."""
     if not file.is_file():
         return [float(i) for i in range(n_keyframes)]
     try:

@@ -14,7 +14,7 @@ from tqdm import tqdm
 from torch_modal.data.precompute_set import DONE, FAILED, Options, Record, run_set
 from torch_modal.data.tree import find_keyframe_sets
 from torch_modal.extras import require
-from torch_modal.precompute.parallel import n_cpus
+from torch_modal.modes.parallel import n_cpus
 
 RETRIES = 2
 """Retries of a task that raised an error on a cluster: a machine may lack the package or the folders."""
@@ -53,7 +53,12 @@ def precompute_tree(
         OSError: The output cannot be written, or there is no cluster, or it is gone (ConnectionError).
         MissingPackageError: ``scheduler`` without dask.distributed.
     """
-    _check_folders(root, out)
+    if not root.is_dir():
+        raise ValueError(f"{root} is no folder" if root.exists() else f"there is no folder {root}")
+    if out.exists() and not out.is_dir():
+        raise ValueError(f"{out} is a file; the output is a folder")
+    if out.resolve() in (root.resolve(), *root.resolve().parents):
+        raise ValueError(f"the output folder {out} is or contains the input {root}; choose another one")
     out.mkdir(parents=True, exist_ok=True)
     options = options or Options()
     sets, left_out = find_keyframe_sets(root, skip=out)
@@ -109,11 +114,8 @@ def _local_processes(workers: int | None) -> Iterator[tuple[Executor, Any]]:
 
 @contextmanager
 def _dask_cluster(address: str) -> Iterator[tuple[Executor, Any]]:
-    """The workers of a Dask cluster, and an event on its scheduler: running tasks cannot be cancelled from outside.
-
-    The scheduler gives the sets of a dead worker to others, and gives up a set that killed several workers
-    (``distributed.scheduler.allowed-failures``).
-    """
+    """The workers of a Dask cluster, and an event on its scheduler: running tasks cannot be cancelled from outside."""
+    # Sets of a dead worker go to others, until one has killed several (distributed.scheduler.allowed-failures).
     distributed = require("distributed", "dask", "a Dask cluster")
     with distributed.Client(address, set_as_default=False) as client:
         yield client.get_executor(pure=False, retries=RETRIES), distributed.Event(client=client)
@@ -139,12 +141,3 @@ def printable(name: str) -> str:
     """A name as one line of a terminal can show it; names of folders may hold anything but a slash."""
     text = name.encode("utf-8", "backslashreplace").decode()
     return text if text.isprintable() else repr(text)
-
-
-def _check_folders(root: Path, out: Path) -> None:
-    if not root.is_dir():
-        raise ValueError(f"{root} is no folder" if root.exists() else f"there is no folder {root}")
-    if out.exists() and not out.is_dir():
-        raise ValueError(f"{out} is a file; the output is a folder")
-    if out.resolve() in (root.resolve(), *root.resolve().parents):
-        raise ValueError(f"the output folder {out} is or contains the input {root}; choose another one")

@@ -8,10 +8,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torch_modal.autograd import Recent, lasting, transformed
+from torch_modal.autograd import Recent, lasting
 from torch_modal.data.in_betweens import InBetweens
-from torch_modal.data.motion import Motion
-from torch_modal.data.stored import StoredSet
+from torch_modal.data.stored import Motion, StoredSet
 from torch_modal.data.strain import mode_scales
 from torch_modal.geometry.canonical import size
 from torch_modal.geometry.crossings import require_contact
@@ -21,9 +20,9 @@ from torch_modal.geometry.vectors import norm, pick
 from torch_modal.inbetween.settings import Objective, Preset, Solver, settings
 from torch_modal.keyframes.check import check_keyframes
 from torch_modal.layers.blend import Blend
-from torch_modal.precompute.basis import ModalBasis
-from torch_modal.statistics.coordinates import Components
-from torch_modal.statistics.fit import Fitted, Observations, checked_observations, checked_weights, fit
+from torch_modal.modes.basis import ModalBasis
+from torch_modal.statistics.components import Components
+from torch_modal.statistics.fit import Fitted, fit
 from torch_modal.statistics.variation import Variation
 
 # Sizes whose squares, and squares of areas, are usual numbers of float32.
@@ -90,12 +89,13 @@ class ShapeSpace:
             require_contact()
         self.dtype = dtype
         self.motion = Motion.of(keyframe_times, len(self.bases), cyclic)
-        self.in_betweens = InBetweens(self.bases, self.faces, *self.settings, self.motion, times, dtype, folder)
+        self.in_betweens = InBetweens(self.bases, self.faces, self.settings, self.motion, times, dtype, folder)
         self._keyframes = torch.stack([basis.reference.double() for basis in self.bases])
         length = size(self._keyframes[0].numpy(), self.faces.numpy())
         #: The least precise dtype that can square areas of these shapes.
         self.least_dtype = torch.float32 if _SIZES[0] <= length <= _SIZES[1] else torch.float64
-        self._reconstructions, self._scales, self._variation = Recent(4), Recent(len(self.bases)), Recent(1)
+        #: Reconstructions by device, scales of modes by key-frame, and the variation.
+        self._made = Recent(5 + len(self.bases))
 
     @classmethod
     def open(cls, stored: StoredSet, **options: Any) -> "ShapeSpace":
@@ -119,11 +119,6 @@ class ShapeSpace:
     def n_modes(self) -> int:
         """Most modes that a key-frame has, k."""
         return max(basis.n_modes for basis in self.bases)
-
-    @property
-    def edges(self) -> Tensor:
-        """Vertex indices of each edge. *Shape:* ``(E, 2)``."""
-        return self.reconstruction().edges
 
     def keyframes(self, like: Tensor | None = None) -> Tensor:
         """A copy of the key-frames, in the dtype and on the device of another tensor. *Shape:* ``(K, V, 3)``."""
@@ -154,14 +149,14 @@ class ShapeSpace:
     def reconstruction(self, device: torch.device | str = "cpu") -> Reconstruction:
         """The Poisson problem of the connectivity. The first key-frame's weights serve for all shapes."""
         device = torch.device(device)
-        found: Reconstruction = self._reconstructions.get(
+        found: Reconstruction = self._made.get(
             device, lambda: Reconstruction(self._keyframes[0], self.faces).to(device)
         )
         return found
 
     def mode_scales(self, index: int) -> Tensor:
         """Scales of the modes of a key-frame (:func:`~torch_modal.data.strain.mode_scales`). *Shape:* ``(k,)``."""
-        found: Tensor = self._scales.get(index, lambda: mode_scales(self.bases[index], self.faces, self.edges))
+        found: Tensor = self._made.get(index, lambda: mode_scales(self.bases[index], self.faces))
         return found
 
     # ----------------------------------------------------------------------------------------------------- statistics
@@ -191,13 +186,11 @@ class ShapeSpace:
         Raises:
             ValueError: There are fewer.
         """
-        most = len(self) - 1
-        if n is None:
-            n = most
+        variation, most = self.variation(), len(self) - 1
+        n = most if n is None else n
         if not 1 <= n <= most:
             raise ValueError(f"{len(self)} key-frames have {most} components; got n={n}")
-        variation = self.variation()
-        return Components(variation.coordinates, variation.average + variation.deviations, n, variation.origin)
+        return Components(variation, n)
 
     def variation(self) -> Variation:
         """Variation of the key-frames, which :meth:`sample` and :meth:`fit` share.
@@ -209,7 +202,7 @@ class ShapeSpace:
             raise ValueError(
                 "one key-frame alone does not vary; a space for sample, fit or components needs two or more"
             )
-        found: Variation = self._variation.get((), lambda: Variation(self._keyframes, self.faces))
+        found: Variation = self._made.get("variation", lambda: Variation(self._keyframes, self.faces))
         return found
 
     @torch.no_grad()
@@ -242,15 +235,9 @@ class ShapeSpace:
         Raises:
             ValueError: An argument is out of range.
         """
-        if n < 0:
-            raise ValueError(f"n is 0 or more, got {n}")
-        check_density(concentration, locality)
         variation = self.variation()
-        out = torch.empty(n, self.n_vertices, 3, dtype=self.dtype)
-        for i in range(n):
-            weights, factors = variation.draw(concentration, locality, generator)
-            out[i] = variation.member(weights, factors)[0] + variation.origin
-        return out
+        drawn = variation.draw(n, concentration, locality, generator)
+        return (variation.members(*drawn) + variation.origin).to(self.dtype)
 
     def fit(
         self, points: Tensor, vertices: Tensor, *, near: int | Tensor | None = None, robust: bool = False
@@ -280,28 +267,4 @@ class ShapeSpace:
                 units.
             RuntimeError: The points are within a transform of ``torch.func``, or have a tangent.
         """
-        if transformed(points):
-            raise RuntimeError("fits have no forward mode, and no transforms of torch.func: take torch.autograd.grad")
-        about = checked_weights(near, len(self))
-        places = checked_observations(points, vertices, self.n_vertices)
-        variation = self.variation()
-        found = []
-        for own in points.reshape(points.shape[:-2].numel(), *points.shape[-2:]):
-            known = own.to("cpu", torch.float64)
-            to = Observations(known, places, torch.ones_like(known[:, 0]))
-            found.append(fit(variation, to, about, robust))
-        lead, v, n = points.shape[:-2], self.n_vertices, len(places)
-        if not found:
-            sizes = (v, 3), (len(self), v), (n,), (n,)
-            return Fitted(*(points.new_zeros(*lead, *shape) for shape in sizes))
-        return Fitted(*(torch.stack(part).view(*lead, *part[0].shape).to(points) for part in zip(*found, strict=True)))
-
-
-def check_density(concentration: float, locality: float) -> None:
-    """Check what new members are drawn with.
-
-    Raises:
-        ValueError: It is out of range.
-    """
-    if not 0 < concentration < torch.inf or not 0 <= locality < torch.inf:
-        raise ValueError(f"concentration is above 0, locality 0 or more; got {concentration} and {locality}")
+        return fit(self.variation(), points, vertices, near, robust)

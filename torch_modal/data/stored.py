@@ -11,12 +11,13 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from torch_modal.autograd import lasting
-from torch_modal.data.motion import Motion
 from torch_modal.io.tensors import TensorFile, write_tensors
-from torch_modal.precompute.basis import ModalBasis
+from torch_modal.keyframes.arrays import checked_times
+from torch_modal.modes.basis import ModalBasis
 
 FORMAT = "torch_modal.set"
 VERSION = "2"
@@ -25,6 +26,57 @@ LABELS_FILE = "labels.safetensors"
 #: Tables of in-betweens, which follow from a set and are removed when it is replaced.
 TABLE_FILES = "between-*.safetensors"
 _PARTS = tuple(field.name for field in fields(ModalBasis))
+
+
+class Motion:
+    """The order and the times of the key-frames of a motion.
+
+    Args:
+        times: Times of the key-frames, ascending; if cyclic, one more, when the first comes again. *Shape:* ``(K,)``,
+            or ``(K + 1,)`` if cyclic.
+        n_keyframes: Their number, K.
+        cyclic: Whether the last key-frame leads on to the first.
+
+    Attributes:
+        neighbours: The key-frames before and after each in time; twice the same at an end. *Shape:* ``(K, 2)``.
+
+    Raises:
+        ValueError: Another number of times, or times that do not ascend.
+    """
+
+    def __init__(self, times: Tensor | Sequence[float], n_keyframes: int, cyclic: bool = False) -> None:
+        self.times = checked_times(times, n_keyframes, cyclic)
+        self.n_keyframes = n_keyframes
+        self.cyclic = cyclic
+        both, last = torch.arange(n_keyframes)[:, None] + torch.tensor([-1, 1]), n_keyframes - 1
+        self.neighbours = both % n_keyframes if cyclic else last - (last - both.abs()).abs()
+
+    @classmethod
+    def of(cls, times: Tensor | Sequence[float] | None, n_keyframes: int, cyclic: bool) -> "Motion | None":
+        """The motion of key-frames; None without times.
+
+        Raises:
+            ValueError: As for the constructor, or cyclic key-frames without times.
+        """
+        if times is None and cyclic:
+            raise ValueError(f"cyclic key-frames are a motion and need their times: range({n_keyframes + 1}) if even")
+        return None if times is None else cls(times, n_keyframes, cyclic)
+
+    def span(self, i: int, j: int) -> tuple[float, float] | None:
+        """The times of two successive key-frames, in either direction.
+
+        Returns:
+            The times of ``i`` and of ``j``; in a cycle, those before the first and after the last go on. None if they
+            are not successive, or have no neighbours.
+        """
+        n, back = self.n_keyframes, -1 % self.n_keyframes if self.cyclic else -1
+        step = (j - i) % n if self.cyclic else j - i
+        if n < 3 or step not in (1, back):
+            return None
+        first = i if step == 1 else j
+        period = self.times[-1] - self.times[0]
+        start, end = (float(self.times[place % n] + place // n * period) for place in (first, first + 1))
+        return (start, end) if step == 1 else (end, start)
 
 
 class StoredSet:
@@ -78,21 +130,9 @@ class StoredSet:
     def __reduce__(self) -> tuple[Any, ...]:
         return StoredSet, (self.folder,)
 
-    def __repr__(self) -> str:
-        return f"StoredSet({str(self.folder)!r}, {len(self)} key-frames, {self.n_vertices} vertices)"
-
-
-def open_set(folder: str | os.PathLike[str]) -> StoredSet:
-    """The key-frame set in a folder; see :class:`StoredSet`."""
-    return StoredSet(folder)
-
 
 def read_note(folder: Path) -> str:
-    """The note of a stored set; reads the header of its file only.
-
-    Raises:
-        FileNotFoundError, ValueError: As for :class:`StoredSet`.
-    """
+    """The note of a stored set; reads the header of its file only, and raises as :class:`StoredSet`."""
     return str(_opened(folder).metadata["note"])
 
 
@@ -168,11 +208,7 @@ def find_sets(root: str | os.PathLike[str]) -> list[Path]:
 
 
 def _opened(folder: Path) -> TensorFile:
-    """The file of a set, whose header is checked.
-
-    Raises:
-        FileNotFoundError, ValueError: As for :class:`StoredSet`.
-    """
+    """The file of a set, whose header is checked; raises as :class:`StoredSet`."""
     file = TensorFile(folder / SET_FILE, FORMAT, VERSION, ("keyframes", "faces"))
     keyframes, faces = file.shapes["keyframes"], file.shapes["faces"]
     if len(keyframes) != 3 or keyframes[2] != 3 or len(faces) != 2 or faces[1] != 3:

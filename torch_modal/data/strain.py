@@ -6,41 +6,40 @@ from torch import Tensor
 from torch_modal.energy.bend import dihedral_gradient
 from torch_modal.geometry.canonical import size
 from torch_modal.geometry.connectivity import Connectivity
-from torch_modal.geometry.vectors import cross, norm
-from torch_modal.precompute.basis import ModalBasis
-from torch_modal.precompute.sheet import THICKNESS
+from torch_modal.geometry.vectors import cross, norm, pick
+from torch_modal.modes.basis import ModalBasis
+from torch_modal.modes.sheet import THICKNESS
 
 # Eigenvalues below this part of the largest are loose pieces that move without deforming: no elastic modes.
 _NOT_ELASTIC = 1e-8
 
 
-def mode_scales(basis: ModalBasis, faces: Tensor, edges: Tensor) -> Tensor:
+def mode_scales(basis: ModalBasis, faces: Tensor) -> Tensor:
     r"""Factors of the modes, proportional to :math:`1 / \sqrt{\lambda}`; zero for modes that do not deform.
 
     Independent standard normal amplitudes of modes so scaled give an expected root mean square strain of one: of the
-    edges, or, of sheets, where bending strains their sides more than that, of their sides.
-
-    Args:
-        basis: Of the key-frame.
-        faces: *Shape:* ``(F, 3)``.
-        edges: *Shape:* ``(E, 2)``.
-
-    Returns:
-        Float64. *Shape:* ``(k,)``.
+    edges, or, of sheets, where bending strains their sides more than that, of their sides. *Shape:* ``(k,)``, float64.
     """
     x, values = basis.reference.double(), basis.eigenvalues.double()
+    mesh = Connectivity(faces.numpy(), basis.n_vertices)
     scales = torch.where(values > _NOT_ELASTIC * values.amax(), values, torch.inf).rsqrt()
-    modes = basis.modes.double() * scales[:, None, None]
-    i, j = edges.unbind(1)
-    side = x[j] - x[i]
-    lengths = side.square().sum(-1)
-    strains = ((modes[:, j] - modes[:, i]) * side).sum(-1) / lengths.clamp_min(1e-300)
+    modes, edges = basis.modes.double() * scales[:, None, None], torch.tensor(mesh.edges)
+    strains = edge_strains(modes.movedim(-1, 0).contiguous(), x, edges)
+    lengths = (x[edges[:, 1]] - x[edges[:, 0]]).square().sum(-1)
     expected = _expected(strains, torch.ones_like(lengths))
-    bending, areas = _bending_strains(modes, x, faces)
+    bending, areas = _bending_strains(modes, x, mesh)
     by_bending = _expected(bending, areas)
     if by_bending > _expected(strains, lengths):  # a sheet, which bends without a change of length
         expected = by_bending
     return scales / expected.clamp_min(torch.finfo(torch.float64).tiny)
+
+
+def edge_strains(displacement: Tensor, x: Tensor, edges: Tensor) -> Tensor:
+    """Strains of edges under linear displacements. *Shape:* ``(3, B, V), (V, 3), (E, 2) -> (B, E)``."""
+    i, j = edges.unbind(1)
+    side = (x[j] - x[i]).mT[:, None]
+    along = ((pick(displacement, j) - pick(displacement, i)) * side).sum(0)
+    return along / side.square().sum(0).clamp_min(torch.finfo(side.dtype).tiny)
 
 
 def _expected(strains: Tensor, weights: Tensor) -> Tensor:
@@ -48,13 +47,9 @@ def _expected(strains: Tensor, weights: Tensor) -> Tensor:
     return (strains.square() @ weights / weights.sum()).sum().sqrt()
 
 
-def _bending_strains(modes: Tensor, x: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
-    """Strain of the sides of a sheet across each hinge, for the thickness that shell modes have, and the hinges' areas.
-
-    *Shape:* ``(k, V, 3), (V, 3), (F, 3) -> (k, H), (H,)``, to first order.
-    """
-    hinges = torch.tensor(Connectivity(faces.numpy(), len(x)).hinges)
-    first, *others = (torch.cat([x[None], modes])[:, corner] for corner in hinges.unbind(1))
+def _bending_strains(modes: Tensor, x: Tensor, mesh: Connectivity) -> tuple[Tensor, Tensor]:
+    """Strain of a sheet's sides across each hinge, and its area. *Shape:* ``(k, V, 3), (V, 3) -> (k, H), (H,)``."""
+    first, *others = (torch.cat([x[None], modes])[:, corner] for corner in torch.tensor(mesh.hinges).unbind(1))
     vectors = torch.stack([other - first for other in others]).movedim(-1, 1)
     rest, moves = vectors[:, :, 0], vectors[:, :, 1:]
     angles = (dihedral_gradient(rest)[:, :, None] * moves).sum((0, 1))
@@ -62,5 +57,5 @@ def _bending_strains(modes: Tensor, x: Tensor, faces: Tensor) -> tuple[Tensor, T
     tiny = torch.finfo(x.dtype).tiny
     areas = 0.5 * (norm(cross(e, a)) + norm(cross(e, b)))
     apart = 2 * areas / (3 * norm(e)).clamp_min(tiny)  # of the centroids
-    thickness = THICKNESS * size(x.numpy(), faces.numpy())
+    thickness = THICKNESS * size(x.numpy(), mesh.faces)
     return 0.5 * thickness * angles / apart.clamp_min(tiny), areas

@@ -15,6 +15,9 @@ from torch_modal.autograd import lasting
 from torch_modal.energy.term import Mesh, Term
 from torch_modal.geometry.vectors import pick
 
+# Roundings of an energy, relative to it, that say nothing about a step.
+ENERGY_ROUNDING = 64.0
+
 
 class Rest(NamedTuple):
     """Measures of a rest shape and their weights, term by term."""
@@ -32,7 +35,7 @@ class Reference(NamedTuple):
     """``Q``, of :meth:`torch_modal.energy.term.Term.merged`. *Shape of each:* ``(..., R, M)``."""
     weights: tuple[Tensor, ...]
     """``W``, the stiffness included. *Shape of each:* ``(..., M)``."""
-    constant: Tensor | float
+    constant: Tensor
     """``c``. *Shape:* ``(...)``."""
 
 
@@ -205,10 +208,10 @@ class Energy(nn.Module):
         for i, (part, factor) in enumerate(zip(self.parts, stiffness, strict=True)):
             values = torch.stack([rest.measures[i] for rest in rests], -2)
             pulls = weights[..., None] * torch.stack([rest.weights[i] for rest in rests], -2).expand_as(values)
-            own = part.term.merged(values, pulls)
-            measures.append(own.measures)
-            wholes.append(factor * own.weights)
-            constant = constant + (factor * own.constant).sum(-1)
+            value, whole, left = part.term.merged(values, pulls)
+            measures.append(value)
+            wholes.append(factor * whole)
+            constant = constant + (factor * left).sum(-1)
         return Reference(tuple(measures), tuple(wholes), constant)
 
     def mixed(self, rest: Rest, weights: Tensor) -> Rest:
@@ -229,12 +232,7 @@ class Energy(nn.Module):
 
     def against(self, rest: Rest, stiffness: Sequence[float | Tensor]) -> Reference:
         """One rest shape as the reference."""
-        merged = [
-            part.term.merged(measures[..., None, :], weight.expand_as(measures)[..., None, :])
-            for part, measures, weight in zip(self.parts, *rest, strict=True)
-        ]
-        weights = tuple(factor * own.weights for factor, own in zip(stiffness, merged, strict=True))
-        return Reference(tuple(own.measures for own in merged), weights, 0.0)
+        return self.among([rest], torch.ones_like(rest.measures[0][..., :1]), stiffness)
 
     # --------------------------------------------------------------------------------------------------------- values
     def value(self, extended: Tensor, reference: Reference) -> Tensor:
@@ -299,17 +297,10 @@ class Energy(nn.Module):
             out = corners[0].new_zeros(*corners[0].shape[:-1], self.n_extended)
         return out.index_add(-1, self.corners, torch.cat(corners, -1)) if corners else out
 
-    def gather(self, at: Sequence[Linearised], factors: Sequence[Tensor]) -> Tensor:
-        """Gradients of all measures times factors of them, summed. *Shape:* ``(B, M)`` each, ``(3, B, V)`` extended."""
-        scaled = [
-            factor if part.term.total else factor * one.gradients
-            for part, one, factor in zip(self.parts, at, factors, strict=True)
-        ]
-        return self.scatter(at, scaled)
-
     def gradient(self, at: Sequence[Linearised]) -> Tensor:
         """Gradient of the energy. *Shape:* ``(3, B, V)``, extended."""
-        return self.gather(at, [one.slope for one in at])
+        parts = zip(self.parts, at, strict=True)
+        return self.scatter(at, [one.slope if part.term.total else one.slope * one.gradients for part, one in parts])
 
 
 class RestShapes(NamedTuple):

@@ -17,6 +17,9 @@ from torch_modal.energy.energy import Energy, Linearised, Reference, RestShapes
 from torch_modal.energy.shell import ShellEnergy
 from torch_modal.energy.term import Term
 
+# The second-order term of a batch passes through an array of this many bytes at a time.
+MOST_BYTES = 2**26
+
 
 class Derivatives(NamedTuple):
     """Derivatives of an energy in the amplitudes ``a``."""
@@ -29,6 +32,11 @@ class Derivatives(NamedTuple):
     """The second-order term of the full Hessian. *Shape:* ``(B, n, n)``."""
     resolution: Tensor
     """Gradient norm that the rounding of the positions alone explains. *Shape:* ``(B,)``."""
+
+    @property
+    def floor(self) -> Tensor:
+        """Gradient norm below which there is only rounding, which adds up along sums of elements. *Shape:* ``(B,)``."""
+        return 4 * self.resolution
 
     @property
     def hessian(self) -> Tensor:
@@ -67,9 +75,8 @@ class ModalEnergy(nn.Module):
         rows = self.energy.extend(columns.movedim(-1, 0))
         self.register_buffer("columns", rows.transpose(0, 1).contiguous(), persistent=False)
         for i in range(len(self.energy.parts)):
-            self.register_buffer(
-                f"edge_vectors_{i}", self._edge_vectors(i) if self.tabulated else None, persistent=False
-            )
+            table = self._edge_vectors(i) if self.tabulated else None
+            self.register_buffer(f"edge_vectors_{i}", table, persistent=False)
 
     def _edge_vectors(self, i: int) -> Tensor:
         """Edge vectors of the elements of a term along each column. *Shape:* ``(M, 3 (c-1), n)``."""
@@ -138,7 +145,11 @@ class ModalEnergy(nn.Module):
         gradients, inner, curved = [], [], []
         for i, (part, one) in enumerate(zip(self.energy.parts, at, strict=True)):
             columns = getattr(self, f"edge_vectors_{i}") if self.tabulated else self._edge_vectors(i)
-            gradient, own = self._of_total(one) if part.term.total else _normal_equations(one, columns)
+            if part.term.total:
+                row = self._along_columns(one.gradients)
+                gradient, own = one.slope * row, one.curvature[..., None] * row[:, :, None] * row[:, None, :]
+            else:
+                gradient, own = _normal_equations(one, columns)
             gradients.append(gradient)
             inner.append(own)
             if second_order:
@@ -173,21 +184,11 @@ class ModalEnergy(nn.Module):
         """From gradients in the vertices to those in the amplitudes. *Shape:* ``(3, B, V) -> (B, n)``."""
         return extended.transpose(0, 1).flatten(1) @ self.columns.flatten(1).mT
 
-    def _of_total(self, one: Linearised) -> tuple[Tensor, Tensor]:
-        """Contribution of a total to the gradient and to Gauss-Newton's Hessian."""
-        row = self._along_columns(one.gradients)
-        return one.slope * row, one.curvature[..., None] * row[:, :, None] * row[:, None, :]
-
 
 def _normal_equations(one: Linearised, columns: Tensor) -> tuple[Tensor, Tensor]:
-    """Contribution of one term to the gradient and to Gauss-Newton's Hessian.
+    """Contribution of one term to the gradient and to Gauss-Newton's Hessian, by edge vectors along the columns.
 
-    Args:
-        one: The term.
-        columns: Edge vectors in each direction of the space. *Shape:* ``(M, c, n)``, with ``c = 3 (n-1)``.
-
-    Returns:
-        *Shape:* ``(B, n)``, ``(B, n, n)``.
+    *Shape:* ``(M, c, n) -> (B, n), (B, n, n)``, with ``c`` three times the number of edge vectors.
     """
     # Rows of the Jacobian are scaled before they pass through the columns, where they are few numbers.
     root = one.curvature.clamp_min(torch.finfo(one.curvature.dtype).tiny).sqrt()
@@ -203,6 +204,7 @@ def _second_order(term: Term, one: Linearised, columns: Tensor) -> Tensor:
     if one.beyond is not None:
         gradients = one.gradients.flatten(0, 1)
         curved = curved + (one.beyond * gradients)[:, None] * gradients
-    # (B, M, c, c) by (M, c, n).
-    pushed = curved.permute(2, 3, 0, 1).contiguous() @ columns
-    return columns.flatten(0, 1).mT @ pushed.flatten(1, 2)
+    most = max(1, MOST_BYTES // max(1, columns.numel() * columns.element_size()))
+    # (b, M, c, c) by (M, c, n), of some samples at a time.
+    parts = (own.contiguous() @ columns for own in curved.permute(2, 3, 0, 1).split(most))
+    return torch.cat([columns.flatten(0, 1).mT @ pushed.flatten(1, 2) for pushed in parts])

@@ -8,7 +8,7 @@ Eq. 5 write theirs out. Angles take a smooth periodic function in the place of t
 
 import math
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -64,17 +64,6 @@ class Mesh:
     def of(cls, faces: Tensor, n_vertices: int) -> "Mesh":
         """The mesh of these faces."""
         return cls(Connectivity(faces.detach().cpu().long().numpy().copy(), n_vertices))
-
-
-class Merged(NamedTuple):
-    """K rest shapes as one reference of a term."""
-
-    measures: Tensor
-    """What its measures are compared with. *Shape:* ``(..., R, M)``."""
-    weights: Tensor
-    """*Shape:* ``(..., M)``."""
-    constant: Tensor
-    """The energy that remains. *Shape:* ``(..., M)``."""
 
 
 class Term(nn.Module):
@@ -144,7 +133,7 @@ class Term(nn.Module):
         return measures - rest
 
     # ---------------------------------------------------------------- the square of the difference, and its derivatives
-    def merged(self, measures: Tensor, pulls: Tensor) -> Merged:
+    def merged(self, measures: Tensor, pulls: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """K parabolas as one (Eq. 8).
 
         Weights below zero may outweigh the others: then there is no minimum, and no weight.
@@ -152,13 +141,17 @@ class Term(nn.Module):
         Args:
             measures: Of K rest shapes. *Shape:* ``(..., K, M)``.
             pulls: Their weights. *Shape:* ``(..., K, M)``.
+
+        Returns:
+            The reference that measures are compared with, *shape* ``(..., R, M)``; its weights, and the energy that
+            remains, *shape* ``(..., M)``.
         """
         whole = pulls.sum(-2)
         shares = pulls * inverse(whole, whole <= 0)[..., None, :]
         first = measures[..., :1, :]
         value = first + (shares * self.difference(measures, first)).sum(-2, keepdim=True)
         constant = (pulls * self.difference(measures, value) ** 2).sum(-2)
-        return Merged(value, torch.where(whole > 0, whole, 0), constant)
+        return value, torch.where(whole > 0, whole, 0), constant
 
     def energies(self, measures: Tensor, rest: Tensor, weights: Tensor) -> Tensor:
         """Energy of each element.
@@ -229,7 +222,7 @@ class PeriodicTerm(Term):
     of the differences ``d`` from it, the weighted means of ``1 - cos d``, ``sin d``, ``1 - cos 2d`` and ``sin 2d``.
     """
 
-    def merged(self, measures: Tensor, pulls: Tensor) -> Merged:
+    def merged(self, measures: Tensor, pulls: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """K rest angles by their first two trigonometric moments; arguments as in the base class."""
         whole = pulls.sum(-2)
         shares = pulls * inverse(whole, whole <= 0)[..., None, :]
@@ -238,7 +231,7 @@ class PeriodicTerm(Term):
         off = measures - first[..., None, :]
         parts = _versine(off), off.sin(), _versine(2 * off), (2 * off).sin()
         rows = torch.stack([first, *((shares * part).sum(-2) for part in parts)], -2)
-        return Merged(rows, torch.where(whole > 0, whole, 0), torch.zeros_like(whole))
+        return rows, torch.where(whole > 0, whole, 0), torch.zeros_like(whole)
 
     def energies(self, measures: Tensor, rest: Tensor, weights: Tensor) -> Tensor:
         """Overrides the square."""

@@ -3,8 +3,6 @@
 NumPy only.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 
 from torch_modal.arrays import FloatArray, IntArray
@@ -17,19 +15,6 @@ ALIKE = 1e-6
 """Relative difference of principal moments below which axes are undetermined; likewise skewness and signs."""
 GENERIC = np.array([1.0, 0.6180339887, 0.3247179572])
 """A generic direction, which is unlikely to match a symmetry of a shape."""
-
-
-class Placed(NamedTuple):
-    """A shape in its principal axes, centred, with a size of 100."""
-
-    points: FloatArray
-    """Coordinates along the axes, rounded. *Shape:* ``(V, 3)``."""
-    axes: FloatArray
-    """A rotation whose rows are the axes: ``points @ axes`` has the caller's axes. *Shape:* ``(3, 3)``."""
-    centre: FloatArray
-    """Centroid in the caller's coordinates. *Shape:* ``(3,)``."""
-    scale: float
-    """Canonical units per unit of the caller."""
 
 
 def size(points: FloatArray, faces: IntArray) -> float:
@@ -52,8 +37,8 @@ def canonical_scale(shapes: FloatArray, faces: IntArray) -> float:
     return CANONICAL_SIZE / float(np.mean([size(x, faces) for x in shapes]))
 
 
-def placed(points: FloatArray, faces: IntArray) -> Placed:
-    """A shape in its principal axes.
+def placed(points: FloatArray, faces: IntArray) -> tuple[FloatArray, FloatArray, FloatArray, float]:
+    """A shape in its principal axes, centred, with a size of 100.
 
     The signs of the axes follow from the third moments. Undetermined axes and signs, as in symmetric shapes, are close
     to the caller's.
@@ -61,6 +46,10 @@ def placed(points: FloatArray, faces: IntArray) -> Placed:
     Args:
         points: *Shape:* ``(V, 3)``.
         faces: Vertex indices. *Shape:* ``(F, 3)``.
+
+    Returns:
+        Rounded coordinates along the axes, ``(V, 3)``; the axes, rows of a rotation, ``(3, 3)``; the centroid,
+        ``(3,)``; the scale. ``coordinates @ axes / scale + centroid`` are the points.
     """
     second, centre, length, arms, areas = _moments(points, faces)
     axes = _principal_axes(second)
@@ -72,7 +61,7 @@ def placed(points: FloatArray, faces: IntArray) -> Placed:
     axes[last] = np.cross(axes[last - 2], axes[last - 1])
     scale = CANONICAL_SIZE / length
     turned = ((points - centre) * scale) @ axes.T
-    return Placed(np.round(turned / ROUNDING) * ROUNDING, axes, centre, scale)
+    return np.round(turned / ROUNDING) * ROUNDING, axes, centre, scale
 
 
 def vertex_order(points: FloatArray) -> IntArray:

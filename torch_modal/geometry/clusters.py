@@ -7,7 +7,7 @@ from scipy.sparse.csgraph import breadth_first_order
 from torch import Tensor, nn
 
 from torch_modal.arrays import FloatArray, IntArray
-from torch_modal.geometry.rotations import conjugate, mean, product, turn_of
+from torch_modal.geometry.rotations import arc, conjugate, mean, product
 from torch_modal.geometry.vectors import pick
 
 # Rotation of the triangles of a cluster relative to its root, in radians. Above half a turn, the direction is unknown.
@@ -82,7 +82,7 @@ def beyond_a_turn(turns: Tensor, areas: Tensor, ancestors: Tensor, piece: Tensor
 def _from_mean(turns: Tensor, areas: Tensor, ancestors: Tensor, piece: Tensor) -> Tensor:
     """Angles between triangles and the mean of their piece, added up along the tree. *Shape:* ``(F,)``."""
     step = product(conjugate(pick(turns, ancestors[0])), turns)
-    winding = turn_of(torch.where(step[0] < 0, -step, step))
+    winding = 2 * arc(torch.where(step[0] < 0, -step, step))
     for generation in ancestors:
         winding = winding + pick(winding, generation)
     means = torch.stack([torch.bincount(piece, areas * row) for row in winding]) / torch.bincount(piece, areas)

@@ -16,12 +16,8 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 
 from torch_modal import extras
 from torch_modal.arrays import BoolArray, FloatArray, IntArray
-from torch_modal.errors import MissingPackageError
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.triangle_pairs import cross, dot, triangles_cross
-
-PACKAGES = ("ipctk", "igl")
-"""Of the extra."""
 
 RINGS = 2
 """Pairs within so many rings of a crossing of a key-frame belong to it: it grows and shrinks with every rounding."""
@@ -29,17 +25,6 @@ FAR = 0.06
 """Part of the diagonal, along the surface; nearer crossings are folds, not two parts that meet."""
 _OFFSET = 1e-4
 """Of the diagonal, outwards: where the winding number of a vertex is taken. On the surface itself it is a half."""
-_FACES = attrgetter("face0_id", "face1_id")
-"""Of a candidate of ipctk."""
-
-
-def require(name: str) -> Any:
-    """Import a library of the extra ``contact``.
-
-    Raises:
-        MissingPackageError: It is not installed; the message says how to install it.
-    """
-    return extras.require(name, "contact", "contact")
 
 
 def require_contact() -> None:
@@ -48,16 +33,7 @@ def require_contact() -> None:
     Raises:
         MissingPackageError: It names what is missing.
     """
-    extras.require_installed(PACKAGES, "contact", "contact")
-
-
-def has_contact() -> bool:
-    """True if the extra ``contact`` is installed."""
-    try:
-        require_contact()
-    except MissingPackageError:
-        return False
-    return True
+    extras.require_installed(("ipctk", "igl"), "contact", "contact")
 
 
 class Crossings:
@@ -88,22 +64,9 @@ class Crossings:
 
     # ------------------------------------------------------------------------------------------------- once for a mesh
     @cached_property
-    def _corners(self) -> Any:
-        """Faces as ipctk takes them."""
-        return np.asfortranarray(self.mesh.faces.astype(np.int32))
-
-    @cached_property
     def adjacency(self) -> sparse.csr_matrix:
         """One between vertices that an edge joins. *Shape:* ``(V, V)``."""
-        i, j = self.mesh.edges.T
-        n = self.mesh.n_vertices
-        half = sparse.coo_matrix((np.ones(len(i)), (i, j)), shape=(n, n))
-        return (half + half.T).tocsr()
-
-    @cached_property
-    def _touching(self) -> sparse.csr_matrix:
-        """One between faces that share a vertex, and of a face with itself. *Shape:* ``(F, F)``."""
-        return _ones(self.incidence.T @ self.incidence)
+        return _ones(self.lengths)
 
     @cached_property
     def incidence(self) -> sparse.csr_matrix:
@@ -138,11 +101,11 @@ class Crossings:
         pairs, n = self.known_pairs, len(self.mesh.faces)
         if not len(pairs):
             return None
-        near = _ones(
-            sparse.coo_matrix((np.ones(2 * len(pairs)), (pairs.reshape(-1), pairs[:, ::-1].reshape(-1))), (n, n))
-        )
+        ends = pairs.reshape(-1), pairs[:, ::-1].reshape(-1)
+        near = _ones(sparse.coo_matrix((np.ones(len(ends[0])), ends), (n, n)))
+        touching = _ones(self.incidence.T @ self.incidence)  # faces that share a vertex
         for _ in range(RINGS):
-            near = _ones(self._touching @ near @ self._touching)
+            near = _ones(touching @ near @ touching)
         return near
 
     @cached_property
@@ -158,16 +121,10 @@ class Crossings:
 
     # ----------------------------------------------------------------------------------------------------- of one shape
     def pairs(self, x: FloatArray) -> IntArray:
-        """Pairs of triangles that cross and share no vertex, the smaller number first, sorted.
+        """Pairs of triangles that share no vertex and cross, the smaller number first, sorted.
 
-        They cross as :func:`~torch_modal.geometry.triangle_pairs.triangles_cross` says: those that only touch, or lie
-        in one plane, do not.
-
-        Args:
-            x: *Shape:* ``(V, 3)``.
-
-        Returns:
-            *Shape:* ``(P, 2)``.
+        By :func:`~torch_modal.geometry.triangle_pairs.triangles_cross`: those that only touch, or lie in one plane, do
+        not cross. *Shape:* ``(V, 3) -> (P, 2)``.
         """
         pairs = np.sort(self._search(x), axis=1)
         one, other = (x[self.mesh.faces[side]] for side in pairs.T)
@@ -175,12 +132,13 @@ class Crossings:
         return pairs[np.lexsort(pairs.T[::-1])]
 
     def _crossing(self, x: FloatArray) -> IntArray:
-        tree = require("ipctk").LBVH()
+        tree = extras.require("ipctk", "contact", "contact").LBVH()
+        faces = np.asfortranarray(self.mesh.faces.astype(np.int32))
         # Scaled and centred: the library's boxes are of single precision.
         centred = np.asfortranarray((x - self.like.mean(0)) / self.diagonal)
         # Without the edges: nobody asks for their boxes.
-        tree.build(centred, np.zeros((0, 2), np.int32, order="F"), self._corners, 1e-6)
-        found = map(_FACES, tree.detect_face_face_candidates())
+        tree.build(centred, np.zeros((0, 2), np.int32, order="F"), faces, 1e-6)
+        found = map(attrgetter("face0_id", "face1_id"), tree.detect_face_face_candidates())
         candidates = np.fromiter(chain.from_iterable(found), np.int64).reshape(-1, 2)
         corners = self.mesh.faces[candidates]
         candidates = candidates[~(corners[:, 0, :, None] == corners[:, 1, None, :]).any((1, 2))]
@@ -216,14 +174,9 @@ class Crossings:
         if self._around_known is not None and far.any():
             at = np.flatnonzero(far)
             far[at] = np.asarray(self._around_known[pairs[at, 0], pairs[at, 1]]).reshape(-1) == 0
-        far[far] = self.far_apart(pairs[far])
+        one, other = self.mesh.faces[pairs[far]].transpose(1, 0, 2)
+        far[far] = np.all([self.separated(corner, other) for corner in one.T], axis=0)
         return far
-
-    def far_apart(self, pairs: IntArray) -> BoolArray:
-        """Which pairs are more than :data:`FAR` apart along the surface. *Shape:* ``(P, 2) -> (P,)``."""
-        faces = self.mesh.faces
-        found = [self.separated(faces[pairs[:, 0], corner], faces[pairs[:, 1]]) for corner in range(3)]
-        return np.all(found, axis=0)
 
     def separated(self, vertices: IntArray, faces: IntArray) -> BoolArray:
         """True where a vertex and a face are more than :data:`FAR` apart along the surface.
@@ -234,12 +187,12 @@ class Crossings:
         """
         own, which = np.unique(vertices, return_inverse=True)
         new = [v for v in own.tolist() if v not in self._near]
-        for part in np.array_split(new, -(-len(new) // 256) or 1):
-            reached = dijkstra(self.lengths, indices=part, limit=FAR * self.diagonal) if len(part) else []
-            self._near.update((int(v), np.flatnonzero(np.isfinite(row))) for v, row in zip(part, reached, strict=True))
-        n = self.mesh.n_vertices
+        for part in (new[i : i + 256] for i in range(0, len(new), 256)):
+            reached = dijkstra(self.lengths, indices=part, limit=FAR * self.diagonal)
+            self._near.update((v, np.flatnonzero(np.isfinite(row))) for v, row in zip(part, reached, strict=True))
         if not len(own):
             return np.ones(0, dtype=bool)
+        n = self.mesh.n_vertices
         # Sorted, as they are put together.
         codes = np.concatenate([k * n + self._near[v] for k, v in enumerate(own.tolist())])
         wanted = which.reshape(-1, 1) * n + faces
@@ -275,7 +228,8 @@ class Crossings:
             x, faces = surface.x, self.mesh.faces
             points = x[own] + _OFFSET * self.diagonal * surface.vertex_normals[own]
             # About 1 inside, about 0 outside.
-            number = require("igl").fast_winding_number(*(np.ascontiguousarray(a) for a in (x, faces, points)))
+            igl = extras.require("igl", "contact", "contact")
+            number = igl.fast_winding_number(*(np.ascontiguousarray(a) for a in (x, faces, points)))
             turned = (surface.doubled * (surface.centres - x.mean(0))).sum() < 0  # a surface that is inside out
             inside[own] = (-number if turned else number) > 0.5
         return inside
@@ -331,7 +285,7 @@ def _unit(vectors: FloatArray) -> FloatArray:
 
 
 def _ones(matrix: Any) -> sparse.csr_matrix:
-    """Replace the values of a pattern by ones."""
-    found = sparse.csr_matrix(matrix)
+    """The pattern of a matrix, with ones."""
+    found = sparse.csr_matrix(matrix, copy=True)
     found.data[:] = 1.0
     return found

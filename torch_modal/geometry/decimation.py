@@ -4,7 +4,6 @@ Sorted faces make the collapses independent of the axes and of the order of the 
 """
 
 import threading
-from typing import NamedTuple
 
 import fast_simplification
 import numpy as np
@@ -22,30 +21,24 @@ _STUCK = 1.5
 _SHIFT = 1e-5 * CANONICAL_SIZE
 
 
-class Decimation(NamedTuple):
-    """A decimated mesh and its edge collapses."""
-
-    vertices: FloatArray
-    """Positions that minimise the quadrics, not linear in the input. *Shape:* ``(V', 3)``."""
-    faces: IntArray
-    """Faces; may be degenerate or repeated. *Shape:* ``(F', 3)``."""
-    collapses: IntArray
-    """In order: the remaining vertex and the removed one. *Shape:* ``(n, 2)``."""
-
-
-def decimate(vertices: FloatArray, faces: IntArray, n_faces: int) -> Decimation:
+def decimate(vertices: FloatArray, faces: IntArray, n_faces: int) -> tuple[FloatArray, IntArray, IntArray]:
     """Collapse edges down to a number of faces.
 
     Args:
         vertices: In any units. *Shape:* ``(V, 3)``.
         faces: Vertex indices. *Shape:* ``(F, 3)``.
         n_faces: Target number of faces; more remain if edges cannot be collapsed.
+
+    Returns:
+        Positions that minimise the quadrics, not linear in the input, *shape* ``(V', 3)``; faces, which may be
+        degenerate or repeated, *shape* ``(F', 3)``; the collapses in order, the vertex that remains and the one that
+        does not, *shape* ``(n, 2)``.
     """
-    shape = placed(vertices, faces)
-    order = vertex_order(shape.points)
+    points, axes, centre, scale = placed(vertices, faces)
+    order = vertex_order(points)
     rank = np.argsort(order)
-    sorted_points = np.ascontiguousarray(shape.points[order])
-    sorted_faces = np.ascontiguousarray(rank[ordered_faces(shape.points, faces)], dtype=np.int32)
+    sorted_points = np.ascontiguousarray(points[order])
+    sorted_faces = np.ascontiguousarray(rank[ordered_faces(points, faces)], dtype=np.int32)
 
     def simplified(points: FloatArray) -> tuple[FloatArray, IntArray, IntArray]:
         with _NOT_THREAD_SAFE:
@@ -60,5 +53,5 @@ def decimate(vertices: FloatArray, faces: IntArray, n_faces: int) -> Decimation:
         shifted = simplified(sorted_points + shifts)
         if len(shifted[1]) <= _STUCK * n_faces:
             points, triangles, collapses = shifted
-    points = points.astype(np.float64) @ shape.axes / shape.scale + shape.centre
-    return Decimation(points, triangles.astype(np.int64), order[collapses].reshape(-1, 2))
+    positions = points.astype(np.float64) @ axes / scale + centre
+    return positions, triangles.astype(np.int64), order[collapses].reshape(-1, 2)

@@ -3,8 +3,6 @@
 Nothing here raises or warns; see `keyframes/check.py`.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 
 from torch_modal.arrays import BoolArray, FloatArray, IntArray
@@ -14,16 +12,6 @@ FLATNESS = 1e-6
 """Extent across a plane, over the largest, up to which a surface is flat."""
 OPEN = 0.08
 """Part of its area that holes have (:func:`open_part`) above which a surface is open, rather than a body with holes."""
-
-
-class Winding(NamedTuple):
-    """Faces with consistent winding in each orientable component."""
-
-    faces: IntArray
-    flipped: IntArray
-    """Indices of flipped faces."""
-    non_orientable: IntArray
-    """Indices of the unchanged faces of non-orientable components (a Moebius strip)."""
 
 
 def degenerate_faces(faces: IntArray) -> BoolArray:
@@ -49,20 +37,23 @@ def repeated_faces(faces: IntArray) -> BoolArray:
     return repeated
 
 
-def consistent_winding(mesh: Connectivity) -> Winding:
+def consistent_winding(mesh: Connectivity) -> tuple[IntArray, IntArray, IntArray]:
     """Flip the fewest faces so that adjacent faces have opposite directions along their edge.
 
     The graph has two nodes for each face, as it is and flipped. Edges join equal nodes of consistent neighbours and
     different nodes of inconsistent ones. An orientable component gives two components of this graph, a non-orientable
     one gives one. Edges of three or more faces are ignored.
+
+    Returns:
+        The faces, *shape* ``(F, 3)``; the indices of those that are flipped, and of those that stay because their
+        component is not orientable (a Moebius strip).
     """
     faces, n_faces = mesh.faces, len(mesh.faces)
     one, two = mesh.hinge_sides.T % n_faces
     signs = mesh.signs[mesh.hinge_sides]
     crossed = (signs[:, 0] == signs[:, 1]) * n_faces
     if not crossed.any():
-        none = np.zeros(0, dtype=np.int64)
-        return Winding(faces, none, none)
+        return faces, np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
     pairs = np.stack([np.append(one, one + n_faces), np.append(two + crossed, two + n_faces - crossed)], axis=1)
     label = connected_pieces(pairs, 2 * n_faces)
     as_is, turned = label[:n_faces], label[n_faces:]
@@ -73,7 +64,7 @@ def consistent_winding(mesh: Connectivity) -> Winding:
     fewer, equal = size[as_is] < size[turned], size[as_is] == size[turned]
     flip = ~non_orientable & (fewer | (equal & (as_is > turned)))
     repaired = np.where(flip[:, None], faces[:, ::-1], faces)
-    return Winding(repaired, np.flatnonzero(flip), np.flatnonzero(non_orientable))
+    return repaired, np.flatnonzero(flip), np.flatnonzero(non_orientable)
 
 
 def diagonals(keyframes: FloatArray) -> FloatArray:

@@ -8,15 +8,14 @@ from torch import Tensor, nn
 
 from torch_modal.geometry.clusters import Clusters, beyond_a_turn
 from torch_modal.geometry.connectivity import Connectivity, spanning_forest
-from torch_modal.geometry.rotations import agreeing, mean, quaternion, rotate, turn_of, turned
+from torch_modal.geometry.rotations import agreeing, arc, mean, quaternion, rotate, turned
 from torch_modal.geometry.triangle_frames import (
     Frames,
     Sides,
     doubled_areas,
     edge_means,
-    frames,
+    frames_of,
     mapped,
-    sides,
     stretched,
 )
 from torch_modal.geometry.vectors import pick
@@ -45,10 +44,6 @@ class Trajectory(NamedTuple):
     last: Tensor
     """How far that at the end is. *Shape:* ``(6, P, F)``."""
 
-    def rows(self, index: Tensor) -> "Trajectory":
-        """Those of some of the pairs."""
-        return Trajectory._make(part.index_select(-2, index) for part in self)
-
 
 class LocalRotations(nn.Module):
     r"""Edge vectors between two shapes whose triangles turn at constant speed.
@@ -76,15 +71,14 @@ class LocalRotations(nn.Module):
 
     def __init__(self, mesh: Connectivity, references: Tensor) -> None:
         super().__init__()
-        faces = torch.tensor(mesh.faces)
-        a, b = (_frames(x[None], faces) for x in references[:2])
-        every = [a, b, *(_frames(x[None], faces) for x in references[2:])]
+        self.register_buffer("faces", torch.tensor(mesh.faces), persistent=False)
+        every = [self.frames(x[None]) for x in references]
+        a, b = every[:2]
         slenderness = reduce(torch.minimum, [x.slenderness for x in every]).squeeze(0)
         parents, piece = self._tree(_turn_between(a, b).squeeze(1), slenderness, mesh)
         ancestors = [parents]
         while 2 ** len(ancestors) < len(parents):
             ancestors.append(ancestors[-1][ancestors[-1]])
-        self.register_buffer("faces", faces, persistent=False)
         self.register_buffer("sides", torch.tensor(mesh.sides), persistent=False)
         self.register_buffer("side_signs", torch.tensor(mesh.signs).to(references), persistent=False)
         #: The first reference, from which rotations of more than two shapes are measured. *Shape:* ``(1, V, 3)``.
@@ -95,7 +89,7 @@ class LocalRotations(nn.Module):
         self.register_buffer("ancestors", torch.stack(ancestors), persistent=False)
         self.register_buffer("piece", piece, persistent=False)
         self.n_edges, self.n_pieces = len(mesh.edges), int(piece.max()) + 1
-        wound = self._wound(a, b)
+        wound = self.wound(a, b)
         #: For rotations beyond a full turn; None where there are none.
         self.clusters = Clusters(*wound) if beyond_a_turn(*wound) else None
 
@@ -124,8 +118,8 @@ class LocalRotations(nn.Module):
             *Shape:* ``(3, B, E)``.
         """
         # From one of two shapes: the way from a third to a triangle that collapses in one has no bounded gradient.
-        start = _frames(shapes[:, 0] if shapes.shape[1] == 2 else self.reference, self.faces)
-        own = Frames(*(x.unflatten(-2, weights.shape) for x in _frames(shapes.flatten(0, 1), self.faces)))
+        start = self.frames(shapes[:, 0] if shapes.shape[1] == 2 else self.reference)
+        own = Frames(*(x.unflatten(-2, weights.shape) for x in self.frames(shapes.flatten(0, 1))))
         turns = _turn_between(Frames(*(x[..., None, :] for x in start)), own)
         if self.clusters is None:
             signs = self.sign(turns.detach().flatten(1, 2).movedim(0, -1), own.doubled_areas.detach().flatten(0, 1))
@@ -136,8 +130,9 @@ class LocalRotations(nn.Module):
             turn = mean(self._agreeing(turns.detach(), weights.detach()) * turns, weights[..., None])
         else:
             turn = self.clusters(turns, weights[..., None])
-        stretches = ((weights[..., None] * x).sum(-2) for x in own[3:])
-        return self._edges(_turned(turn, start, *stretches), self.areas.expand(len(weights), -1))
+        xx, xy, yy = ((weights[..., None] * x).sum(-2) for x in own[3:])
+        first, second = (rotate(turn, start.world(*side)) for side in mapped(xx, xy, xy, yy))
+        return self._edges((first, second), self.areas.expand(len(weights), -1))
 
     def _agreeing(self, turns: Tensor, weights: Tensor) -> Tensor:
         """Signs for the pieces of K shapes, with which they turn the short way from each other.
@@ -149,12 +144,8 @@ class LocalRotations(nn.Module):
         products = torch.stack([zero.index_add(-1, self.piece, row) for row in rows], -1).movedim(2, 1)
         return pick(agreeing(products, weights[:, None]).mT, self.piece)
 
-    def is_beyond_a_turn(self, first: Tensor, second: Tensor) -> bool:
-        """True where parts turn by more than a full turn from each other. *Shape of each:* ``(V, 3)``."""
-        return beyond_a_turn(*self._wound(*(_frames(x[None], self.faces) for x in (first, second))))
-
-    def _wound(self, a: Frames, b: Frames) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Arguments of :class:`Clusters`."""
+    def wound(self, a: Frames, b: Frames) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Arguments of :class:`Clusters`, from one shape to another."""
         areas = (a.doubled_areas + b.doubled_areas).squeeze(0)
         return _turn_between(a, b).squeeze(1), areas, self.ancestors, self.piece
 
@@ -164,13 +155,12 @@ class LocalRotations(nn.Module):
         Axis times angle in the coordinates of the frame, which are the same in both frames, then the growth of the
         entries of the stretch. *Shape:* ``(6, B, F)``.
         """
-        turn = turn_of(self._signed(a, b))
-        turns = [(turn * axis).sum(0) for axis in (a.e1, a.e2, a.normal)]
-        return torch.stack([*turns, *(y - x for x, y in zip(a[3:], b[3:], strict=True))])
+        growth = [y - x for x, y in zip(a[3:], b[3:], strict=True)]
+        return torch.stack([*a.coordinates(2 * arc(self._signed(a, b))), *growth])
 
     def frames(self, x: Tensor) -> Frames:
         """The frames of the triangles of shapes. *Shape:* ``(B, V, 3)``."""
-        return _frames(x, self.faces)
+        return frames_of(x, self.faces)
 
     def along(self, trajectory: Trajectory, which: Tensor, t: Tensor) -> Tensor:
         """Edge vectors of shapes on trajectories, components first.
@@ -183,23 +173,19 @@ class LocalRotations(nn.Module):
         Returns:
             *Shape:* ``(3, B, E)``.
         """
-        return self._along(trajectory.rows(which), t, None)
+        return self.bent_along(Trajectory._make(part.index_select(-2, which) for part in trajectory), t)
 
-    def bent_along(self, trajectory: Trajectory, t: Tensor, bending: Tensor) -> Tensor:
-        """Edge vectors of shapes on the trajectory of one pair, whose triangles are strained and turned beforehand.
+    def bent_along(self, trajectory: Trajectory, t: Tensor, bending: Tensor | None = None) -> Tensor:
+        """Edge vectors of shapes on trajectories, whose triangles may be strained and turned beforehand.
 
         Args:
-            trajectory: Of one pair.
+            trajectory: Of one pair, or of a pair for each shape.
             t: *Shape:* ``(B,)``.
-            bending: In coordinates of the triangles (:func:`~torch_modal.geometry.triangle_frames.convected`). *Shape:*
-                ``(6, B, F)``.
+            bending: In coordinates of the triangles: axis times angle, then strain. *Shape:* ``(6, B, F)``.
 
         Returns:
             *Shape:* ``(3, B, E)``.
         """
-        return self._along(trajectory, t, bending)
-
-    def _along(self, trajectory: Trajectory, t: Tensor, bending: Tensor | None) -> Tensor:
         u = t[:, None]
         straight = u * trajectory.step
         bent = u * (1 - u) * ((1 - u) * trajectory.first - u * trajectory.last)
@@ -215,7 +201,7 @@ class LocalRotations(nn.Module):
         # At a key-frame, the intervals on both sides weigh alike: velocities of edges are continuous.
         areas = torch.lerp(doubled_areas(*trajectory.size), doubled_areas(*(trajectory.size + trajectory.step[3:])), u)
         first, second = mapped(xx, xy, xy, yy) if bending is None else stretched(bending[3:], xx, xy, yy)
-        return self._edges(Sides(placed(*first), placed(*second)), areas)
+        return self._edges((placed(*first), placed(*second)), areas)
 
     def _edges(self, wanted: Sides, areas: Tensor) -> Tensor:
         """Edge vectors that the triangles ask for, by area. *Shape:* ``(B, F) -> (3, B, E)``."""
@@ -223,20 +209,17 @@ class LocalRotations(nn.Module):
 
     def turns(self, first: Tensor, second: Tensor) -> Tensor:
         """Quaternions of triangles, whose signs tell the way round. *Shape:* ``(B, V, 3), (B, V, 3) -> (4, B, F)``."""
-        return self._signed(_frames(first, self.faces), _frames(second, self.faces))
+        return self._signed(self.frames(first), self.frames(second))
 
     def _signed(self, a: Frames, b: Frames) -> Tensor:
         """Quaternions between frames, whose signs tell the way round. *Shape:* ``(4, B, F)``."""
         quaternions = _turn_between(a, b)
         areas = (a.doubled_areas + b.doubled_areas).detach()
-        return self._sign_votes(quaternions.detach(), areas) * quaternions
+        return self.sign(quaternions.detach().movedim(0, -1), areas) * quaternions
 
     def sign(self, quaternions: Tensor, areas: Tensor) -> Tensor:
         """A sign for the quaternion of each triangle. *Shape:* ``(B, F, 4), (B, F) -> (B, F)``."""
-        return self._sign_votes(quaternions.movedim(-1, 0), areas)
-
-    def _sign_votes(self, quaternions: Tensor, areas: Tensor) -> Tensor:
-        """A sign for each quaternion. *Shape:* ``(4, B, F), (B, F) -> (B, F)``."""
+        quaternions = quaternions.movedim(-1, 0)
         signs = torch.where((quaternions * pick(quaternions, self.ancestors[0])).sum(0) < 0, -1.0, 1.0).to(areas)
         for ancestors in self.ancestors:
             signs = signs * pick(signs, ancestors)
@@ -255,14 +238,3 @@ def weights_per_length(mesh: Connectivity, references: Tensor) -> Tensor:
 def _turn_between(a: Frames, b: Frames) -> Tensor:
     """Quaternions of the rotations between the frames of triangles. *Shape:* ``(4, B, F)``."""
     return quaternion(b.e1[:, None] * a.e1 + b.e2[:, None] * a.e2 + b.normal[:, None] * a.normal)
-
-
-def _turned(turn: Tensor, own: Frames, xx: Tensor, xy: Tensor, yy: Tensor) -> Sides:
-    """Sides of triangles with another stretch in their frames, turned. *Shape:* ``(4, B, F), (B, F)``."""
-    first, second = mapped(xx, xy, xy, yy)
-    return Sides(rotate(turn, own.world(*first)), rotate(turn, own.world(*second)))
-
-
-def _frames(x: Tensor, faces: Tensor) -> Frames:
-    """Frames of a batch of shapes. *Shape:* ``(B, V, 3), (F, 3)``."""
-    return frames(sides(x.movedim(-1, 0).contiguous(), faces))

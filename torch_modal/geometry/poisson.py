@@ -55,13 +55,11 @@ class Poisson(nn.Module):
         self.n_pieces = len(fixed)
         self._made: tuple[Tensor, SparseSolver] | None = None
 
-    @property
-    def solver(self) -> SparseSolver:
-        """Inverse of the Laplacian for the current weights, which ``functional_call`` may replace."""
-        return self._solver_of(self.weights)
-
     def _solver_of(self, weights: Tensor) -> SparseSolver:
-        if self._made is None or not _equal(weights, self._made[0]):
+        """Inverse of the Laplacian for the current weights, which ``functional_call`` may replace."""
+        known = None if self._made is None else self._made[0]
+        alike = known is not None and (known.dtype, known.device) == (weights.dtype, weights.device)
+        if self._made is None or not (known is weights or (alike and torch.equal(weights, self._made[0]))):
             laplacian = graph_laplacian(self.edges.cpu().numpy(), weights.double().cpu().numpy(), len(self.piece))
             # A copy: `share_memory()`, as for spawned workers, frees what is under the view of a tensor.
             self._made = weights, SparseSolver(laplacian, self.free.cpu().numpy().copy())
@@ -79,16 +77,12 @@ class Poisson(nn.Module):
         """
         pulls = wanted * self.weights.to(wanted)
         both = torch.cat([-pulls, pulls], -1)
-        return self.placed(torch.zeros_like(near).index_add(-1, self.edges.T.flatten().to(near.device), both), near)
-
-    def placed(self, right: Tensor, near: Tensor) -> Tensor:
-        """The shape from the right-hand side of the normal equations. *Shape:* ``(3, ..., V)`` each."""
+        right = torch.zeros_like(near).index_add(-1, self.edges.T.flatten().to(near.device), both).movedim(0, -1)
         if torch.compiler.is_exporting():
-            x = solve_exported(self.edges, self.weights, self.free, right.movedim(0, -1)).movedim(-1, 0)
+            x = solve_exported(self.edges, self.weights, self.free, right).movedim(-1, 0)
         else:
             # Bound to the current weights: other weights may be in place during the backward solve.
-            solver = cache(partial(self._solver_of, self.weights))
-            x = solve_by(solver, right.movedim(0, -1)).movedim(-1, 0)
+            x = solve_by(cache(partial(self._solver_of, self.weights)), right).movedim(-1, 0)
         return x + self.centres(near - x)
 
     def centres(self, x: Tensor) -> Tensor:
@@ -124,8 +118,9 @@ class Reconstruction(nn.Module):
         self.register_buffer("faces", faces.cpu().clone(), persistent=False)
         self.register_buffer("sides", torch.tensor(mesh.sides), persistent=False)
         self.register_buffer("signs", torch.tensor(mesh.signs), persistent=False)
+        bounded = np.clip(half_cotangents(shape, mesh), *_WEIGHT_RANGE)
         #: Weights of the sides. *Shape:* ``(3F,)``.
-        self.register_buffer("weights", torch.from_numpy(_side_weights(shape, mesh)), persistent=False)
+        self.register_buffer("weights", torch.from_numpy(bounded), persistent=False)
         #: Areas of the vertices. *Shape:* ``(V,)``.
         self.register_buffer("areas", torch.from_numpy(vertex_areas(shape, mesh.faces)), persistent=False)
         weights = torch.zeros(len(mesh.edges), dtype=torch.float64).index_add(0, self.sides, self.weights)
@@ -171,15 +166,6 @@ class Reconstruction(nn.Module):
             moved = placed[..., piece] + (motion.apply(centre) - centre).movedim(-1, 0)
             out = out.index_copy(-1, piece, moved)
         return out
-
-
-def _equal(a: Tensor, b: Tensor) -> bool:
-    return a is b or (a.dtype == b.dtype and a.device == b.device and torch.equal(a, b))
-
-
-def _side_weights(shape: FloatArray, mesh: Connectivity) -> FloatArray:
-    """Half the cotangent of the angle opposite to each side, within bounds. *Shape:* ``(3F,)``."""
-    return np.clip(half_cotangents(shape, mesh), *_WEIGHT_RANGE)
 
 
 def _nearest(points: FloatArray, piece: FloatArray) -> IntArray:

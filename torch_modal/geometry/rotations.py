@@ -71,10 +71,7 @@ def quaternion(rotation: Tensor) -> Tensor:
 
 
 def power(q: Tensor, t: Tensor) -> Tensor:
-    """Rotations about unchanged axes by the fraction ``t`` of the angle, which is below a whole turn.
-
-    *Shape:* ``(4, ...), (...) -> (4, ...)``.
-    """
+    """Rotations by the fraction ``t`` of the angle, below a whole turn. *Shape:* ``(4, ...), (...) -> (4, ...)``."""
     return about(t * arc(q))
 
 
@@ -98,11 +95,6 @@ def rotate(q: Tensor, v: Tensor) -> Tensor:
 def turned(turn: Tensor, v: Tensor) -> Tensor:
     """Vectors rotated by rotation vectors. *Shape:* ``(3, ...), (3, ...) -> (3, ...)``."""
     return rotate(about(0.5 * turn), v)
-
-
-def turn_of(q: Tensor) -> Tensor:
-    """Axis times angle of a quaternion, below a whole turn. *Shape:* ``(4, ...) -> (3, ...)``."""
-    return 2 * arc(q)
 
 
 def arc(q: Tensor) -> Tensor:

@@ -49,7 +49,7 @@ class SparseSolver:
     """The inverse of a sparse symmetric positive definite matrix, in float64.
 
     Solves run on the device of the right-hand side, or on the CPU for GPUs other than the first, which ``cholespy``
-    does not support. Backward is another solve. The matrix is factorised at the first use, and again after pickling.
+    does not support. The matrix is factorised at the first use, and again after pickling.
 
     Args:
         matrix: *Shape:* ``(V, V)``.
@@ -67,19 +67,11 @@ class SparseSolver:
         return {**self.__dict__, "_solves": {}}
 
     def __call__(self, right: Tensor) -> Tensor:
-        """Solve for right-hand sides in columns. *Shape:* ``(..., V, m) -> (..., V, m)``.
+        """Solve for right-hand sides in columns, without gradient. *Shape:* ``(..., V, m) -> (..., V, m)``.
 
         Raises:
             ValueError: The matrix is not positive definite.
         """
-        return solve_by(lambda: self, right)
-
-    def solve(self, right: FloatArray) -> FloatArray:
-        """Solve for an array. *Shape:* ``(V, m) -> (V, m)``."""
-        return self.solved(torch.from_numpy(right)).numpy()
-
-    def solved(self, right: Tensor) -> Tensor:
-        """Solve without gradient."""
         if right.is_meta:
             return torch.empty_like(right)
         device = right.device if _is_served(right.device) else torch.device("cpu")
@@ -145,9 +137,9 @@ def _cholesky(matrix: sparse.csr_matrix, device: torch.device) -> Solve:
 
 
 def solve_by(solver: Callable[[], SparseSolver], right: Tensor) -> Tensor:
-    """Solve with a lazily created solver: inside ``torch.func`` transforms, tensors cannot be read earlier.
+    """Solve with gradients, which are solves, too. *Shape:* ``(..., V, m) -> (..., V, m)``.
 
-    *Shape:* ``(..., V, m) -> (..., V, m)``.
+    The solver is made lazily: inside ``torch.func`` transforms, tensors cannot be read earlier.
     """
     if torch.compiler.is_compiling():  # do not trace into SciPy
         return torch.compiler.disable(_Solve.apply)(solver, right)
@@ -157,7 +149,7 @@ def solve_by(solver: Callable[[], SparseSolver], right: Tensor) -> Tensor:
 class _Solve(torch.autograd.Function):
     @staticmethod
     def forward(solver: Callable[[], SparseSolver], right: Tensor) -> Tensor:
-        return solver().solved(right)
+        return solver()(right)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
@@ -204,7 +196,7 @@ def solve_exported(edges: Tensor, weights: Tensor, free: Tensor, right: Tensor) 
         return SparseSolver(graph_laplacian(given[0], given[1], right.shape[-2]), given[2].copy())
 
     solver: SparseSolver = _EXPORTED.get(tuple(x.tobytes() for x in given), make)
-    return solver.solved(right)
+    return solver(right)
 
 
 @solve_exported.register_fake

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torch_modal.geometry.rotations import SMALL, product, turn_of, turned
+from torch_modal.geometry.rotations import SMALL, arc, product, turned
 from torch_modal.geometry.vectors import cross, inverse, norm, pick, tiny
 
 # Smallest area relative to the squared sides; below, the normal is rounding, and divisions amplify noise.
@@ -18,13 +18,8 @@ FLAT = 1e-6
 HEIGHT = 0.75**0.5
 
 
-class Sides(NamedTuple):
-    """Two sides of each triangle, from its first corner to the others; the third is their difference."""
-
-    first: Tensor
-    """*Shape:* ``(3, B, F)``."""
-    second: Tensor
-    """*Shape:* ``(3, B, F)``."""
+Sides = tuple[Tensor, Tensor]
+"""Two sides of each triangle, from its first corner to the others. *Shape of each:* ``(3, B, F)``."""
 
 
 class Frames(NamedTuple):
@@ -50,6 +45,10 @@ class Frames(NamedTuple):
         """The vector with coordinates in the plane. *Shape:* ``(B, F), (B, F) -> (3, B, F)``."""
         return x * self.e1 + y * self.e2
 
+    def coordinates(self, v: Tensor) -> Tensor:
+        """Coordinates of vectors in the frames. *Shape:* ``(3, B, F) -> (3, B, F)``."""
+        return torch.stack([_dot(v, axis) for axis in self[:3]])
+
     @property
     def size(self) -> Tensor:
         """Mean stretch: the side of an equilateral triangle. *Shape:* ``(B, F)``."""
@@ -67,24 +66,16 @@ class Frames(NamedTuple):
         return self.doubled_areas / torch.stack([x * x + y * y for x, y in ((a, b), (c, d), (c - a, d - b))]).amax(0)
 
 
-class BentTriangles(NamedTuple):
-    """Infinitesimal rotation and strain of each triangle."""
-
-    turn: Tensor
-    """Axis times angle, in the coordinates of the shape. *Shape:* ``(3, B, F)``."""
-    strain: tuple[Tensor, Tensor, Tensor]
-    """Entries ``xx, xy, yy`` of the symmetric gradient in the triangle's frame. *Shape of each:* ``(B, F)``."""
-
-
 def sides(x: Tensor, faces: Tensor) -> Sides:
     """Sides of all triangles. *Shape:* ``(3, B, V), (F, 3)``."""
     origin, first, second = (pick(x, corner) for corner in faces.unbind(1))
-    return Sides(first - origin, second - origin)
+    return first - origin, second - origin
 
 
 def frames(given: Sides) -> Frames:
     """The frame of each triangle; the normal of one without area is arbitrary and a constant, all is finite."""
-    one, other = given.first, (given.second - 0.5 * given.first) / HEIGHT  # the images of orthonormal axes
+    first, second = given
+    one, other = first, (second - 0.5 * first) / HEIGHT  # the images of orthonormal axes
     xx, xy, yy = _dot(one, one), _dot(one, other), _dot(other, other)
     point, total = xx + yy <= tiny(one), (xx + yy).clamp_min(tiny(one))
     up = cross(one, other) / total
@@ -96,6 +87,11 @@ def frames(given: Sides) -> Frames:
     per = inverse(root, point)
     e1, e2 = per * (one + cross(other, normal)), per * (other + cross(normal, one))
     return Frames(e1, e2, normal, (xx + lift) / root, xy / root, (yy + lift) / root)
+
+
+def frames_of(shapes: Tensor, faces: Tensor) -> Frames:
+    """The frame of each triangle of shapes. *Shape:* ``(B, V, 3), (F, 3)``."""
+    return frames(sides(shapes.movedim(-1, 0).contiguous(), faces))
 
 
 def doubled_areas(xx: Tensor, xy: Tensor, yy: Tensor) -> Tensor:
@@ -128,30 +124,26 @@ def edge_means(wanted: Sides, weights: Tensor, edges: Tensor, signs: Tensor, n_e
     return summed / total.clamp_min(torch.finfo(total.dtype).tiny)
 
 
-def bend(displaced: Sides, reference: Frames) -> BentTriangles:
+def bend(displaced: Sides, reference: Frames) -> tuple[Tensor, Tensor]:
     """Infinitesimal rotation and strain of a displacement field (Kirchhoff-Love kinematics).
 
     Args:
         displaced: Sides of the displacement field.
         reference: Frames of the undeformed shape; a batch of one is broadcast.
+
+    Returns:
+        Axis times angle, in the coordinates of the shape; entries ``xx, xy, yy`` of the symmetric gradient in the
+        triangle's frame. *Shape of each:* ``(3, B, F)``.
     """
-    axes = (reference.e1, reference.e2, reference.normal)
+    axes = reference[:3]
     first, second = displaced
     one, other = first, (second - 0.5 * first) / HEIGHT
     xx, xy, yy = _inverse(reference)
     x_x, y_x, n_x = (_dot(xx * one + xy * other, axis) for axis in axes)
     x_y, y_y, n_y = (_dot(xy * one + yy * other, axis) for axis in axes)
     spin = 0.5 * (y_x - x_y)
-    return BentTriangles(n_y * axes[0] - n_x * axes[1] + spin * axes[2], (x_x, 0.5 * (x_y + y_x), y_y))
-
-
-def convected(bending: BentTriangles, own: Frames) -> Tensor:
-    """Rotation vector and strain in the frames of the triangles.
-
-    *Shape:* ``(6, B, F)``.
-    """
-    turn = [_dot(bending.turn, axis) for axis in (own.e1, own.e2, own.normal)]
-    return torch.stack([*turn, *bending.strain])
+    turn = n_y * axes[0] - n_x * axes[1] + spin * axes[2]
+    return turn, torch.stack([x_x, 0.5 * (x_y + y_x), y_y])
 
 
 def stretched(
@@ -161,20 +153,21 @@ def stretched(
     return mapped(*_product(_exponential(*strain), (xx, xy, yy)))
 
 
-def bent_sides(bending: BentTriangles, own: Frames) -> Sides:
+def bent_sides(turn: Tensor, strain: Tensor, own: Frames) -> Sides:
     """Sides after a bend: stretched in their plane, then turned by the finite rotation of the same axis and angle.
 
     The stretch is the exponential of the strain: shear keeps the area, and no triangle inverts.
 
     Args:
-        bending: Rotations in the coordinates of ``own``.
+        turn: Axis times angle, in the coordinates of the shape. *Shape:* ``(3, B, F)``.
+        strain: Its entries ``xx, xy, yy`` in the frames. *Shape:* ``(3, B, F)``.
         own: Frames of the undeformed shape.
     """
-    first, second = stretched(torch.stack(bending.strain), *own[3:])
-    return Sides(turned(bending.turn, own.world(*first)), turned(bending.turn, own.world(*second)))
+    first, second = stretched(strain, *own[3:])
+    return turned(turn, own.world(*first)), turned(turn, own.world(*second))
 
 
-def bending_between(own: Frames, other: Frames, turns: Tensor) -> BentTriangles:
+def bending_between(own: Frames, other: Frames, turns: Tensor) -> tuple[Tensor, Tensor]:
     """Rotation and strain from one shape to another: :func:`bent_sides` of it are the sides of the other.
 
     Args:
@@ -182,10 +175,10 @@ def bending_between(own: Frames, other: Frames, turns: Tensor) -> BentTriangles:
         other: Frames of the other.
         turns: Quaternions from the first frames to the others; their signs tell the way round. *Shape:* ``(4, B, F)``.
     """
-    polar = _polar(own, other)
-    half = 0.5 * torch.atan2(polar.sin, polar.cos)
-    turn = turn_of(product(turns, torch.cat([half.cos()[None], half.sin() * own.normal])))
-    return BentTriangles(turn, _logarithm(polar.xx, polar.xy, polar.yy))
+    cos, sin, *stretch = _polar(own, other)
+    half = 0.5 * torch.atan2(sin, cos)
+    turn = 2 * arc(product(turns, torch.cat([half.cos()[None], half.sin() * own.normal])))
+    return turn, torch.stack(_logarithm(*stretch))
 
 
 def mirrored_sides(centre: Frames, other: Frames) -> Sides:
@@ -200,11 +193,11 @@ def mirrored_sides(centre: Frames, other: Frames) -> Sides:
     g_xx, g_xy, g_yy = i_xx**2 + i_xy**2, i_xy * (i_xx + i_yy), i_xy**2 + i_yy**2
 
     def turned_back(x: Tensor, y: Tensor) -> Tensor:
-        v = centre.world(x, y)
-        p, q, r = (_dot(v, axis) for axis in (other.e1, other.e2, other.normal))
+        p, q, r = other.coordinates(centre.world(x, y))
         return centre.world(cos * p + sin * q, cos * q - sin * p) + r * centre.normal
 
-    return Sides(*(turned_back(*side) for side in mapped(*_product((g_xx, g_xy, g_yy), centre[3:]))))
+    first, second = mapped(*_product((g_xx, g_xy, g_yy), centre[3:]))
+    return turned_back(*first), turned_back(*second)
 
 
 def _dot(a: Tensor, b: Tensor) -> Tensor:
@@ -212,21 +205,12 @@ def _dot(a: Tensor, b: Tensor) -> Tensor:
     return (a * b).sum(0)
 
 
-class _Polar(NamedTuple):
-    """The map of a triangle's plane to another's, as a rotation after a stretch. *Shape of each:* ``(B, F)``."""
-
-    cos: Tensor
-    sin: Tensor
-    xx: Tensor
-    xy: Tensor
-    yy: Tensor
-
-
-def _polar(own: Frames, other: Frames) -> _Polar:
+def _polar(own: Frames, other: Frames) -> tuple[Tensor, ...]:
+    """The map of a triangle's plane to another's: cosine and sine of a rotation after a stretch, by entries."""
     xx, xy, yx, yy = _product(other[3:], _inverse(own))
     trace = torch.hypot(xx + yy, yx - xy)  # of the stretch; never 0, as both determinants are above 0
     cos, sin = (xx + yy) / trace, (yx - xy) / trace
-    return _Polar(cos, sin, cos * xx + sin * yx, cos * xy + sin * yy, cos * yy - sin * xy)
+    return cos, sin, cos * xx + sin * yx, cos * xy + sin * yy, cos * yy - sin * xy
 
 
 def _inverse(own: Frames) -> tuple[Tensor, Tensor, Tensor]:

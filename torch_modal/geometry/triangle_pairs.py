@@ -42,10 +42,7 @@ def triangles_cross(one: FloatArray, other: FloatArray) -> BoolArray:
 
 
 def pierce_nearly(edges_of: FloatArray, through: FloatArray) -> BoolArray:
-    """True where an edge of a triangle intersects another one within the margin.
-
-    *Shape:* ``(n, 3, 3), (n, 3, 3) -> (n,)``.
-    """
+    """True where an edge of a triangle meets another within the margin. *Shape:* ``(n, 3, 3), (n, 3, 3) -> (n,)``."""
     first = through[:, 0]
     normal = cross(through[:, 1] - first, through[:, 2] - first)
     height = dot(edges_of - first[:, None], normal[:, None])

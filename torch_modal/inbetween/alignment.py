@@ -54,7 +54,8 @@ class KeyframeAlignment(nn.Module):
         super().__init__()
         faces = torch.tensor(mesh.faces)
         scale = torch.tensor(canonical_scale(references.numpy(), mesh.faces), dtype=references.dtype)
-        weights = mean_areas(references, faces)
+        areas = torch.stack([torch.from_numpy(vertex_areas(x.numpy(), mesh.faces)) for x in references])
+        weights = (areas / areas.sum(1, keepdim=True)).mean(0)
         centred = references - centroid(references, weights)[:, None]
         self.register_buffer("scale", scale, persistent=False)
         #: Of the vertices, adding up to one. *Shape:* ``(V,)``.
@@ -176,9 +177,3 @@ class KeyframeAlignment(nn.Module):
             MeshWarning,
             stacklevel=2,
         )
-
-
-def mean_areas(shapes: Tensor, faces: Tensor) -> Tensor:
-    """Vertex areas as parts of the whole, averaged over shapes. *Shape:* ``(K, V, 3), (F, 3) -> (V,)``."""
-    areas = torch.stack([torch.from_numpy(vertex_areas(x.numpy(), faces.numpy())) for x in shapes])
-    return (areas / areas.sum(1, keepdim=True)).mean(0)

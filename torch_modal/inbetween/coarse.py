@@ -11,7 +11,7 @@ from torch_modal.energy.energy import Energy
 from torch_modal.energy.stretch import Stretch
 from torch_modal.energy.term import Mesh
 from torch_modal.geometry.inspect import is_flat
-from torch_modal.precompute.coarsening import Coarsening, Collapses, coarsen
+from torch_modal.modes.coarsening import Coarsening, coarsen
 
 ENOUGH_FACES = 1000
 """Up to so many are tried; coarse meshes of more are not checked."""
@@ -68,33 +68,19 @@ class CoarseMesh(nn.Module):
         return means.reshape(*x.shape[:-2], self.n_vertices, 3)
 
 
-def resolving(
-    shapes: Tensor,
-    faces: Tensor,
-    n_faces: int,
-    modes: Sequence[Tensor],
-) -> Coarsening:
+def resolving(shapes: Tensor, faces: Tensor, n_faces: int, modes: Sequence[Tensor]) -> Coarsening:
     """A coarse mesh of so many faces, or of more, where those do not resolve the modes.
 
     A flat shape does not tell where the other one bends: the collapses are then those of the other, and there are
     ``ENOUGH_FACES`` or more.
 
-    Args:
-        shapes: Float64 on the CPU. *Shape:* ``(K, V, 3)``.
-        faces: Vertex indices. *Shape:* ``(F, 3)``.
-        n_faces: How many are wanted.
-        modes: Of the shapes, in their axes. *Shape of each:* ``(k, V, 3)``.
+    Arguments as for :class:`CoarseMesh`.
     """
     enough = min(ENOUGH_FACES, len(faces))
     flat = [is_flat(x[faces.unique()].numpy()) for x in shapes]
-    given = Collapses(faces.numpy()).of(range(len(shapes)), shapes.numpy())
-    curved = flat.index(False) if False in flat else 0
+    curved = [i for i, one in enumerate(flat) if not one] or [0]
     n_faces = max(n_faces, enough) if any(flat) else n_faces
-
-    def collapses(keyframe: int, n: int) -> Coarsening:
-        return given(curved if flat[keyframe] else keyframe, n)
-
-    found = coarsen(shapes.numpy(), faces.numpy(), n_faces, collapses)
+    found = coarsen(shapes.numpy(), faces.numpy(), n_faces, curved)
     if n_faces >= enough:
         return found
     whole, ends = Mesh.of(faces, shapes.shape[1]), [(x, y) for x, y in zip(shapes, modes, strict=False) if len(y)]
@@ -106,7 +92,7 @@ def resolving(
         if all(spread(own, stretching(mesh, x, moves)) <= MOST_SPREAD for own, (x, moves) in pairs):
             break
         n_faces = min(round(MORE * n_faces), ENOUGH_FACES)
-        found = coarsen(shapes.numpy(), faces.numpy(), n_faces, collapses)
+        found = coarsen(shapes.numpy(), faces.numpy(), n_faces, curved)
     return found
 
 

@@ -61,17 +61,9 @@ def no_worse(
 def blended(
     x: Tensor, starts: Sequence[Tensor], distortion: Tensor, slight: Tensor, slack: float = SLACK
 ) -> tuple[Tensor, Tensor]:
-    """Shapes, blended into their starts by their distortions.
+    """Shapes, blended into their starts by the distortions of all, and where a start has replaced one.
 
-    Args:
-        x: *Shape:* ``(B, V, 3)``.
-        starts: *Shape of each:* ``(B, V, 3)``.
-        distortion: Of ``x`` and of the starts. *Shape:* ``(1 + S, B)``.
-        slight: Added to those of the starts. *Shape:* ``(B,)``.
-        slack: As for :func:`no_worse`.
-
-    Returns:
-        The shapes, *shape* ``(B, V, 3)``; where a start has replaced one, *shape* ``(B,)``, bool.
+    *Shape:* ``(B, V, 3), (1 + S, B), (B,) -> (B, V, 3), (B,)``.
     """
     own, *others = distortion
     replaced = torch.zeros_like(own, dtype=torch.bool)

@@ -9,8 +9,8 @@ from torch import Tensor, nn
 from torch_modal.energy.energy import RestShapes
 from torch_modal.energy.modal_energy import Derivatives, Placement
 from torch_modal.inbetween.joint import JointSpace
-from torch_modal.solve.gauss_newton import AmplitudeEnergy, GaussNewtonStep, gradient_floor
-from torch_modal.solve.minimise import Solution, Status
+from torch_modal.solve.gauss_newton import GaussNewtonStep
+from torch_modal.solve.minimise import AmplitudeEnergy, Solution, Status
 
 
 class PairedPlacement(NamedTuple):
@@ -148,7 +148,7 @@ def newton(
     found, value = energy.derivatives(a, placement, second_order=False), energy.value(a, placement)
     norm = found.gradient.norm(dim=-1)
     start = norm if start is None else start
-    small = norm <= torch.maximum(tolerance * start, gradient_floor(found))
+    small = norm <= torch.maximum(tolerance * start, found.floor)
     status = torch.where(small, Status.CONVERGED, torch.where(moving, Status.OUT_OF_STEPS, Status.STALLED))
     status = torch.where(norm.isfinite() & value.isfinite(), status, Status.INVALID)
     return Solution(a, value, norm / start.clamp_min(torch.finfo(start.dtype).tiny), n_steps, status)

@@ -2,12 +2,14 @@
 
 import warnings
 from collections.abc import Iterable, Iterator
+from functools import partial
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from torch_modal.autograd import traced, transformed
+from torch_modal.autograd import made_outside, traced, transformed
+from torch_modal.inbetween.settings import Solver
 from torch_modal.solve.implicit import ConvergenceWarning
 from torch_modal.solve.minimise import Solution, Status
 
@@ -67,48 +69,37 @@ def unminimised(x: Tensor, usable: Tensor) -> Solution:
     return Solution(number.new_zeros(len(x), 0), number, number.clone(), torch.zeros_like(status), status)
 
 
-def report(solution: Solution, max_steps: int, forbid: bool) -> None:
-    """Warn about samples that did not converge.
-
-    Args:
-        solution: One value per sample.
-        max_steps: The limit of the solver.
-        forbid: True to raise.
+def report(solution: Solution, solver: Solver) -> None:
+    """Warn about samples that did not converge, and about those that are what they started from.
 
     Raises:
-        ConvergenceError: Something did not converge, and that is an error.
+        ConvergenceError: Something did not converge where gradients are recorded, and that is an error.
     """
-    missed = ~solution.usable
-    if not bool(missed.any()):
-        return
-    counts = {status.name: int((solution.status == status).sum()) for status in Status if status}
-    counts.pop(Status.FELL_BACK.name)
-    message = (
-        f"{int(missed.sum())} of {missed.numel()} in-betweens did not converge in {max_steps} steps "
-        f"({', '.join(f'{n} {name}' for name, n in counts.items() if n)}): no gradient flows through their amplitudes; "
-        "solve() tells which"
-    )
-    if forbid:
-        raise ConvergenceError(message)
-    warnings.warn(message, ConvergenceWarning, stacklevel=2)
+    if not traced(solution.status) and solver.gradient == "implicit":
+        forbid = solver.unconverged == "raise" and torch.is_grad_enabled()
+        made_outside(partial(_report, max_steps=solver.max_steps, forbid=forbid), solution.status)
 
 
-def warn_of_starts(solution: Solution) -> None:
-    """Warn about shapes that are the ones that they started from.
-
-    Args:
-        solution: One value per sample.
-    """
-    fell = solution.status == Status.FELL_BACK
-    if traced(fell) or transformed(fell) or not bool(fell.any()):
-        return
-    warnings.warn(
-        f"{int(fell.sum())} of {fell.numel()} in-betweens came out worse than what they started from, the blend by "
-        "local rotations or linear interpolation, which is returned in their place (status FELL_BACK); more coarse "
-        "faces or local steps may help: Objective(coarse_faces=...), Solver(local_steps=...)",
-        ConvergenceWarning,
-        stacklevel=2,
-    )
+def _report(status: Tensor, max_steps: int, forbid: bool) -> None:
+    counts = {kind.name: int((status == kind).sum()) for kind in Status if kind}
+    fell, missed = counts.pop(Status.FELL_BACK.name), sum(counts.values())
+    if missed:
+        message = (
+            f"{missed} of {status.numel()} in-betweens did not converge in {max_steps} steps "
+            f"({', '.join(f'{n} {name}' for name, n in counts.items() if n)}): no gradient flows through their "
+            "amplitudes; solve() tells which"
+        )
+        if forbid:
+            raise ConvergenceError(message)
+        warnings.warn(message, ConvergenceWarning, stacklevel=2)
+    if fell:
+        warnings.warn(
+            f"{fell} of {status.numel()} in-betweens came out worse than what they started from, the blend by local "
+            "rotations or linear interpolation, which is returned in their place (status FELL_BACK); more coarse faces "
+            "or local steps may help: Objective(coarse_faces=...), Solver(local_steps=...)",
+            ConvergenceWarning,
+            stacklevel=2,
+        )
 
 
 def with_exact_keyframes(shapes: Tensor, keyframes: Tensor, weights: Tensor) -> Tensor:

@@ -19,10 +19,10 @@ from torch_modal.inbetween.comparison import SLACK, no_worse
 from torch_modal.inbetween.joint import JointSpace
 from torch_modal.inbetween.paired import PairedSpace, newton
 from torch_modal.inbetween.regions import LocalInterpolation, worst_regions
-from torch_modal.inbetween.results import InBetweenResult, Samples, unminimised, warn_of_starts
+from torch_modal.inbetween.results import InBetweenResult, Samples, unminimised
 from torch_modal.inbetween.settings import Objective, Solver
 from torch_modal.inbetween.subspace import elastic_subspace
-from torch_modal.solve.implicit import Report, solve_implicit, solve_unrolled
+from torch_modal.solve.implicit import solve_implicit, solve_unrolled
 from torch_modal.solve.minimise import Solution, Status
 
 # Products with the Hessian in each local step, and in each step of the polish: with two local steps, what closes 97 %
@@ -83,12 +83,11 @@ class InBetweenSolver(nn.Module):
         first, second = (JointSpace(*given, elastic_subspace([own], alignment, coarse)) for own in turned)
         return PairedSpace(first, second, alignment.weights > 0)
 
-    def forward(self, samples: Samples, report: Report | None) -> InBetweenResult:
+    def forward(self, samples: Samples) -> InBetweenResult:
         """Solve.
 
         Args:
             samples: The batch.
-            report: Receives the solution.
         """
         weights = samples.weights
         shapes, pose, usable = self.alignment(samples.keyframes, weights)
@@ -98,7 +97,7 @@ class InBetweenSolver(nn.Module):
         rests = RestShapes(shapes, weights, samples.stiffness, anchors)
         straight = torch.bmm(weights[:, None], shapes.flatten(2)).view_as(shapes[:, 0])
         base = straight if self.blend is None else self.blend(shapes, weights, straight)
-        solution = self.minimised(base, rests, samples.mu, usable, report)
+        solution = self.minimised(base, rests, samples.mu, usable)
         if self.blend is None:
             return self.paired(straight, rests, solution, pose)
         x = base if self.space is None else self.space.lift(solution.amplitudes, base)
@@ -107,8 +106,6 @@ class InBetweenSolver(nn.Module):
         compared = rests._replace(weights=weights.clamp_min(0))
         x, solution = no_worse(x, [base, straight], solution, self.distortion, compared, SLACK)
         x, solution = self.finished(x, solution, rests)
-        if report is not None:
-            warn_of_starts(solution)
         valid = (solution.status != Status.INVALID)[:, None, None]
         return InBetweenResult(torch.where(valid, self.alignment.restore(x, pose), torch.nan), solution)
 
@@ -131,7 +128,7 @@ class InBetweenSolver(nn.Module):
         each = [energy.against(energy.rest_of(shape.detach()), rests.stiffness) for shape in rests.shapes.unbind(1)]
         return (energy.value(rows, each[0]) + energy.value(rows, each[1])).detach() / 2
 
-    def minimised(self, base: Tensor, rests: RestShapes, mu: Tensor, usable: Tensor, report: Report | None) -> Solution:
+    def minimised(self, base: Tensor, rests: RestShapes, mu: Tensor, usable: Tensor) -> Solution:
         """Amplitudes of least energy in the modal space. *Shape:* of ``mu`` and ``usable`` ``(B,)``."""
         if self.space is None:
             return unminimised(base, usable)
@@ -140,7 +137,7 @@ class InBetweenSolver(nn.Module):
             solve = partial(solve_implicit, method=newton)
         placement = self.space.place(base, rests, mu)
         limits = self.solver.max_steps, self.solver.tolerance
-        solution = solve(self.space, placement, usable, *limits, report)
+        solution = solve(self.space, placement, usable, *limits)
         # Kernels compute in float64, whatever goes in and comes out.
         values = (value.to(base) if value.is_floating_point() else value for value in solution if value is not None)
         return Solution(*values)

@@ -53,7 +53,9 @@ def elastic_subspace(modes: Sequence[Tensor], alignment: KeyframeAlignment, coar
     """
     fine = torch.cat(list(modes))
     most = sum(sorted(len(own) for own in modes)[-2:])
-    rigid = _rigid_fields(alignment.references.mean(0))
+    x = alignment.references.mean(0)
+    axes = torch.eye(3).to(x)[:, None].expand(3, *x.shape)
+    rigid = torch.cat([axes, torch.linalg.cross(axes, x.expand(3, *x.shape))])
     rigid_coarse = coarse.restrict(rigid)
     mix = _orthonormal(rigid_coarse, coarse.weights)
     rigid, rigid_coarse = _mixed(mix, rigid), _mixed(mix, rigid_coarse)
@@ -71,19 +73,10 @@ def _mixed(mix: Tensor, fields: Tensor) -> Tensor:
 
 
 def _orthonormal(fields: Tensor, weights: Tensor, most: int | None = None) -> Tensor:
-    """Combinations that are orthonormal; dependent ones are dropped. *Shape:* ``(m, V, 3), (V,) -> (n, m)``.
+    """Combinations that are orthonormal, at most so many: those that the fields have most in common.
 
-    Args:
-        fields: *Shape:* ``(m, V, 3)``.
-        weights: Of the vertices. *Shape:* ``(V,)``.
-        most: Number of combinations at most: those that the fields have most in common.
+    Dependent ones are dropped. *Shape:* ``(m, V, 3), (V,) -> (n, m)``.
     """
     values, vectors = torch.linalg.eigh((fields * weights[:, None]).flatten(1) @ fields.flatten(1).mT)
     keep = values > DEPENDENT * values.amax().clamp_min(torch.finfo(values.dtype).tiny)
     return (vectors[:, keep] / values[keep].sqrt()).mT[-most if most else None :]
-
-
-def _rigid_fields(x: Tensor) -> Tensor:
-    """Translations and infinitesimal rotations of a shape. *Shape:* ``(V, 3) -> (6, V, 3)``."""
-    axes = torch.eye(3, dtype=x.dtype, device=x.device)[:, None].expand(3, *x.shape)
-    return torch.cat([axes, torch.linalg.cross(axes, x.expand(3, *x.shape))])

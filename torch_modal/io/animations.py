@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from torch_modal.io.asset import CLAY, Polygons
+from torch_modal.io.asset import CLAY
 from torch_modal.io.formats import ANIMATION_FORMATS, Animation, resample
 
 
@@ -45,7 +45,8 @@ def write_usd(animation: Animation, path: Path) -> None:
     shapes, faces, timing, asset = animation.shapes, animation.faces, animation.timing, animation.asset
     if asset is not None:
         asset.warn_lost(animation.name, ANIMATION_FORMATS[".usd"].holds)
-    polygons = Polygons(np.full(len(faces), 3), faces.reshape(-1)) if asset is None else asset.polygons()
+    triangles = np.full(len(faces), 3), faces.reshape(-1), None
+    sizes, corners, texcoords = triangles if asset is None else asset.polygons()
     times, shown = timing.knots()
     codes = times * timing.fps
     stage: Any = Usd.Stage.CreateNew(str(path))
@@ -58,8 +59,8 @@ def write_usd(animation: Animation, path: Path) -> None:
     stage.SetDefaultPrim(root.GetPrim())
     mesh = UsdGeom.Mesh.Define(stage, "/sequence/mesh")
     mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
-    mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(polygons.sizes.astype(np.int32)))
-    mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(polygons.corners.astype(np.int32)))
+    mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(sizes.astype(np.int32)))
+    mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(corners.astype(np.int32)))
     single = shapes.astype(np.float32)
     points, extent = mesh.CreatePointsAttr(), mesh.CreateExtentAttr()
     for code, number in zip(codes.tolist(), shown.tolist(), strict=True):
@@ -68,10 +69,10 @@ def write_usd(animation: Animation, path: Path) -> None:
         bounds = np.stack([single[number].min(axis=0), single[number].max(axis=0)])
         extent.Set(Vt.Vec3fArray.FromNumpy(bounds), at)
     primvars = UsdGeom.PrimvarsAPI(mesh)
-    if polygons.texcoords is not None:
+    if texcoords is not None:
         kind = Sdf.ValueTypeNames.TexCoord2fArray
         st = primvars.CreatePrimvar("st", kind, UsdGeom.Tokens.faceVarying)
-        st.Set(Vt.Vec2fArray.FromNumpy(polygons.texcoords.astype(np.float32)))
+        st.Set(Vt.Vec2fArray.FromNumpy(texcoords.astype(np.float32)))
     colors = None
     if asset is not None and "colors" in asset.carries:
         colors = np.ones((shapes.shape[1], 3), np.float32)

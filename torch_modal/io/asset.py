@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import io
-import os
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Collection
-from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.errors import MeshWarning
-from torch_modal.io.files import write_files
-from torch_modal.io.write import check_frames, refuse_existing, to_numpy
 
 FEATURES = ("polygons", "texcoords", "normals", "colors", "materials", "groups", "properties", "posing")
 """Content of mesh files besides positions and triangles."""
@@ -24,27 +20,18 @@ CLAY = (0.66, 0.52, 0.42, 1.0)
 """Linear RGBA of surfaces without a colour."""
 
 
-class Image(NamedTuple):
-    """A picture file."""
-
-    data: bytes
-    mime: str
-    """``image/png`` or ``image/jpeg``."""
-
-
-def as_image(data: bytes) -> Image | None:
-    """PNG and JPEG as they are, other pictures as PNG, or None."""
-    for start, mime in ((b"\x89PNG", "image/png"), (b"\xff\xd8", "image/jpeg")):
-        if data.startswith(start):
-            return Image(data, mime)
-    from PIL import Image as pillow
+def as_png_or_jpeg(data: bytes) -> bytes | None:
+    """PNG and JPEG files as they are, other pictures as PNG, or None."""
+    if data.startswith((b"\x89PNG", b"\xff\xd8")):
+        return data
+    from PIL import Image
 
     stream = io.BytesIO()
     try:
-        pillow.open(io.BytesIO(data)).save(stream, format="PNG")
+        Image.open(io.BytesIO(data)).save(stream, format="PNG")
     except OSError:
         return None
-    return Image(stream.getvalue(), "image/png")
+    return stream.getvalue()
 
 
 def linear(colors: FloatArray) -> FloatArray:
@@ -64,7 +51,8 @@ class Material(NamedTuple):
     """Linear RGBA; multiplies the texture and the vertex colours."""
     metallic: float = 0.0
     roughness: float = 0.85
-    texture: Image | None = None
+    texture: bytes | None = None
+    """A PNG or JPEG file."""
 
 
 class Part(NamedTuple):
@@ -83,23 +71,8 @@ class Part(NamedTuple):
     """Those of the file. *Shape:* ``(P, 3)``."""
 
 
-class Polygons(NamedTuple):
-    """Faces before triangulation."""
-
-    sizes: IntArray
-    """Corners of each. *Shape:* ``(P,)``."""
-    corners: IntArray
-    """Vertices, one polygon after the other. *Shape:* ``(sum of sizes,)``."""
-    texcoords: FloatArray | None = None
-    """Texture coordinates of the corners, origin at the lower left. *Shape:* ``(sum of sizes, 2)``."""
-
-
 class Asset(ABC):
-    """A mesh file: positions and triangles for the solve, the rest for writing it with other positions.
-
-    Args:
-        path: The file.
-    """
+    """A mesh file: positions and triangles for the solve, the rest for writing it with other positions."""
 
     positions: FloatArray
     """In the file's units, transforms of a scene applied. *Shape:* ``(V, 3)``."""
@@ -111,7 +84,7 @@ class Asset(ABC):
     """Features that :meth:`with_positions` keeps."""
 
     suffix: str
-    """Ending of the files that :meth:`write` makes: ``".obj"``, ``".ply"``, ``".off"`` or ``".glb"``."""
+    """Ending of such a file, ``".obj"``, ``".ply"``, ``".off"`` or ``".glb"``; it is GLB of a GLTF file."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -119,63 +92,25 @@ class Asset(ABC):
 
     @abstractmethod
     def with_positions(self, positions: FloatArray) -> bytes:
-        """The file with other positions. Its normals rotate with the surface; everything else stays.
+        """The file with other positions ``(V, 3)``. Its normals rotate with the surface; everything else stays."""
 
-        Args:
-            positions: *Shape:* ``(V, 3)``.
-        """
-
-    @abstractmethod
     def parts(self) -> list[Part]:
         """The surface with its materials, for other formats."""
+        return [Part(np.arange(len(self.positions)), self.faces, Material())]
 
-    def polygons(self) -> Polygons:
-        """The faces for formats that hold polygons; triangles where the file's are not known."""
-        return Polygons(np.full(len(self.faces), 3), self.faces.reshape(-1))
+    def polygons(self) -> tuple[IntArray, IntArray, FloatArray | None]:
+        """The faces for formats that hold polygons; triangles where the file's are not known.
 
-    @cached_property
+        Returns:
+            Number of corners of each; vertices of the corners, one polygon after the other; their texture coordinates,
+            origin at the lower left, where all have them. *Shape:* ``(P,), (n,), (n, 2)``.
+        """
+        return np.full(len(self.faces), 3), self.faces.reshape(-1), None
+
+    @property
     def companions(self) -> dict[str, bytes]:
         """Files that must lie beside a copy, by their names there: material libraries, textures."""
         return {}
-
-    def write(self, path: str | os.PathLike[str], positions: Any, overwrite: bool = False) -> Path:
-        """Write the file with other positions, and its material libraries and textures beside it.
-
-        Args:
-            path: Of the file's own suffix; ``.glb`` for ``.gltf``.
-            positions: A tensor or array. *Shape:* ``(V, 3)``.
-            overwrite: Replace files that exist. Files of equal content need no overwriting.
-
-        Returns:
-            The file.
-
-        Raises:
-            ValueError: The positions or the ending do not fit.
-            FileExistsError: A file exists and ``overwrite`` is off; then none is written.
-        """
-        path = Path(path)
-        if path.suffix.lower() != self.suffix:
-            raise ValueError(f"{self.path.name} is written as {self.suffix}, got {path.name!r}.")
-        shapes, _ = check_frames(to_numpy(positions)[None], self.faces, "positions[None]")
-        self.check(shapes)
-        refuse_existing(path, overwrite)
-        write_files([*self.missing_companions(path.parent, overwrite), (path, self.with_positions(shapes[0]))])
-        return path
-
-    def missing_companions(self, folder: Path, overwrite: bool = False) -> list[tuple[Path, bytes]]:
-        """The companions that a copy in this folder lacks.
-
-        Raises:
-            FileExistsError: Another file is there, and ``overwrite`` is off.
-        """
-        missing = []
-        for name, data in self.companions.items():
-            path = folder / name
-            if path.is_file() and path.read_bytes() == data:
-                continue
-            refuse_existing(path, overwrite)
-            missing.append((path, data))
-        return missing
 
     def check(self, shapes: FloatArray) -> None:
         """Raise unless shapes are of this mesh. *Shape:* ``(N, V, 3)``."""
@@ -186,12 +121,7 @@ class Asset(ABC):
             )
 
     def warn_lost(self, name: str, holds: Collection[str]) -> None:
-        """Warn of features that a file loses.
-
-        Args:
-            name: Of the file.
-            holds: Those of :data:`FEATURES` that it has.
-        """
+        """Warn of what a file of this name loses, which holds some of :data:`FEATURES`."""
         lost = [name for feature, name in self.carries.items() if feature not in holds]
         if lost:
             listed = lost[0] if len(lost) == 1 else ", ".join(lost[:-1]) + " and " + lost[-1]

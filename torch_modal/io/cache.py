@@ -20,7 +20,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torch_modal.io.tensors import TensorFile, write_tensors
+from torch_modal.io.tensors import TensorFile, bytes_of, write_tensors
 from torch_modal.version import __version__
 
 CACHE_VERSION = 6
@@ -51,37 +51,24 @@ def default_cache_dir() -> Path:
     """The folder named by ``TORCH_MODAL_CACHE``, or ``torch_modal`` in the user's cache folder."""
     if named := os.environ.get(CACHE_VARIABLE):
         return Path(named).expanduser()
-    if sys.platform == "win32":
-        base = Path(os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local")
-    elif sys.platform == "darwin":
-        base = Path.home() / "Library" / "Caches"
-    else:
-        base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    return base / "torch_modal"
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "torch_modal"
 
 
 def size_limit() -> int:
-    """The largest size of a cache folder in bytes: ``TORCH_MODAL_CACHE_LIMIT``, or 4 GiB.
+    """The largest size of a cache folder in bytes: ``TORCH_MODAL_CACHE_LIMIT``, such as ``500M`` or ``4G``, or 4 GiB.
 
     Raises:
         ValueError: The variable is no size.
     """
     named = os.environ.get(LIMIT_VARIABLE)
-    try:
-        return parse_size(named) if named else DEFAULT_LIMIT
-    except ValueError as error:
-        raise ValueError(f"the environment variable {LIMIT_VARIABLE}: {error}") from None
-
-
-def parse_size(text: str) -> int:
-    """Bytes of ``"500M"``, ``"4G"`` or ``"1.5 GiB"``; all units are powers of 1,024.
-
-    Raises:
-        ValueError: It is no size.
-    """
-    match = re.fullmatch(r"(\d+(?:\.\d+)?) ?(?:([KMGT])(?:i?B)?|B)?", text.strip(), re.IGNORECASE)
+    if not named:
+        return DEFAULT_LIMIT
+    match = re.fullmatch(r"(\d+(?:\.\d+)?) ?(?:([KMGT])(?:i?B)?|B)?", named.strip(), re.IGNORECASE)
     if match is None:
-        raise ValueError(f"{text!r} is no size; give a number of bytes, or something like 500M or 4G")
+        raise ValueError(
+            f"the environment variable {LIMIT_VARIABLE}: {named!r} is no size; give a number of bytes, or something "
+            "like 500M or 4G"
+        )
     number, unit = match.groups()
     return int(float(number) * 1024 ** (" KMGT".index((unit or " ").upper())))
 
@@ -90,9 +77,8 @@ def parse_size(text: str) -> int:
 class Cache:
     """A folder of files, one per result, each with digests that every read verifies.
 
-    Damaged, truncated or foreign entries are computed again and replaced. Several processes may share the
-    folder: entries are moved into place whole. When they take more than the limit, the least recently used are
-    removed.
+    Damaged or foreign entries are computed again and replaced. Several processes may share the folder: entries are
+    moved into place whole. When they take more than the limit, the least recently used are removed.
 
     Attributes:
         folder: Of the entries; it is made when the first is written. None: nothing is cached.
@@ -104,11 +90,7 @@ class Cache:
 
     @classmethod
     def at(cls, cache_dir: str | os.PathLike[str] | None = None, *, enabled: bool = True) -> "Cache":
-        """The cache in a folder, by default in :func:`default_cache_dir`, or a disabled one.
-
-        Raises:
-            ValueError: ``TORCH_MODAL_CACHE_LIMIT`` is no size.
-        """
+        """The cache in a folder, by default in :func:`default_cache_dir`, or a disabled one."""
         if not enabled:
             return cls(None)
         return cls(default_cache_dir() if cache_dir is None else Path(cache_dir).expanduser(), size_limit())
@@ -122,66 +104,48 @@ class Cache:
     ) -> Arrays:
         """The cached result; computed and cached if there is none.
 
-        Args:
-            kind: Of result; the first part of the file's name.
-            inputs: Arrays that the result depends on.
-            parameters: Numbers and strings that it depends on.
-            compute: Computes the result.
-
-        Returns:
-            The arrays that ``compute`` returned, now or earlier.
-
-        Warns:
-            CacheWarning: The folder cannot be written.
+        It depends on arrays, and on parameters that are numbers or strings. The kind is the first part of the file's
+        name. A :class:`CacheWarning` says that the folder cannot be written.
         """
-        found = self.find(kind, inputs, parameters)
-        return self.keep(kind, inputs, parameters, compute()) if found is None else found
-
-    def find(self, kind: str, inputs: Mapping[str, NDArray[Any]], parameters: Mapping[str, Any]) -> Arrays | None:
-        """The cached result, if there is one; arguments as for :meth:`get`."""
         if self.folder is None:
-            return None
+            return dict(compute())
         path = self.folder / entry_name(kind, inputs, parameters)
-        try:
+        with contextlib.suppress(OSError, ValueError):  # missing or damaged
             file = TensorFile(path, FORMAT, str(CACHE_VERSION))
             found = {name: tensor.numpy() for name, tensor in file.tensors().items()}
-        except (OSError, ValueError):  # missing or damaged
-            return None
-        with contextlib.suppress(OSError):  # removed meanwhile, or not writable
-            os.utime(path)  # the time of the last use
-        return found
-
-    def keep(
-        self,
-        kind: str,
-        inputs: Mapping[str, NDArray[Any]],
-        parameters: Mapping[str, Any],
-        result: Mapping[str, NDArray[Any]],
-    ) -> Arrays:
-        """Write a result, in place of any earlier one; arguments as for :meth:`get`.
-
-        Returns:
-            The arrays of the result.
-
-        Warns:
-            CacheWarning: The folder cannot be written.
-        """
-        if self.folder is None:
-            return dict(result)
+            with contextlib.suppress(OSError):  # removed meanwhile, or not writable
+                os.utime(path)  # the time of the last use
+            return found
+        result = compute()
         tensors = {name: torch.from_numpy(np.array(array)) for name, array in result.items()}
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            path = self.folder / entry_name(kind, inputs, parameters)
             write_tensors(path, FORMAT, str(CACHE_VERSION), tensors)
-            _make_room(self.folder, self.limit, path)
+            self._make_room(path)
         except OSError as error:
             warnings.warn(
                 f"cannot keep {kind} in the cache folder {self.folder} ({error}); set {CACHE_VARIABLE} or "
                 "cache_dir to a folder that can be written",
                 CacheWarning,
-                stacklevel=3,
+                stacklevel=2,
             )
         return dict(result)
+
+    def _make_room(self, newest: Path) -> None:
+        """Remove entries that were not used for the longest, if all take too much; the newest stays in any case."""
+        entries = _entries(newest.parent)
+        total = sum(stat.st_size for _, stat in entries)
+        if total <= self.limit:
+            return
+        for path, stat in entries:
+            being_written = path.suffix != SUFFIX and time.time() - stat.st_mtime < ABANDONED
+            if path == newest or being_written:
+                continue
+            if total <= KEPT_PART * self.limit:
+                break
+            total -= stat.st_size
+            with contextlib.suppress(OSError):  # another process removed it, or has it open
+                path.unlink()
 
 
 def entry_name(kind: str, inputs: Mapping[str, NDArray[Any]], parameters: Mapping[str, Any]) -> str:
@@ -190,7 +154,6 @@ def entry_name(kind: str, inputs: Mapping[str, NDArray[Any]], parameters: Mappin
     return f"{kind}-{key}{SUFFIX}"
 
 
-# -------------------------------------------------------------------------------------------------- size of a folder
 class CacheContent(NamedTuple):
     """Size of a cache folder."""
 
@@ -198,99 +161,37 @@ class CacheContent(NamedTuple):
     n_bytes: int
 
 
-class _Entry(NamedTuple):
-    used: int
-    """Time of the last use, in nanoseconds."""
-    size: int
-    path: Path
-
-
 def cache_content(cache_dir: str | os.PathLike[str] | None = None) -> CacheContent:
-    """Number of entries in a cache folder and their size; none if there is no such folder.
-
-    Args:
-        cache_dir: The folder, by default :func:`default_cache_dir`.
-    """
+    """Number of entries in a cache folder, by default :func:`default_cache_dir`, and their size."""
     entries = _entries(cache_dir)
-    return CacheContent(len(entries), sum(entry.size for entry in entries))
+    return CacheContent(len(entries), sum(stat.st_size for _, stat in entries))
 
 
 def clear_cache(cache_dir: str | os.PathLike[str] | None = None) -> CacheContent:
-    """Remove the entries of a cache folder, and partial files of killed processes. Other files stay.
+    """Remove the entries of a cache folder, and partial files of killed processes; returns what was removed.
 
-    Other processes recompute what they miss.
-
-    Args:
-        cache_dir: The folder, by default :func:`default_cache_dir`.
-
-    Returns:
-        The entries removed.
+    Other files stay, and other processes recompute what they miss.
 
     Raises:
         OSError: An entry cannot be removed.
     """
-    return _remove(_entries(cache_dir))
+    sizes = []
+    for path, stat in _entries(cache_dir):
+        with contextlib.suppress(FileNotFoundError):
+            path.unlink()
+            sizes.append(stat.st_size)
+    return CacheContent(len(sizes), sum(sizes))
 
 
-def shrink_cache(limit: int, cache_dir: str | os.PathLike[str] | None = None) -> CacheContent:
-    """Remove the entries that were not used for the longest, until the others take no more than a limit.
-
-    Args:
-        limit: In bytes.
-        cache_dir: The folder, by default :func:`default_cache_dir`.
-
-    Returns:
-        The entries removed.
-
-    Raises:
-        OSError: An entry cannot be removed.
-    """
-    return _remove(_oldest(_entries(cache_dir), limit))
-
-
-def _entries(cache_dir: str | os.PathLike[str] | None) -> list[_Entry]:
+def _entries(cache_dir: str | os.PathLike[str] | None) -> list[tuple[Path, os.stat_result]]:
     """Entries and partial ones, known by their names; a user's own files may lie beside them. The oldest come first."""
     folder = default_cache_dir() if cache_dir is None else Path(cache_dir).expanduser()
     found = []
     for path in folder.iterdir() if folder.is_dir() else ():
         if _OWN_NAME.fullmatch(path.name):
             with contextlib.suppress(FileNotFoundError):  # another process may be clearing
-                status = path.stat()
-                found.append(_Entry(status.st_mtime_ns, status.st_size, path))
-    return sorted(found)
-
-
-def _make_room(folder: Path, limit: int, newest: Path) -> None:
-    """Remove the oldest entries if all together are too large; the newest stays in any case."""
-    entries = _entries(folder)
-    others = [entry for entry in entries if entry.path != newest]
-    size = sum(entry.size for entry in entries if entry.path == newest)
-    if _oldest(others, limit - size):
-        for entry in _oldest(others, int(KEPT_PART * limit) - size):
-            with contextlib.suppress(OSError):  # another process removed it, or has it open
-                entry.path.unlink()
-
-
-def _oldest(entries: list[_Entry], limit: int) -> list[_Entry]:
-    """Entries to remove so that the rest takes no more than a limit: those not used for the longest."""
-    now, total, chosen = time.time(), sum(entry.size for entry in entries), []
-    for entry in entries:
-        if entry.path.suffix != SUFFIX and now - entry.used / 1e9 < ABANDONED:
-            continue  # another process is writing it
-        if total <= limit:
-            break
-        chosen.append(entry)
-        total -= entry.size
-    return chosen
-
-
-def _remove(entries: list[_Entry]) -> CacheContent:
-    sizes = []
-    for entry in entries:
-        with contextlib.suppress(FileNotFoundError):
-            entry.path.unlink()
-            sizes.append(entry.size)
-    return CacheContent(len(sizes), sum(sizes))
+                found.append((path, path.stat()))
+    return sorted(found, key=lambda entry: entry[1].st_mtime_ns)
 
 
 # ----------------------------------------------------------------------------------------------------------- digests
@@ -329,21 +230,19 @@ def _digest(value: Any) -> bytes:
     if kind in (set, frozenset):
         return _joined(kind.__name__, sorted(map(_digest, value)))
     if kind in (Tensor, torch.nn.Parameter):
-        return _joined("tensor", [str(value.dtype).encode(), str(tuple(value.shape)).encode(), _bytes_of(value)])
+        x = value.detach()
+        if x.layout is not torch.strided or x.is_meta or torch.func.debug_unwrap(x, recurse=False) is not x:
+            raise ContentError(
+                f"a tensor of {x.layout} on {x.device}, or inside a transform of torch.func, has no numbers"
+            )
+        numbers = bytes_of(x.cpu().resolve_conj().resolve_neg())
+        return _joined("tensor", [str(x.dtype).encode(), str(tuple(x.shape)).encode(), numbers])
     if isinstance(value, (np.ndarray, np.generic)) and not value.dtype.hasobject:
         return _joined("array", [str(value.dtype.descr).encode(), str(value.shape).encode(), value.tobytes()])
     if _is_of_package(kind):
         content = tuple(value) if isinstance(value, tuple) else dict(vars(value))
         return _joined(f"{kind.__module__}.{kind.__qualname__}", [_digest(content)])
     raise ContentError(f"a {kind.__qualname__} is neither plain data nor of a class of torch_modal")
-
-
-def _bytes_of(x: Tensor) -> bytes:
-    plain = x.detach()
-    if plain.layout is not torch.strided or plain.is_meta or torch.func.debug_unwrap(plain, recurse=False) is not plain:
-        raise ContentError(f"a tensor of {x.layout} on {x.device}, or inside a transform of torch.func, has no numbers")
-    numbers = plain.cpu().resolve_conj().resolve_neg().contiguous().flatten().view(torch.uint8)
-    return numbers.numpy().tobytes()
 
 
 def _is_of_package(kind: type) -> bool:

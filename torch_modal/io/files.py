@@ -38,34 +38,13 @@ def temporary_beside(path: Path, ending: str = ".tmp") -> Iterator[Path]:
             temporary.unlink()
 
 
-def write_atomically(path: Path, data: bytes) -> None:
-    """Write a whole file or nothing.
-
-    Args:
-        path: Of the file; its folder must exist.
-        data: The whole content.
-
-    Raises:
-        OSError: As for :func:`temporary_beside`.
-    """
-    with temporary_beside(path) as temporary:
-        temporary.write_bytes(data)
-
-
 def write_file(path: Path, data: bytes) -> None:
     """Write a whole file or nothing; its folder is made if missing."""
     write_files([(path, data)])
 
 
 def write_files(files: Iterable[tuple[Path, bytes]]) -> None:
-    """Write all files or none: they are moved to their places after the last one was written; folders are made.
-
-    Args:
-        files: The path and the whole content of each.
-
-    Raises:
-        OSError: As for :func:`temporary_beside`.
-    """
+    """Write all files or none: they are moved to their places after the last one was written; folders are made."""
     sizes = {}
     with contextlib.ExitStack() as written:
         for path, data in files:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from pkgutil import resolve_name
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -14,8 +14,6 @@ from torch_modal.progress import Progress
 
 if TYPE_CHECKING:
     from torch_modal.io.asset import Asset
-
-Writer = TypeVar("Writer", bound=Callable[..., Any])
 
 SECONDS_OF_A_PAIR = 2.0
 SECONDS_OF_A_CYCLE = 1.0
@@ -27,9 +25,14 @@ FPS = 24.0
 class OutputFormat:
     """A function that writes, and what is known of it before it is imported.
 
+    In :data:`MESH_FORMATS`, for :func:`torch_modal.save_frames`, it takes vertices ``(V, 3)``, faces ``(F, 3)`` and the
+    :class:`torch_modal.Asset` that they come from, or None, and returns the bytes of a file. In
+    :data:`ANIMATION_FORMATS`, for :func:`torch_modal.save_animation`, it takes a :class:`torch_modal.Animation` and the
+    path of a new file, which is renamed when the function returns.
+
     Attributes:
         function: The function; of built-in formats its place, ``module:name``.
-        holds: Which of :data:`torch_modal.io.asset.FEATURES` it takes from an asset.
+        holds: Which of :data:`torch_modal.io.asset.FEATURES` it takes from an asset; a warning names the others.
         modules: Modules that must be installed.
         extra: The extra of torch_modal that installs them.
     """
@@ -47,13 +50,13 @@ class OutputFormat:
 
 GLB_HOLDS = ("texcoords", "normals", "colors", "materials")
 """From a file of another format; of materials, colour, roughness and the texture of the colour."""
-MESH_FORMATS = {
+MESH_FORMATS: dict[str, OutputFormat] = {
     ".ply": OutputFormat("torch_modal.io.ply:ply_bytes"),
     ".obj": OutputFormat("torch_modal.io.obj:obj_bytes"),
     ".off": OutputFormat("torch_modal.io.ply:off_bytes"),
     ".glb": OutputFormat("torch_modal.io.glb:glb_bytes", GLB_HOLDS),
 }
-ANIMATION_FORMATS = {
+ANIMATION_FORMATS: dict[str, OutputFormat] = {
     ".glb": OutputFormat("torch_modal.io.glb:write_glb", GLB_HOLDS),
     ".mp4": OutputFormat("torch_modal.view.animation:write_mp4", (), ("imageio", "imageio_ffmpeg"), "video"),
     ".gif": OutputFormat("torch_modal.view.animation:write_gif"),
@@ -69,66 +72,60 @@ PICTURES = (".png", ".pdf")
 PAGES = (".html", ".htm")
 
 
-def mesh_format(*suffixes: str, holds: Collection[str] = ()) -> Callable[[Writer], Writer]:
-    """Register a function that writes one shape, for :func:`torch_modal.save_frames`.
+class Timing:
+    """Times and repetitions of a sequence that plays, checked and completed.
 
-    The function takes vertices ``(V, 3)``, faces ``(F, 3)`` and the :class:`torch_modal.Asset` that they come from, or
-    None, and returns the bytes of the file.
+    Arguments as for :func:`torch_modal.save_animation`.
 
-    Args:
-        suffixes: In small letters with their dots, such as ``".xyz"``.
-        holds: Which of :data:`torch_modal.io.asset.FEATURES` it takes from the asset; a warning names the others.
+    Raises:
+        ValueError: A number is not positive, a cycle is to turn back or to slow down, or times do not fit.
     """
 
-    def register(write: Writer) -> Writer:
-        MESH_FORMATS.update(dict.fromkeys(suffixes, OutputFormat(write, holds)))
-        return write
-
-    return register
-
-
-def animation_format(*suffixes: str, modules: Collection[str] = (), extra: str = "") -> Callable[[Writer], Writer]:
-    """Register a function that writes a sequence, for :func:`torch_modal.save_animation`.
-
-    The function takes an :class:`torch_modal.Animation` and the path of a new file, which is renamed when the
-    function returns.
-
-    Args:
-        suffixes: In small letters with their dots, such as ``".csv"``.
-        modules: Modules that must be installed.
-        extra: The extra of torch_modal that installs them.
-    """
-
-    def register(write: Writer) -> Writer:
-        ANIMATION_FORMATS.update(dict.fromkeys(suffixes, OutputFormat(write, (), modules, extra)))
-        return write
-
-    return register
-
-
-class Timing(NamedTuple):
-    """Times and repetitions of a sequence that plays."""
-
-    duration: float
-    """Seconds of the whole sequence once; for a cycle, with the step back to its start."""
-    fps: float
-    """Pictures a second, for formats that have a fixed rate."""
-    cyclic: bool
-    ping_pong: bool
-    """There and back again."""
-    ease: bool
-    """Slow at both ends, by half a period of a cosine."""
-    parts: FloatArray
-    """Time of each frame over the duration, from 0 on. *Shape:* ``(N,)``."""
+    def __init__(
+        self,
+        n_frames: int,
+        n_keyframes: int = 2,
+        *,
+        duration: float | None = None,
+        fps: float | None = None,
+        cyclic: bool = False,
+        ping_pong: bool = False,
+        ease: bool = False,
+        times: Sequence[float] | FloatArray | None = None,
+    ) -> None:
+        for name, value in (("duration", duration), ("fps", fps)):
+            if value is not None and not (np.isfinite(value) and value > 0):
+                raise ValueError(f"{name} must be a positive number, got {value}.")
+        if cyclic and (ping_pong or ease):
+            name = "ping_pong" if ping_pong else "ease"
+            raise ValueError(f"{name} is for sequences that begin and end; a cyclic one does neither.")
+        steps = max(n_frames if cyclic else n_frames - 1, 1)
+        if duration is None:
+            if fps is not None:
+                duration = steps / fps
+            elif cyclic:
+                duration = SECONDS_OF_A_CYCLE
+            else:
+                duration = max(SECONDS_OF_A_PAIR, SECONDS_OF_AN_INTERVAL * (n_keyframes - 1))
+        #: Time of each frame over the duration, from 0 on. *Shape:* ``(N,)``.
+        self.parts = np.arange(n_frames) / steps
+        if times is not None:
+            given, wanted = np.asarray(times, np.float64), n_frames + cyclic
+            if given.shape != (wanted,) or not np.isfinite(given).all() or (np.diff(given) <= 0).any():
+                also = ", and the one when it begins again" if cyclic else ""
+                raise ValueError(
+                    f"times must be {wanted} ascending numbers, one for each frame{also}; got {given.shape}."
+                )
+            if wanted > 1:
+                self.parts = ((given - given[0]) / (given[-1] - given[0]))[:n_frames]
+        #: Seconds of the sequence once, for a cycle with the step back to its start; pictures a second at a fixed rate.
+        self.duration, self.fps = float(duration), float(FPS if fps is None else fps)
+        self.cyclic, self.ping_pong, self.ease = cyclic, ping_pong, ease
 
     def knots(self, frames: IntArray | None = None) -> tuple[FloatArray, IntArray]:
-        """Times at which frames are fully shown, for formats that interpolate linearly between them.
+        """Times in seconds at which frames are fully shown, for linear interpolation between them, and their indices.
 
-        Args:
-            frames: Frame numbers that are kept, from the first to the last, ascending. Default: all. *Shape:* ``(n,)``.
-
-        Returns:
-            Times in seconds, and indices into ``frames``. *Shape of both:* ``(T,)``.
+        The indices are into all frames, or into some that are kept, ascending. *Shape:* ``(n,) -> (T,), (T,)``.
         """
         parts = self.parts if frames is None else self.parts[frames]
         places = np.arange(len(parts))
@@ -160,57 +157,6 @@ class Timing(NamedTuple):
         return np.interp(part, known, np.arange(len(known)))
 
 
-def make_timing(
-    n_frames: int,
-    n_keyframes: int = 2,
-    *,
-    duration: float | None = None,
-    fps: float | None = None,
-    cyclic: bool = False,
-    ping_pong: bool = False,
-    ease: bool = False,
-    times: Sequence[float] | FloatArray | None = None,
-) -> Timing:
-    """Check and complete the settings of an animation.
-
-    Args:
-        n_frames: Of the sequence.
-        n_keyframes: Of the sequence.
-        duration: In seconds. Default: of ``fps`` frames a second where that is given; otherwise 1 s for a cycle, 2 s
-            for two key-frames, and 1 s for each interval of more.
-        fps: Frames a second. With a duration, only formats of a fixed rate (videos, point caches) depend on it.
-        cyclic: The last frame leads on to the first.
-        ping_pong: There and back again.
-        ease: Slow at both ends.
-        times: Of the frames, in any unit; of a cycle, also when it begins again. Default: evenly spaced.
-
-    Raises:
-        ValueError: A number is not positive, a cycle is to turn back or to slow down, or times do not fit.
-    """
-    for name, value in (("duration", duration), ("fps", fps)):
-        if value is not None and not (np.isfinite(value) and value > 0):
-            raise ValueError(f"{name} must be a positive number, got {value}.")
-    if cyclic and (ping_pong or ease):
-        name = "ping_pong" if ping_pong else "ease"
-        raise ValueError(f"{name} is for sequences that begin and end; a cyclic one does neither.")
-    steps = max(n_frames if cyclic else n_frames - 1, 1)
-    if duration is None:
-        if fps is not None:
-            duration = steps / fps
-        elif cyclic:
-            duration = SECONDS_OF_A_CYCLE
-        else:
-            duration = max(SECONDS_OF_A_PAIR, SECONDS_OF_AN_INTERVAL * (n_keyframes - 1))
-    parts = np.arange(n_frames) / steps
-    if times is not None:
-        given, wanted = np.asarray(times, np.float64), n_frames + cyclic
-        if given.shape != (wanted,) or not np.isfinite(given).all() or (np.diff(given) <= 0).any():
-            also = ", and the one when it begins again" if cyclic else ""
-            raise ValueError(f"times must be {wanted} ascending numbers, one for each frame{also}; got {given.shape}.")
-        parts = parts if wanted == 1 else ((given - given[0]) / (given[-1] - given[0]))[:n_frames]
-    return Timing(float(duration), float(FPS if fps is None else fps), cyclic, ping_pong, ease, parts)
-
-
 def resample(frames: FloatArray, places: FloatArray) -> FloatArray:
     """Linear interpolation at fractional frame numbers. *Shape:* ``(N, V, 3), (T,) -> (T, V, 3)``."""
     left = np.floor(places).astype(np.int64)
@@ -220,21 +166,18 @@ def resample(frames: FloatArray, places: FloatArray) -> FloatArray:
 
 
 class Animation(NamedTuple):
-    """A sequence to write, as :func:`torch_modal.save_animation` passes it to a format."""
+    """A sequence to write, as :func:`torch_modal.save_animation` passes it to a format, with arguments of these names.
+
+    The timing has the times of frames in seconds, and samples at a fixed rate. *Shape:* ``(N, V, 3), (F, 3)``.
+    """
 
     shapes: FloatArray
-    """*Shape:* ``(N, V, 3)``."""
     faces: IntArray
-    """*Shape:* ``(F, 3)``."""
     timing: Timing
-    """Times of the frames in seconds, and samples at a fixed rate."""
     name: str
     """Name of the file, for messages."""
     keyframes: list[int]
     """Frame numbers of the key-frames."""
     asset: Asset | None
-    """The mesh file that the frames come from."""
     max_targets: int
-    """Most morph targets of a GLB."""
     progress: Progress
-    """See :data:`torch_modal.progress.Progress`."""

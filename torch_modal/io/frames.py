@@ -23,9 +23,8 @@ def save_frames(
 ) -> list[Path]:
     """Write every shape as a mesh of its own: ``frame-000.ply``, ``frame-001.ply``, ...
 
-    Vertices and faces keep their order. OBJ and OFF are text and hold float64 exactly; PLY is binary and
-    holds float32 (about seven digits), which is what viewers expect: take OBJ where the files are computed
-    with again.
+    Vertices and faces keep their order. OBJ and OFF are text and hold float64 exactly; PLY is binary and holds float32
+    (about seven digits), which is what viewers expect: take OBJ where the files are computed with again.
 
     With an asset, each file is that of the asset with other positions: polygons, texture coordinates, materials, groups
     and all else stay, normals turn with the surface, and material libraries and textures are copied beside the files.
@@ -53,8 +52,6 @@ def save_frames(
         MeshWarning: The format cannot hold what the asset carries.
     """
     shapes, triangles = check_frames(frames, faces)
-    if asset is not None:
-        asset.check(shapes)
     suffix = (".ply" if asset is None else asset.suffix) if fmt is None else f".{fmt}"
     if suffix not in MESH_FORMATS:
         raise ValueError(f"fmt must be one of {', '.join(known[1:] for known in MESH_FORMATS)}, got {fmt!r}.")
@@ -65,43 +62,47 @@ def save_frames(
         raise NotADirectoryError(f"{folder} is a file; out must be a folder.")
     digits = max(3, len(str(len(shapes) - 1)))
     paths = [folder / f"{stem}-{number:0{digits}d}{suffix}" for number in range(len(shapes))]
-    _write(shapes, triangles, paths, suffix, asset, overwrite)
+    _write(shapes, triangles, paths, asset, overwrite)
     return paths
 
 
 def save_mesh(
     vertices: Array, faces: Array, out: str | Path, overwrite: bool = False, asset: Asset | None = None
 ) -> Path:
-    """Write one shape; the file's extension says the format. All else is as for `save_frames`.
+    """Write one shape; the file's extension says the format. All else is as for :func:`torch_modal.save_frames`.
 
     Args:
         vertices: Vertex positions. *Shape:* ``(V, 3)``.
         faces: Vertex indices. *Shape:* ``(F, 3)``.
-        out: The file.
-        overwrite: Replace the file if it exists.
+        out: The file: ``.ply``, ``.obj``, ``.off`` or ``.glb``.
+        overwrite: Replace files that exist. Materials and textures of equal content need no overwriting.
         asset: The mesh file whose materials, texture coordinates and all else the shape keeps.
-
-    Raises:
-        ValueError: The arrays or the extension cannot be used.
-        FileExistsError: The file exists and ``overwrite`` is off.
     """
     path = Path(out)
     shapes, triangles = check_frames(to_numpy(vertices)[None], faces, "vertices[None]")
-    suffix = check_suffix(path, MESH_FORMATS)
-    _write(shapes, triangles, [path], suffix, asset, overwrite)
+    check_suffix(path, MESH_FORMATS)
+    _write(shapes, triangles, [path], asset, overwrite)
     return path
 
 
-def _write(
-    shapes: FloatArray, faces: IntArray, paths: list[Path], suffix: str, asset: Asset | None, overwrite: bool
-) -> None:
+def _write(shapes: FloatArray, faces: IntArray, paths: list[Path], asset: Asset | None, overwrite: bool) -> None:
     """Each shape to its file, all in one folder and of one format; none if one of them cannot be written."""
+    folder, suffix = paths[0].parent, paths[0].suffix.lower()
     for path in paths:
         refuse_existing(path, overwrite)
-    fmt = MESH_FORMATS[suffix]
-    own = asset is not None and asset.suffix == suffix
+    beside: list[tuple[Path, bytes]] = []
     if asset is not None:
-        asset.warn_lost(paths[0].name, asset.keeps if own else fmt.holds)
-    beside = asset.missing_companions(paths[0].parent, overwrite) if asset is not None and own else []
-    data = (asset.with_positions(x) if asset is not None and own else fmt.write(x, faces, asset) for x in shapes)
-    write_files(chain(beside, zip(paths, data, strict=True)))
+        asset.check(shapes)
+    if asset is not None and asset.suffix == suffix:
+        asset.warn_lost(paths[0].name, asset.keeps)
+        beside = [(folder / name, data) for name, data in asset.companions.items()]
+        beside = [(path, data) for path, data in beside if not (path.is_file() and path.read_bytes() == data)]
+        for path, _ in beside:
+            refuse_existing(path, overwrite)
+        files = ((path, asset.with_positions(x)) for path, x in zip(paths, shapes, strict=True))
+    else:
+        fmt = MESH_FORMATS[suffix]
+        if asset is not None:
+            asset.warn_lost(paths[0].name, fmt.holds)
+        files = ((path, fmt.write(x, faces, asset)) for path, x in zip(paths, shapes, strict=True))
+    write_files(chain(beside, files))

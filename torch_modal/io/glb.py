@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +12,7 @@ from torch_modal.geometry.connectivity import merge_seams
 from torch_modal.geometry.vectors import vertex_normals
 from torch_modal.io.asset import Asset, Material, Part
 from torch_modal.io.formats import GLB_HOLDS, Animation
-from torch_modal.io.gltf import ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER, Document, Drawn, Json, animate, place_frames
+from torch_modal.io.gltf import ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER, Document, Json
 from torch_modal.io.gltf_asset import GltfAsset
 from torch_modal.io.normals import carry_together
 
@@ -23,9 +22,7 @@ LARGEST_FILE_WITH_NORMALS = 48 * 2**20
 
 def glb_bytes(vertices: FloatArray, faces: IntArray, asset: Asset | None) -> bytes:
     """One shape without an animation."""
-    document, drawn, _ = _document(vertices[None], faces, asset, "shape")
-    place_frames(document, drawn, vertices[None])
-    return document.to_glb()
+    return _document(vertices[None], faces, asset, "shape").to_glb()
 
 
 def write_glb(animation: Animation, path: Path) -> None:
@@ -51,17 +48,31 @@ def write_glb(animation: Animation, path: Path) -> None:
     if asset is not None:
         asset.warn_lost(name, asset.keeps if isinstance(asset, GltfAsset) else GLB_HOLDS)
     if isinstance(asset, GltfAsset):
-        document, drawn, nodes = asset.rebuilt(shapes[kept] if move_normals else shapes[:1])
+        document = asset.rebuilt(shapes[kept], move_normals)
     else:
-        document, drawn, nodes = _document(shapes[kept], animation.faces, asset, Path(name).stem, move_normals)
-    place_frames(document, drawn, shapes[kept])
+        document = _document(shapes[kept], animation.faces, asset, Path(name).stem, move_normals)
     if len(kept) > 1:
         times, shown = timing.knots(kept)
         steps = len(shapes) if timing.cyclic else len(shapes) - 1
         extras: Json = {"fps": steps / timing.duration, "frames": kept.tolist(), "keyframes": keyframes}
         if timing.ping_pong:
             extras["ping_pong"] = True
-        animate(document, nodes, kept.tolist(), times, shown, extras)
+        weights = np.eye(len(kept), dtype=np.float32)[:, 1:][shown]
+        sampler = {
+            "input": document.add(times.astype(np.float32), "SCALAR", bounds=True),
+            "output": document.add(weights.reshape(-1), "SCALAR"),
+            "interpolation": "LINEAR",
+        }
+        for mesh in document.get("meshes"):
+            mesh["weights"] = [0.0] * (len(kept) - 1)
+            mesh["extras"] = {**mesh.get("extras", {}), "targetNames": [f"frame-{n:03d}" for n in kept[1:]]}
+        channels = [
+            {"sampler": 0, "target": {"node": number, "path": "weights"}}
+            for number, node in enumerate(document.get("nodes"))
+            if "mesh" in node
+        ]
+        played = {"name": "sequence", "samplers": [sampler], "channels": channels, "extras": extras}
+        document.append("animations", played)
     path.write_bytes(document.to_glb())
 
 
@@ -81,58 +92,43 @@ def thinned(n_frames: int, most: int, wanted: list[int]) -> IntArray:
 
 def _document(
     shapes: FloatArray, faces: IntArray, asset: Asset | None, name: str, move_normals: bool = True
-) -> tuple[Document, list[Drawn], list[int]]:
-    """A document of one node, with the parts of a file or with all faces in clay."""
+) -> Document:
+    """A document of one node, with the parts of a file or with all faces in clay, and the shapes as morph targets."""
     parts = [Part(np.arange(shapes.shape[1]), faces, Material())] if asset is None else asset.parts()
+    positions = shapes[0] if asset is None else asset.positions
+    frames = shapes if move_normals else shapes[:1]
+    copies = merge_seams(shapes[[0, -1]], faces)
+    _, first = np.unique(copies, return_index=True)
+    smooth = np.stack([vertex_normals(shape[first], copies[faces])[copies] for shape in frames])
+    turned = carry_together(
+        [(part.normals, positions[part.vertices], part.triangles) for part in parts],
+        [frames[:, part.vertices] for part in parts],
+    )
     document = Document()
-    normals = _normals(parts, shapes, faces, asset, len(shapes) if move_normals else 1)
-    primitives, drawn = [], []
+    primitives = []
     materials: dict[Material, int] = {}
-    for part, own_normals in zip(parts, normals, strict=True):
+    for part, normals in zip(parts, turned, strict=True):
         index_type = np.uint16 if len(part.vertices) <= 65535 else np.uint32  # 65535 itself is no valid uint16 index
         if part.material not in materials:
             materials[part.material] = document.append("materials", _material(document, part.material))
+        attributes, *targets = document.add_frames(
+            shapes[:, part.vertices], smooth[:, part.vertices] if normals is None else normals
+        )
+        if part.texcoords is not None:
+            attributes["TEXCOORD_0"] = document.add(part.texcoords.astype(np.float32), "VEC2", ARRAY_BUFFER)
+        if part.colors is not None:
+            attributes["COLOR_0"] = document.add(part.colors.astype(np.float32), "VEC4", ARRAY_BUFFER)
         primitive: Json = {
-            "attributes": {},
+            "attributes": attributes,
             "indices": document.add(part.triangles.astype(index_type).reshape(-1), "SCALAR", ELEMENT_ARRAY_BUFFER),
             "material": materials[part.material],
         }
-        if part.texcoords is not None:
-            primitive["attributes"]["TEXCOORD_0"] = document.add(
-                part.texcoords.astype(np.float32), "VEC2", ARRAY_BUFFER
-            )
-        if part.colors is not None:
-            primitive["attributes"]["COLOR_0"] = document.add(part.colors.astype(np.float32), "VEC4", ARRAY_BUFFER)
-        primitives.append(primitive)
-        drawn.append(Drawn(primitive, part.vertices, np.eye(4), own_normals))
+        primitives.append(primitive | ({"targets": targets} if targets else {}))
     document.append("meshes", {"name": name, "primitives": primitives})
     document.append("nodes", {"name": name, "mesh": 0})
     document.append("scenes", {"name": "scene", "nodes": [0]})
     document.root["scene"] = 0
-    return document, drawn, [0]
-
-
-def _normals(
-    parts: Sequence[Part], shapes: FloatArray, faces: IntArray, asset: Asset | None, n_frames: int
-) -> list[FloatArray]:
-    """For each part, its normals in the first frames: the file's, rotated with the surface, or smooth ones.
-
-    *Shape of each:* ``(n_frames, P, 3)``.
-    """
-    frames = shapes[:n_frames]
-    copies = merge_seams(shapes[[0, -1]], faces)
-    _, first = np.unique(copies, return_index=True)
-    smooth = np.stack([vertex_normals(shape[first], copies[faces])[copies] for shape in frames])
-    found = [smooth[:, part.vertices] for part in parts]
-    own = [number for number, part in enumerate(parts) if part.normals is not None]
-    if own and asset is not None:
-        vertices = np.concatenate([parts[number].vertices for number in own])
-        given = [
-            (part.normals, asset.positions[part.vertices], part.triangles) for part in parts if part.normals is not None
-        ]
-        for number, turned in zip(own, carry_together(given, [shape[vertices] for shape in frames]), strict=True):
-            found[number] = turned
-    return found
+    return document
 
 
 def _material(document: Document, material: Material) -> Json:
@@ -142,8 +138,7 @@ def _material(document: Document, material: Material) -> Json:
         "roughnessFactor": material.roughness,
     }
     if material.texture is not None:
-        view = document.add_bytes(material.texture.data)
-        image = document.append("images", {"bufferView": view, "mimeType": material.texture.mime})
+        image = document.append("images", document.add_image(material.texture))
         if not document.get("samplers"):
             document.append("samplers", {"wrapS": 10497, "wrapT": 10497})  # repeat, as OBJ does
         texture = document.append("textures", {"source": image, "sampler": 0})

@@ -9,16 +9,15 @@ from __future__ import annotations
 import base64
 import json
 import struct
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 from urllib.parse import unquote
 
 import numpy as np
 from numpy.typing import NDArray
 from trimesh.transformations import quaternion_matrix
 
-from torch_modal.arrays import FloatArray, IntArray
+from torch_modal.arrays import FloatArray
 
 Json = dict[str, Any]
 
@@ -27,17 +26,10 @@ WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "M
 ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963
 LARGEST_ACCESSOR = 2**31
 """Numbers; a damaged file may promise any count."""
-TARGET_NAME = "frame-{:03d}"
 
 
 class Document:
-    """A glTF document in memory.
-
-    Args:
-        root: The JSON.
-        folder: Folder that its URIs are relative to.
-        binary: The binary part of a GLB file.
-    """
+    """A glTF document in memory: its JSON and the binary part of a GLB file. URIs are relative to the folder."""
 
     def __init__(self, root: Json | None = None, folder: Path = Path(), binary: bytes = b"") -> None:
         self.root: Json = {"asset": {"version": "2.0", "generator": "torch_modal"}} if root is None else root
@@ -49,11 +41,7 @@ class Document:
 
     @classmethod
     def read(cls, path: Path) -> Document:
-        """Read a GLB or GLTF file.
-
-        Raises:
-            ValueError: It is none, or of another version.
-        """
+        """Read a GLB or GLTF file; raises ValueError if it is none, or of another version."""
         data = path.read_bytes()
         binary = b""
         if data[:4] == b"glTF":
@@ -79,7 +67,11 @@ class Document:
     def get(self, kind: str, index: int | None = None) -> Any:
         """A list of the document, empty where there is none; or one of its members."""
         items = self.root.get(kind, [])
-        return items if index is None else items[_index(index)]
+        if index is None:
+            return items
+        if not isinstance(index, int) or index < 0:  # in damaged files; Python accepts negative ones
+            raise ValueError(f"an index {index!r}")
+        return items[index]
 
     def resource(self, uri: str) -> bytes:
         """The data in a URI, or of the file that it names."""
@@ -90,9 +82,9 @@ class Document:
     def view(self, index: int) -> bytes:
         """The bytes of a buffer view."""
         view = self.get("bufferViews", index)
-        start = view.get("byteOffset", 0)
-        data = self.buffers[_index(view["buffer"])][start : start + view["byteLength"]]
-        if start < 0 or len(data) < view["byteLength"]:
+        start, number = view.get("byteOffset", 0), view["buffer"]
+        data = self.buffers[number][start : start + view["byteLength"]]
+        if min(start, number) < 0 or len(data) < view["byteLength"]:
             raise ValueError("a buffer is too short")
         return bytes(data)
 
@@ -102,32 +94,25 @@ class Document:
         return self.view(image["bufferView"]) if "bufferView" in image else self.resource(image["uri"])
 
     def accessor(self, index: int) -> NDArray[Any]:
-        """The numbers of an accessor, in its component type. *Shape:* ``(count, width)``.
-
-        Raises:
-            ValueError: It does not fit its buffer.
-        """
+        """The numbers of an accessor, in its component type. *Shape:* ``(count, width)``."""
         accessor = self.get("accessors", index)
-        dtype, width = np.dtype(COMPONENTS[accessor["componentType"]]), WIDTHS[accessor["type"]]
-        count = accessor["count"]
+        kind, width, count = accessor["componentType"], WIDTHS[accessor["type"]], accessor["count"]
         if not 0 <= count * width < LARGEST_ACCESSOR:
             raise ValueError(f"an accessor of {count} elements")
-        if "bufferView" in accessor:
-            stride = self.get("bufferViews", accessor["bufferView"]).get("byteStride")
-            array = self._rows(accessor, dtype, count, width, stride)
-        else:
-            array = np.zeros((count, width), dtype)
+        array = self._rows(accessor, kind, count, width)
         if "sparse" in accessor:
             n, indices, values = (accessor["sparse"][key] for key in ("count", "indices", "values"))
-            at = self._rows(indices, np.dtype(COMPONENTS[indices["componentType"]]), n, 1)
             array = array.copy()
-            array[at[:, 0]] = self._rows(values, dtype, n, width)
+            array[self._rows(indices, indices["componentType"], n, 1)[:, 0]] = self._rows(values, kind, n, width)
         return array
 
-    def _rows(self, place: Json, dtype: np.dtype, count: int, width: int, stride: int | None = None) -> NDArray[Any]:
-        """Numbers in a buffer view. *Shape:* ``(count, width)``."""
+    def _rows(self, place: Json, kind: int, count: int, width: int) -> NDArray[Any]:
+        """Numbers in a buffer view, zeros without one. *Shape:* ``(count, width)``."""
+        dtype = np.dtype(COMPONENTS[kind])
+        if "bufferView" not in place:
+            return np.zeros((count, width), dtype)
         data, offset, size = self.view(place["bufferView"]), place.get("byteOffset", 0), dtype.itemsize * width
-        stride = stride or size
+        stride = self.get("bufferViews", place["bufferView"]).get("byteStride") or size
         if offset < 0 or stride < size:
             raise ValueError("an accessor with a wrong offset or stride")
         if count and offset + (count - 1) * stride + size > len(data):
@@ -159,6 +144,11 @@ class Document:
         binary += data
         return self.append("bufferViews", view)
 
+    def add_image(self, data: bytes) -> Json:
+        """Add a picture; the JSON of an image."""
+        mime = "image/jpeg" if data.startswith(b"\xff\xd8") else "image/png"
+        return {"bufferView": self.add_bytes(data), "mimeType": mime}
+
     def add(
         self,
         array: NDArray[Any],
@@ -167,25 +157,19 @@ class Document:
         bounds: bool = False,
         normalized: bool = False,
     ) -> int:
-        """Add numbers as an accessor with a view of its own; its number.
+        """Add numbers ``(count,)`` or ``(count, width)`` as an accessor with a view of its own; its number.
 
-        Args:
-            array: In one of the component types. *Shape:* ``(count,)`` or ``(count, width)``.
-            kind: ``"SCALAR"``, ``"VEC3"``, ...
-            target: Use of the view.
-            bounds: Whether least and greatest numbers are written; positions and times need them.
-            normalized: Whether integers stand for fractions.
+        Positions and times need bounds. Normalized integers stand for fractions.
         """
         rows = np.ascontiguousarray(array).reshape(len(array), -1)
-        stored = rows
         size = rows.dtype.itemsize * rows.shape[1]
-        view_options: Json = {}
         if target == ARRAY_BUFFER and size % 4:  # each vertex starts at a multiple of four bytes
             stored = np.zeros((len(rows), size + -size % 4), "u1")
             stored[:, :size] = rows.view("u1").reshape(len(rows), size)
-            view_options["byteStride"] = stored.shape[1]
-        view = self.add_bytes(stored.tobytes(), target)
-        self.root["bufferViews"][view].update(view_options)
+            view = self.add_bytes(stored.tobytes(), target)
+            self.root["bufferViews"][view]["byteStride"] = stored.shape[1]
+        else:
+            view = self.add_bytes(rows.tobytes(), target)
         code = next(code for code, name in COMPONENTS.items() if np.dtype(name) == rows.dtype)
         accessor: Json = {"bufferView": view, "componentType": code, "count": len(rows), "type": kind}
         if normalized:
@@ -193,6 +177,17 @@ class Document:
         if bounds:
             accessor |= {"min": rows.min(axis=0).tolist(), "max": rows.max(axis=0).tolist()}
         return self.append("accessors", accessor)
+
+    def add_frames(self, shapes: FloatArray, normals: FloatArray | None) -> list[Json]:
+        """Add the points of a primitive; its attributes in frame 0, and a morph target for each further frame.
+
+        Normals may be those of frame 0 alone. *Shape:* ``(N, P, 3)``, and ``(N, P, 3)`` or ``(1, P, 3)``.
+        """
+        added: list[Json] = [{"POSITION": self.add(x, "VEC3", ARRAY_BUFFER, bounds=True)} for x in _differences(shapes)]
+        if normals is not None:
+            for attributes, x in zip(added, _differences(_unit(normals)), strict=False):
+                attributes["NORMAL"] = self.add(x, "VEC3", ARRAY_BUFFER)
+        return added
 
     def to_glb(self) -> bytes:
         """The document as a GLB file."""
@@ -205,13 +200,6 @@ class Document:
         return b"".join(
             [head, struct.pack("<I4s", len(text), b"JSON"), text, struct.pack("<I4s", len(binary), b"BIN\0"), binary]
         )
-
-
-def _index(number: Any) -> int:
-    """A checked index; damaged files may have negative ones, which Python accepts."""
-    if not isinstance(number, int) or number < 0:
-        raise ValueError(f"an index {number!r}")
-    return number
 
 
 def world_transforms(document: Document) -> dict[int, FloatArray]:
@@ -229,55 +217,16 @@ def world_transforms(document: Document) -> dict[int, FloatArray]:
         if number in found:  # a node has one parent; in a damaged file it may be its own
             continue
         node = document.get("nodes", number)
-        found[number] = parent @ _local_transform(node)
+        if "matrix" in node:
+            local = np.array(node["matrix"], dtype=np.float64).reshape(4, 4).T
+        else:
+            x, y, z, w = node.get("rotation", (0.0, 0.0, 0.0, 1.0))
+            local = quaternion_matrix((w, x, y, z))
+            local[:3, :3] *= np.array(node.get("scale", (1.0, 1.0, 1.0)), dtype=np.float64)
+            local[:3, 3] = node.get("translation", (0.0, 0.0, 0.0))
+        found[number] = parent @ local
         waiting += [(child, found[number]) for child in reversed(node.get("children", []))]
     return found
-
-
-def _local_transform(node: Json) -> FloatArray:
-    if "matrix" in node:
-        return np.array(node["matrix"], dtype=np.float64).reshape(4, 4).T
-    x, y, z, w = node.get("rotation", (0.0, 0.0, 0.0, 1.0))
-    matrix: FloatArray = quaternion_matrix((w, x, y, z))
-    matrix[:3, :3] *= np.array(node.get("scale", (1.0, 1.0, 1.0)), dtype=np.float64)
-    matrix[:3, 3] = node.get("translation", (0.0, 0.0, 0.0))
-    return matrix
-
-
-# ------------------------------------------------------------------------------------------------------------ frames
-class Drawn(NamedTuple):
-    """A primitive of a document without its positions."""
-
-    json: Json
-    points: Any
-    """Its vertices among all; indices or a slice. *Shape:* ``(P,)``."""
-    inverse: FloatArray
-    """From the scene to the node. *Shape:* ``(4, 4)``."""
-    normals: FloatArray | None = None
-    """Normals of each frame, or of frame 0 alone if they do not move. *Shape:* ``(N, P, 3)`` or ``(1, P, 3)``."""
-
-
-def place_frames(document: Document, drawn: Sequence[Drawn], frames: FloatArray) -> None:
-    """Add the positions of frame 0 to primitives, and a morph target for each further frame.
-
-    Args:
-        document: The document.
-        drawn: Its primitives; those that share points and normals share accessors.
-        frames: Positions of all vertices, in the scene. *Shape:* ``(N, V, 3)``.
-    """
-    made: dict[tuple[int, int], list[Json]] = {}
-    for primitive in drawn:
-        key = (id(primitive.points), id(primitive.normals))
-        if key not in made:
-            shapes = frames[:, primitive.points] @ primitive.inverse[:3, :3].T + primitive.inverse[:3, 3]
-            made[key] = [{"POSITION": document.add(x, "VEC3", ARRAY_BUFFER, bounds=True)} for x in _differences(shapes)]
-            if primitive.normals is not None:
-                for attributes, x in zip(made[key], _differences(_unit(primitive.normals)), strict=False):
-                    attributes["NORMAL"] = document.add(x, "VEC3", ARRAY_BUFFER)
-        first, *targets = made[key]
-        primitive.json["attributes"] = {**first, **primitive.json.get("attributes", {})}
-        if targets:
-            primitive.json["targets"] = targets
 
 
 def _differences(frames: FloatArray) -> NDArray[np.float32]:
@@ -292,37 +241,3 @@ def _unit(vectors: FloatArray) -> FloatArray:
     usable = length > 1e-12
     scaled = np.where(np.abs(length - 1) < 1e-6, vectors, vectors / np.where(usable, length, 1.0))
     return np.where(usable, scaled, np.array([0.0, 0.0, 1.0]))
-
-
-def animate(
-    document: Document,
-    nodes: Sequence[int],
-    numbers: Sequence[int],
-    times: FloatArray,
-    shown: IntArray,
-    extras: Json,
-) -> None:
-    """Play the frames of meshes by the weights of their morph targets.
-
-    Args:
-        document: The document; primitives have their targets.
-        nodes: Which show the meshes.
-        numbers: Frame numbers behind the base and the morph targets, for their names.
-        times: In seconds, increasing. *Shape:* ``(T,)``.
-        shown: Which of the frames is shown at each time: 0 for the base. *Shape:* ``(T,)``.
-        extras: Metadata of the animation.
-    """
-    weights = np.eye(len(numbers), dtype=np.float32)[:, 1:][shown]
-    sampler = {
-        "input": document.add(times.astype(np.float32), "SCALAR", bounds=True),
-        "output": document.add(weights.reshape(-1), "SCALAR"),
-        "interpolation": "LINEAR",
-    }
-    channels = []
-    for node in nodes:
-        mesh = document.get("meshes", document.get("nodes", node)["mesh"])
-        mesh["weights"] = [0.0] * (len(numbers) - 1)
-        names = [TARGET_NAME.format(number) for number in numbers[1:]]
-        mesh["extras"] = {**mesh.get("extras", {}), "targetNames": names}
-        channels.append({"sampler": 0, "target": {"node": node, "path": "weights"}})
-    document.append("animations", {"name": "sequence", "samplers": [sampler], "channels": channels, "extras": extras})

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,16 +10,8 @@ import numpy as np
 
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.errors import MeshError
-from torch_modal.io.asset import Asset, Image, Material, Part, as_image
-from torch_modal.io.gltf import (
-    ARRAY_BUFFER,
-    ELEMENT_ARRAY_BUFFER,
-    Document,
-    Drawn,
-    Json,
-    place_frames,
-    world_transforms,
-)
+from torch_modal.io.asset import Asset, Material, Part, as_png_or_jpeg
+from torch_modal.io.gltf import ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER, Document, Json, world_transforms
 from torch_modal.io.normals import carry_together
 
 _COMPRESSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
@@ -29,14 +20,12 @@ _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 
 
 class _Primitive(NamedTuple):
-    """Triangles of one node."""
+    """Triangles of one node, as indices of its own vertices, which are a slice of the asset's. *Shape:* ``(F, 3)``."""
 
     node: int
     json: Json
     points: slice
-    """Its vertices among those of the asset; primitives that share them are alike here."""
     triangles: IntArray
-    """Indices of its own vertices. *Shape:* ``(F, 3)``."""
 
 
 class GltfAsset(Asset):
@@ -55,59 +44,48 @@ class GltfAsset(Asset):
             raise MeshError(f"{path}: its meshes are compressed ({compressed[0]}); export it without compression")
         self._world = world_transforms(self.document)
         self._primitives: list[_Primitive] = []
-        positions, faces, n, posing = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], 0, set()
+        positions, faces, n = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], 0
+        posing = {"skeleton": False, "animations": bool(self.document.get("animations")), "morph targets": False}
         for node, world in self._world.items():
             node_json = self.document.get("nodes", node)
             if "mesh" not in node_json:
                 continue
-            if "skin" in node_json:
-                posing.add("skeleton")
+            posing["skeleton"] |= "skin" in node_json
             shared: dict[int, slice] = {}
             for primitive in self.document.get("meshes", node_json["mesh"])["primitives"]:
-                attributes = primitive.get("attributes", {})
-                if primitive.get("mode", _TRIANGLES) not in (_TRIANGLES, _STRIP, _FAN) or "POSITION" not in attributes:
+                mode = primitive.get("mode", _TRIANGLES)
+                if mode in (_STRIP, _FAN):
+                    raise MeshError(f"{path}: strips or fans of triangles are not read; export single triangles")
+                if mode != _TRIANGLES or "POSITION" not in primitive.get("attributes", {}):
                     self.carries["groups"] = "lines and points"
                     continue
-                if "targets" in primitive:
-                    posing.add("morph targets")
-                accessor = attributes["POSITION"]
+                posing["morph targets"] |= "targets" in primitive
+                accessor = primitive["attributes"]["POSITION"]
                 if accessor not in shared:
                     local = self.document.floats(accessor)
                     shared[accessor] = slice(n, n + len(local))
                     positions.append(local @ world[:3, :3].T + world[:3, 3])
                     n += len(local)
                 points = shared[accessor]
-                triangles = self._triangles(primitive, points.stop - points.start)
+                if "indices" in primitive:
+                    indices = self.document.accessor(primitive["indices"])[:, 0].astype(np.int64)
+                else:
+                    indices = np.arange(points.stop - points.start)
+                triangles = indices[: len(indices) // 3 * 3].reshape(-1, 3)
                 mirrored = np.linalg.det(world[:3, :3]) < 0  # which turns the winding over
                 faces.append((triangles[:, ::-1] if mirrored else triangles) + points.start)
                 self._primitives.append(_Primitive(node, primitive, points, triangles))
         self.positions, self.faces = np.concatenate(positions), np.concatenate(faces)
         names = {name for primitive in self._primitives for name in primitive.json["attributes"]}
-        features = {
-            "texcoords": "texture coordinates" * ("TEXCOORD_0" in names),
-            "normals": "normals" * ("NORMAL" in names),
-            "colors": "vertex colours" * ("COLOR_0" in names),
-            "materials": "materials" * bool(self.document.get("materials")),
-        }
-        if self.document.get("animations"):
-            posing.add("animations")
-        features["posing"] = " and ".join(sorted(posing, key=("skeleton", "animations", "morph targets").index))
-        self.carries |= {feature: name for feature, name in features.items() if name}
-
-    def _triangles(self, primitive: Json, n_points: int) -> IntArray:
-        if "indices" in primitive:
-            indices = self.document.accessor(primitive["indices"])[:, 0].astype(np.int64)
-        else:
-            indices = np.arange(n_points)
-        mode = primitive.get("mode", _TRIANGLES)
-        if mode == _TRIANGLES:
-            return indices[: len(indices) // 3 * 3].reshape(-1, 3)
-        first, second, third = indices[:-2], indices[1:-1], indices[2:]
-        if mode == _FAN:
-            return np.stack([np.full_like(second, indices[0]), second, third], axis=1)
-        odd = np.arange(len(first)) % 2 == 1
-        triangles = np.stack([first, np.where(odd, third, second), np.where(odd, second, third)], axis=1)
-        return triangles[(np.diff(np.sort(triangles, axis=1)) > 0).all(axis=1)]  # strips turn by empty ones
+        for feature, said, there in (
+            ("texcoords", "texture coordinates", "TEXCOORD_0" in names),
+            ("normals", "normals", "NORMAL" in names),
+            ("colors", "vertex colours", "COLOR_0" in names),
+            ("materials", "materials", bool(self.document.get("materials"))),
+            ("posing", " and ".join(name for name, there in posing.items() if there), any(posing.values())),
+        ):
+            if there:
+                self.carries[feature] = said
 
     def morphs(self) -> FloatArray:
         """The file's shape, and that of each morph target at weight 1. *Shape:* ``(N, V, 3)``.
@@ -131,20 +109,10 @@ class GltfAsset(Asset):
     # ------------------------------------------------------------------------------------------------ the file again
     def with_positions(self, positions: FloatArray) -> bytes:
         """The file with other positions."""
-        frames = positions[None]
-        document, drawn, _ = self.rebuilt(frames)
-        place_frames(document, drawn, frames)
-        return document.to_glb()
+        return self.rebuilt(positions[None]).to_glb()
 
-    def rebuilt(self, frames: FloatArray) -> tuple[Document, list[Drawn], list[int]]:
-        """A copy without positions and normals, and without unused content.
-
-        Args:
-            frames: Those with normals, all or the first. *Shape:* ``(N, V, 3)``.
-
-        Returns:
-            The document; its primitives, for :func:`torch_modal.io.gltf.place_frames`; the nodes that show them.
-        """
+    def rebuilt(self, frames: FloatArray, move_normals: bool = True) -> Document:
+        """A copy without unused content, with other positions and those of morph targets. *Shape:* ``(N, V, 3)``."""
         old = self.document
         root = {key: copy.deepcopy(value) for key, value in old.root.items() if key not in _REBUILT}
         root["asset"] = {**root.get("asset", {}), "generator": "torch_modal"}
@@ -154,10 +122,13 @@ class GltfAsset(Asset):
                 del root[key]
         document = Document(root)
         for number, image in enumerate(document.get("images")):
-            data = old.image(number)
             image.pop("uri", None)
-            image["bufferView"] = document.add_bytes(data)
-            image.setdefault("mimeType", "image/jpeg" if data.startswith(b"\xff\xd8") else "image/png")
+            added = document.add_image(old.image(number))
+            image.setdefault("mimeType", added["mimeType"])
+            image["bufferView"] = added["bufferView"]
+        for node_json in document.get("nodes"):
+            for key in ("mesh", "skin", "weights"):
+                node_json.pop(key, None)
         taken: dict[int, int] = {}
 
         def take(accessor: int, target: int) -> int:
@@ -170,13 +141,8 @@ class GltfAsset(Asset):
                     document.get("accessors", taken[accessor])["name"] = given["name"]
             return taken[accessor]
 
-        drawn: list[Drawn] = []
-        nodes: list[int] = []
         for node in self._world:
             own = [primitive for primitive in self._primitives if primitive.node == node]
-            node_json = document.get("nodes", node)
-            for key in ("mesh", "skin", "weights"):
-                node_json.pop(key, None)
             if not own:
                 continue
             # Each node gets a mesh of its own: the same mesh may be shown, and deformed, at several places.
@@ -184,20 +150,33 @@ class GltfAsset(Asset):
             mesh.pop("weights", None)
             mesh["primitives"] = []
             inverse = self._inverse(node)
-            for primitive, normals in zip(own, self._normals(own, inverse, frames), strict=True):
-                copied: Json = {"attributes": {}}
+            given, shapes = [], []
+            for primitive in own:
+                normal = primitive.json["attributes"].get("NORMAL")
+                normals = None if normal is None else old.floats(normal)
+                given.append((normals, old.floats(primitive.json["attributes"]["POSITION"]), primitive.triangles))
+                shapes.append(frames[:, primitive.points] @ inverse[:3, :3].T + inverse[:3, 3])
+            turned = carry_together(given, shapes if move_normals else [x[:1] for x in shapes])
+            placed: dict[tuple[int, int | None], list[Json]] = {}
+            for primitive, shape, normals in zip(own, shapes, turned, strict=True):
+                attributes = primitive.json["attributes"]
+                points = attributes["POSITION"], attributes.get("NORMAL")
+                if points not in placed:
+                    placed[points] = document.add_frames(shape, normals)
+                first, *targets = placed[points]
+                copied: Json = {"attributes": dict(first)}
                 for key in {"material", "mode", "extras"} & primitive.json.keys():
                     copied[key] = copy.deepcopy(primitive.json[key])
-                for name, accessor in primitive.json["attributes"].items():
+                for name, accessor in attributes.items():
                     if name not in ("POSITION", "NORMAL", "TANGENT") and not name.startswith(("JOINTS_", "WEIGHTS_")):
                         copied["attributes"][name] = take(accessor, ARRAY_BUFFER)
                 if "indices" in primitive.json:
                     copied["indices"] = take(primitive.json["indices"], ELEMENT_ARRAY_BUFFER)
+                if targets:
+                    copied["targets"] = targets
                 mesh["primitives"].append(copied)
-                drawn.append(Drawn(copied, primitive.points, inverse, normals))
-            node_json["mesh"] = document.append("meshes", mesh)
-            nodes.append(node)
-        return document, drawn, nodes
+            document.get("nodes", node)["mesh"] = document.append("meshes", mesh)
+        return document
 
     def _inverse(self, node: int) -> FloatArray:
         try:
@@ -207,22 +186,6 @@ class GltfAsset(Asset):
             raise MeshError(
                 f"{self.path}: the node {name} flattens its mesh, so that positions cannot be transformed back"
             ) from None
-
-    def _normals(
-        self, primitives: Sequence[_Primitive], inverse: FloatArray, frames: FloatArray
-    ) -> list[FloatArray | None]:
-        """Normals of a node's primitives in each frame, None for those without. *Shape of each:* ``(N, P, 3)``."""
-        with_normals = [p for p in primitives if "NORMAL" in p.json["attributes"]]
-        if not with_normals:
-            return [None] * len(primitives)
-        parts = []
-        for p in with_normals:
-            normals, positions = (self.document.floats(p.json["attributes"][name]) for name in ("NORMAL", "POSITION"))
-            parts.append((normals, positions, p.triangles))
-        points = np.concatenate([np.arange(p.points.start, p.points.stop) for p in with_normals])
-        local = frames[:, points] @ inverse[:3, :3].T + inverse[:3, 3]
-        turned = iter(carry_together(parts, local))
-        return [next(turned) if "NORMAL" in p.json["attributes"] else None for p in primitives]
 
     # --------------------------------------------------------------------------------------------- for other formats
     def parts(self) -> list[Part]:
@@ -250,8 +213,7 @@ class GltfAsset(Asset):
         if "baseColorTexture" in surface:
             texture = self.document.get("textures", surface["baseColorTexture"]["index"])
             if "source" in texture:
-                data = self.document.image(texture["source"])
-                image = as_image(data) or Image(data, "image/png")
+                image = as_png_or_jpeg(self.document.image(texture["source"]))
         color = tuple(float(c) for c in surface.get("baseColorFactor", (1, 1, 1, 1)))
         metallic, roughness = surface.get("metallicFactor", 1.0), surface.get("roughnessFactor", 1.0)
         return Material(material.get("name", f"material-{number}"), color, metallic, roughness, image)

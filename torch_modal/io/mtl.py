@@ -5,67 +5,75 @@ from __future__ import annotations
 import re
 import warnings
 from pathlib import Path
-from typing import NamedTuple
 
 from torch_modal.errors import MeshWarning
-from torch_modal.io.asset import Material, as_image
+from torch_modal.io.asset import Material, as_png_or_jpeg
 
 _OPTION = re.compile(r"-(?:[ost](?:\s+-?[\d.]+){1,3}|mm\s+\S+\s+\S+|\w+\s+\S+)\s+")
 """An option of a texture line with its values: those of coordinates have up to three numbers."""
 
 
-class Libraries(NamedTuple):
-    """Materials and files of the material libraries of an OBJ file."""
-
-    materials: dict[str, Material]
-    files: dict[str, bytes]
-    """Libraries and textures, by their names beside a copy of the OBJ file."""
-
-
-def read_libraries(path: Path, names: list[str]) -> Libraries:
-    """Read material libraries.
+def read_libraries(path: Path, names: list[str]) -> tuple[dict[str, Material], dict[str, bytes]]:
+    """Read the material libraries that an OBJ file names.
 
     A copy has textures from outside the file's folder beside it, and the library names them there.
 
-    Args:
-        path: The OBJ file.
-        names: From its ``mtllib`` lines.
+    Returns:
+        The materials; the libraries and their textures, by their names beside a copy of the OBJ file.
 
     Warns:
         MeshWarning: A library or a texture is not there.
     """
-    found = Libraries({}, {})
+    materials: dict[str, Material] = {}
+    files: dict[str, bytes] = {}
     for line in names:
         # One name may hold blanks; blanks also separate several names.
-        each = [line] if (path.parent / line).is_file() else line.split()
-        for name in each:
-            library = path.parent / name
-            if library.is_file():
-                _read_library(path, library, name, found)
+        for name in [line] if (path.parent / line).is_file() else line.split():
+            if (path.parent / name).is_file():
+                files[_name_in_copy(name)] = _read_library(path.parent, name, materials, files)
             else:
-                warnings.warn(f"{path.name} names the materials {name}, which are not there", MeshWarning, stacklevel=4)
-    return found
+                warnings.warn(f"{path.name} names the materials {name}, which are not there", MeshWarning, stacklevel=5)
+    return materials, files
 
 
-def _read_library(path: Path, library: Path, name: str, found: Libraries) -> None:
+def _read_library(folder: Path, name: str, materials: dict[str, Material], files: dict[str, bytes]) -> bytes:
+    """Add the materials and textures of a library; returns its content for a copy."""
+    library = folder / name
     lines = library.read_bytes().decode("utf-8", errors="surrogateescape").splitlines()
     material = ""
     for number, line in enumerate(lines):
-        words = line.partition("#")[0].split()
-        if not words:
-            continue
-        key = words[0].lower()
+        key, *words = line.partition("#")[0].split() or [""]
+        key = key.lower()
         if key == "newmtl":
             material = line.split(None, 1)[1].strip()
-            found.materials[material] = Material(material, (0.8, 0.8, 0.8, 1.0))
+            materials[material] = Material(material, (0.8, 0.8, 0.8, 1.0))
         elif key.startswith("map_") or key in ("bump", "norm", "disp", "decal", "refl"):
-            lines[number] = _take_texture(path, library, line, key, material, found)
-        elif material in found.materials:
-            found.materials[material] = _property(found.materials[material], key, words[1:])
-    found.files[_name_in_copy(name)] = ("\n".join(lines) + "\n").encode("utf-8", errors="surrogateescape")
+            # The file stands after the options, and may hold blanks.
+            written = "".join(line.strip().split(None, 1)[1:])
+            while option := _OPTION.match(written):
+                written = written[option.end() :]
+            texture = written.replace("\\", "/")
+            place = next((base / texture for base in (library.parent, folder) if (base / texture).is_file()), None)
+            if place is None:
+                if texture:
+                    said = f"{library.name} names the texture {texture}, which is not there"
+                    warnings.warn(said, MeshWarning, stacklevel=6)
+                continue
+            kept = _name_in_copy(texture)
+            files[kept] = place.read_bytes()
+            if kept != texture:
+                lines[number] = line.rstrip().removesuffix(written) + kept
+            if key == "map_kd" and material in materials:
+                old = materials[material]
+                # Exporters that paint by the texture alone leave black here, which would multiply it away.
+                color = (1.0, 1.0, 1.0, old.color[3]) if not any(old.color[:3]) else old.color
+                materials[material] = old._replace(texture=as_png_or_jpeg(files[kept]), color=color)
+        elif material in materials:
+            materials[material] = _with_property(materials[material], key, words)
+    return ("\n".join(lines) + "\n").encode("utf-8", errors="surrogateescape")
 
 
-def _property(material: Material, key: str, words: list[str]) -> Material:
+def _with_property(material: Material, key: str, words: list[str]) -> Material:
     try:
         numbers = [float(word) for word in words]
     except ValueError:
@@ -83,34 +91,6 @@ def _property(material: Material, key: str, words: list[str]) -> Material:
         case "pm", [x, *_]:
             return material._replace(metallic=min(max(x, 0.0), 1.0))
     return material
-
-
-def _take_texture(path: Path, library: Path, line: str, key: str, material: str, found: Libraries) -> str:
-    """Record a texture; returns its line for a copy of the library."""
-    name = _texture_name(line)
-    if not name:
-        return line
-    texture = next((base / name for base in (library.parent, path.parent) if (base / name).is_file()), None)
-    if texture is None:
-        warnings.warn(f"{library.name} names the texture {name}, which is not there", MeshWarning, stacklevel=6)
-        return line
-    data = texture.read_bytes()
-    kept = _name_in_copy(name)
-    found.files[kept] = data
-    if key == "map_kd" and material in found.materials:
-        old = found.materials[material]
-        # Exporters that paint by the texture alone leave black here, which would multiply it away.
-        color = (1.0, 1.0, 1.0, old.color[3]) if not any(old.color[:3]) else old.color
-        found.materials[material] = old._replace(texture=as_image(data), color=color)
-    return line if kept == name else line[: line.rindex(name)] + kept
-
-
-def _texture_name(line: str) -> str:
-    """The file that a texture line names, after its options; it may hold blanks."""
-    text = "".join(line.strip().split(None, 1)[1:])
-    while option := _OPTION.match(text):
-        text = text[option.end() :]
-    return text.replace("\\", "/").strip()
 
 
 def _name_in_copy(name: str) -> str:

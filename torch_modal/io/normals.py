@@ -1,6 +1,6 @@
 """Normals of a file, rotated with the surface."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -11,12 +11,8 @@ from torch_modal.geometry.vectors import vertex_normals
 class CarriedNormals:
     """Rotates a file's normals with the surface, so that hard edges stay hard and smooth ones smooth.
 
-    Points with one place and one normal are one: seams of texture coordinates do not show in the shading.
-
-    Args:
-        normals: As the file has them. *Shape:* ``(P, 3)``.
-        positions: Of the same points, as the file has them. *Shape:* ``(P, 3)``.
-        triangles: Of points. *Shape:* ``(F, 3)``.
+    Points with one place and one normal are one: seams of texture coordinates do not show in the shading. All are as
+    the file has them. *Shape:* ``(P, 3), (P, 3), (F, 3)``.
     """
 
     def __init__(self, normals: FloatArray, positions: FloatArray, triangles: IntArray) -> None:
@@ -32,10 +28,7 @@ class CarriedNormals:
         self.before = self._frames(positions)
 
     def _frames(self, positions: FloatArray) -> FloatArray:
-        """Right-handed frames of the surface at each point, with the normal as first column. *Shape:* ``(P, 3, 3)``.
-
-        The second column is the edge made perpendicular to it, or any perpendicular if the edge is along the normal.
-        """
+        """Right-handed frames at each point: the normal, the edge made perpendicular to it. *Shape:* ``(P, 3, 3)``."""
         x = positions[self.first]
         normals, sides = vertex_normals(x, self.triangles), x[self.neighbour] - x
         along = sides - np.einsum("ij,ij->i", sides, normals)[:, None] * normals
@@ -47,30 +40,27 @@ class CarriedNormals:
         return np.stack([normals, second, np.cross(normals, second)], axis=2)[self.group]
 
     def at(self, positions: FloatArray) -> FloatArray:
-        """The normals of the surface with other positions; bit for bit those of the file where it has not moved.
-
-        Args:
-            positions: *Shape:* ``(P, 3)``.
-        """
+        """The normals of the surface with other positions; bit for bit those of the file where it has not moved."""
         after = self._frames(positions)
         turned = np.einsum("nij,nkj,nk->ni", after, self.before, self.normals)
         return np.where((self.before == after).all(axis=(1, 2))[:, None], self.normals, turned)
 
 
 def carry_together(
-    parts: Sequence[tuple[FloatArray, FloatArray, IntArray]], frames: Iterable[FloatArray]
-) -> list[FloatArray]:
-    """Normals of several parts of a surface in each frame; where parts meet, equal normals stay equal.
+    parts: Sequence[tuple[FloatArray | None, FloatArray, IntArray]], frames: Sequence[FloatArray]
+) -> list[FloatArray | None]:
+    """Normals of several parts of a surface in each frame, None for those without; where parts meet, they stay equal.
 
-    Args:
-        parts: Arguments of :class:`CarriedNormals` for each.
-        frames: Positions of the points of all parts, one part after the other. *Shape of each:* ``(P, 3)``.
-
-    Returns:
-        *Shape of each:* ``(N, P of the part, 3)``.
+    Parts are arguments of :class:`CarriedNormals`. *Shape of each in the frames, and of the results:* ``(N, P, 3)``.
     """
-    normals, positions, triangles = zip(*parts, strict=True)
-    ends = np.cumsum([len(part) for part in normals])
-    shifted = [part + end - len(own) for part, end, own in zip(triangles, ends, normals, strict=True)]
-    carried = CarriedNormals(np.concatenate(normals), np.concatenate(positions), np.concatenate(shifted))
-    return np.split(np.stack([carried.at(x) for x in frames]), ends[:-1], axis=1)
+    found: list[FloatArray | None] = [None] * len(parts)
+    own = [k for k, (normals, _, _) in enumerate(parts) if normals is not None]
+    if own:
+        normals, positions, triangles = zip(*(parts[k] for k in own), strict=True)
+        ends = np.cumsum([len(part) for part in positions])
+        shifted = [part + end - len(place) for part, end, place in zip(triangles, ends, positions, strict=True)]
+        carried = CarriedNormals(np.concatenate(normals), np.concatenate(positions), np.concatenate(shifted))
+        turned = np.stack([carried.at(x) for x in np.concatenate([frames[k] for k in own], axis=1)])
+        for k, part in zip(own, np.split(turned, ends[:-1], axis=1), strict=True):
+            found[k] = part
+    return found

@@ -9,8 +9,8 @@ import numpy as np
 
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.errors import MeshError
-from torch_modal.io.asset import Asset, Material, Part, Polygons, linear
-from torch_modal.io.mtl import Libraries, read_libraries
+from torch_modal.io.asset import Asset, Material, Part, linear
+from torch_modal.io.mtl import read_libraries
 from torch_modal.io.normals import CarriedNormals
 
 
@@ -104,26 +104,23 @@ class ObjAsset(Asset):
         return ("\n".join(lines) + "\n").encode("utf-8", errors="surrogateescape")
 
     @cached_property
-    def _pairs(self) -> tuple[IntArray, IntArray]:
-        """Each vertex with each of its normals, ``(n, 2)``; index of the pair of each corner, -1 for none."""
+    def _carried(self) -> tuple[IntArray, IntArray, IntArray, CarriedNormals]:
+        """Pairs of a vertex and a normal; each corner's, -1 for none; their normals. *Shape:* ``(n,), (n,), (C,)``."""
         with_normal = self._corners[:, 2] >= 0
         pairs, inverse = np.unique(self._corners[with_normal][:, [2, 0]], axis=0, return_inverse=True)
         which = np.full(len(self._corners), -1)
         which[with_normal] = inverse.reshape(-1)
-        return pairs[:, ::-1], which
-
-    @cached_property
-    def _carried(self) -> CarriedNormals:
-        pairs, which = self._pairs
+        normals, vertices = pairs.T
         triangles = which[self._triangles]
-        vertices, normals = pairs.T
-        return CarriedNormals(self._normals[normals], self.positions[vertices], triangles[(triangles >= 0).all(axis=1)])
+        triangles = triangles[(triangles >= 0).all(axis=1)]
+        carried = CarriedNormals(self._normals[normals], self.positions[vertices], triangles)
+        return vertices, normals, which, carried
 
     def _write_normals(self, lines: list[str], positions: FloatArray) -> None:
-        pairs, which = self._pairs
-        text = [f"vn {x!r} {y!r} {z!r}" for x, y, z in self._carried.at(positions[pairs[:, 0]]).tolist()]
-        if len(np.unique(pairs[:, 1])) == len(pairs):
-            for index, line in zip(pairs[:, 1].tolist(), text, strict=True):
+        vertices, normals, which, carried = self._carried
+        text = [f"vn {x!r} {y!r} {z!r}" for x, y, z in carried.at(positions[vertices]).tolist()]
+        if len(np.unique(normals)) == len(normals):
+            for index, line in zip(normals.tolist(), text, strict=True):
                 lines[self._line_of["vn"][index]] = line
             return
         # A normal of several vertices: one for each instead, all at the place of the first.
@@ -138,20 +135,20 @@ class ObjAsset(Asset):
             lines[number] = " ".join([kind, *words])
 
     @cached_property
-    def _read(self) -> Libraries:
+    def _read(self) -> tuple[dict[str, Material], dict[str, bytes]]:
         return read_libraries(self.path, self._libraries)
 
-    @cached_property
+    @property
     def companions(self) -> dict[str, bytes]:
         """Material libraries and their textures."""
-        return self._read.files
+        return self._read[1]
 
     # --------------------------------------------------------------------------------------------- for other formats
-    def polygons(self) -> Polygons:
+    def polygons(self) -> tuple[IntArray, IntArray, FloatArray | None]:
         """The faces with their texture coordinates."""
         texcoords = self._corners[:, 1]
         known = (texcoords >= 0).all()
-        return Polygons(self._sizes, self._corners[:, 0], self._texcoords[texcoords] if known else None)
+        return self._sizes, self._corners[:, 0], self._texcoords[texcoords] if known else None
 
     def parts(self) -> list[Part]:
         """One part for each material that faces use."""
@@ -162,7 +159,7 @@ class ObjAsset(Asset):
             points, triangles = np.unique(corners, axis=0, return_inverse=True)
             vertices, texcoords, normals = points.T
             name = self._materials[number] if number >= 0 else ""
-            material = self._read.materials.get(name)
+            material = self._read[0].get(name)
             if material is None:
                 material = Material(name) if name else Material()
                 if colors is not None:
@@ -181,11 +178,7 @@ class ObjAsset(Asset):
 
 
 def _corner(word: str, counts: tuple[int, ...], place: str) -> tuple[int, ...]:
-    """Indices from 0 of a corner such as ``1/2/3`` or ``-1//-1``; -1 where there is none.
-
-    Raises:
-        MeshError: It has the index 0, or no vertex.
-    """
+    """Indices from 0 of a corner such as ``1/2/3`` or ``-1//-1``; -1 where there is none."""
     given = [int(part) if part else None for part in (*word.split("/"), "", "")[:3]]
     if 0 in given or given[0] is None:
         raise MeshError(f"{place} has the index 0 (OBJ counts from 1) or a corner without a vertex")

@@ -30,9 +30,6 @@ class PointFile:
         positions: *Shape:* ``(P, 3)``.
         is_splats: Whether the points are splats: with a rotation and logarithms of scales.
 
-    Args:
-        path: The file.
-
     Raises:
         FileNotFoundError: There is none.
         ValueError: It is no PLY file of points.
@@ -46,7 +43,7 @@ class PointFile:
             self.positions = self._file.columns("x", "y", "z")
         except (ValueError, KeyError, IndexError) as error:
             raise ValueError(f"{path} is no PLY file of points with x, y and z: {error}") from error
-        self._names = self._file.vertex.properties.keys()
+        self._names = self._file.properties.keys()
         self.is_splats = {*_QUATERNION, *_SCALES} <= self._names
         #: Properties of the harmonics above degree 0, one channel after the other.
         self._harmonics = sorted(
@@ -62,12 +59,8 @@ class PointFile:
     def moved(self, positions: FloatArray, rotations: FloatArray, gradients: FloatArray) -> bytes:
         """The file with points that moved, and what turns with them: normals; of splats axes, scales and harmonics.
 
-        Axes of splats turn, and scales change as lengths along the axes do.
-
-        Args:
-            positions: *Shape:* ``(P, 3)``.
-            rotations: *Shape:* ``(P, 3, 3)``.
-            gradients: Deformation gradients. *Shape:* ``(P, 3, 3)``.
+        Axes of splats turn, and scales change as lengths along the axes do under the deformation gradients. *Shape:*
+        ``(P, 3), (P, 3, 3), (P, 3, 3)``.
         """
         new = dict(zip("xyz", positions.T, strict=True))
         if {*_NORMALS} <= self._names:
@@ -93,12 +86,7 @@ class PointFile:
 def harmonics(directions: FloatArray, degree: int) -> FloatArray:
     """The real harmonics of a degree, in the order and with the signs of 3D Gaussian splatting (Kerbl et al. 2023).
 
-    Args:
-        directions: Unit vectors. *Shape:* ``(..., 3)``.
-        degree: 1, 2 or 3.
-
-    Returns:
-        *Shape:* ``(..., 2 degree + 1)``.
+    *Shape:* ``(..., 3) -> (..., 2 degree + 1)``, of unit vectors; degrees 1, 2 and 3.
     """
     x, y, z = np.moveaxis(directions, -1, 0)
     if degree == 1:
@@ -121,10 +109,7 @@ def harmonics(directions: FloatArray, degree: int) -> FloatArray:
 def rotated_harmonics(coefficients: FloatArray, rotations: FloatArray) -> FloatArray:
     """Coefficients of functions on the sphere that turn: ``f'(d) = f(R^T d)``.
 
-    Args:
-        coefficients: Of degrees 1 up to 3, one after the other. *Shape:* ``(P, C, 3)``, ``(P, C, 8)`` or
-            ``(P, C, 15)``.
-        rotations: *Shape:* ``(P, 3, 3)``.
+    Those of degrees 1 up to 3, one after the other, ``(P, C, 3)``, ``(P, C, 8)`` or ``(P, C, 15)``.
     """
     found = np.empty_like(coefficients)
     for start in range(0, len(coefficients), _CHUNK):

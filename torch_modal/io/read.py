@@ -23,17 +23,7 @@ SUFFIXES = tuple(READERS)
 
 
 def read_mesh(path: str | os.PathLike[str]) -> tuple[FloatArray, IntArray]:
-    """Read the positions and triangles of a file.
-
-    Args:
-        path: As for :func:`open_asset`.
-
-    Returns:
-        Vertices, *shape* ``(V, 3)``, in the file's units; faces, *shape* ``(F, 3)``.
-
-    Raises:
-        FileNotFoundError, MeshError: As for :func:`open_asset`.
-    """
+    """Positions ``(V, 3)``, in the file's units, and triangles ``(F, 3)`` of a file, as :func:`open_asset` reads it."""
     asset = open_asset(path)
     return asset.positions, asset.faces
 
@@ -45,8 +35,8 @@ def open_asset(path: str | os.PathLike[str]) -> Asset:
         path: An OBJ, PLY, OFF, GLB or GLTF file.
 
     Returns:
-        The asset: ``positions`` and ``faces`` are those of :func:`torch_modal.load_keyframes`; ``write`` makes the
-        same file with other positions.
+        The asset: ``positions`` and ``faces`` are those of :func:`torch_modal.load_keyframes`;
+        :func:`torch_modal.save_mesh` makes the same file with other positions.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -59,7 +49,7 @@ def open_asset(path: str | os.PathLike[str]) -> Asset:
             f"{path}: STL stores loose triangles without shared, ordered vertices, so key-frames cannot be "
             "matched vertex by vertex; export OBJ, PLY, OFF or GLB instead"
         )
-    if suffix not in SUFFIXES:
+    if suffix not in READERS:
         raise MeshError(f"{path}: unknown extension {suffix!r}; supported are {', '.join(SUFFIXES)}")
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such file")
@@ -102,17 +92,13 @@ def require_same_mesh(
             raise MeshError(f"{other} has {len(its)} {what}, {first} has {len(mine)}; {hint}")
     if np.array_equal(faces, other_faces):
         return
-    rows = np.sort(np.concatenate([faces, other_faces]), axis=1)
-    _, ids = np.unique(rows, axis=0, return_inverse=True)
-    mine, its = np.split(ids.reshape(-1), 2)
-    strange, missing = (np.flatnonzero(~np.isin(some, others)) for some, others in ((its, mine), (mine, its)))
-    if len(strange) or len(missing):
-        # Of equally many faces, some may be strange, or missing, or both.
-        file, rows, found, whole = (
-            (other, other_faces, strange, first) if len(strange) else (first, faces, missing, other)
-        )
-        raise MeshError(
-            f"face {found[0]} of {file}, vertices {rows[found[0]].tolist()}, is not in {whole} "
-            f"({max(len(strange), len(missing))} of {len(faces)} faces differ); {hint}; polygons "
-            "that start at another corner are cut along another diagonal, so export triangles"
-        )
+    here, there = (set(map(tuple, np.sort(rows, axis=1).tolist())) for rows in (faces, other_faces))
+    # Of equally many faces, some may be strange, or missing, or both.
+    for file, rows, known, whole in ((other, other_faces, here, first), (first, faces, there, other)):
+        strange = [number for number, row in enumerate(np.sort(rows, axis=1).tolist()) if tuple(row) not in known]
+        if strange:
+            raise MeshError(
+                f"face {strange[0]} of {file}, vertices {rows[strange[0]].tolist()}, is not in {whole} "
+                f"({len(strange)} of {len(faces)} faces differ); {hint}; polygons "
+                "that start at another corner are cut along another diagonal, so export triangles"
+            )

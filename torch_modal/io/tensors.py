@@ -18,7 +18,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from torch_modal.autograd import lasting
-from torch_modal.io.files import write_atomically
+from torch_modal.io.files import temporary_beside
 
 DIGESTS = "digests"
 ENTRY = "torch_modal"
@@ -27,19 +27,9 @@ ENTRY = "torch_modal"
 def write_tensors(
     path: Path, format: str, version: str, tensors: Mapping[str, Tensor], metadata: Mapping[str, Any] | None = None
 ) -> None:
-    """Write a whole file or nothing.
-
-    Args:
-        path: The file; its folder must exist.
-        format: Name of the format.
-        version: Version of the format.
-        tensors: On any device; copied where they share memory, which safetensors refuses.
-        metadata: Further entries of the header, which JSON can hold.
-
-    Raises:
-        OSError: The file cannot be written.
-    """
+    """Write a whole file or nothing, into a folder that exists. JSON must be able to hold the metadata."""
     header = json.dumps({"format": format, "version": version, **(metadata or {})}, sort_keys=True)
+    # Copies, as safetensors refuses tensors that share memory.
     parts = {
         name: tensor.detach().cpu().clone(memory_format=torch.contiguous_format) for name, tensor in tensors.items()
     }
@@ -47,21 +37,18 @@ def write_tensors(
     table = bytearray(b"".join([_header_digest(header, sorted(parts), rows), *rows]))
     parts[DIGESTS] = torch.frombuffer(table, dtype=torch.uint8).reshape(-1, 32)
     # Not safetensors' save_file: its files can be read by their owner alone, whatever the umask says.
-    write_atomically(path, save(parts, {ENTRY: header}))
+    with temporary_beside(path) as temporary:
+        temporary.write_bytes(save(parts, {ENTRY: header}))
 
 
 class TensorFile:
     """A file that is open for reading and mapped into memory: tensors are read when they are used, and outlive it.
 
+    It must have the format, the version and the tensors that are named.
+
     Attributes:
         metadata: Entries of the header.
         shapes: Shape of each tensor.
-
-    Args:
-        path: The file.
-        format: Format that it must have.
-        version: Version that it must have.
-        needs: Tensors that it must have.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -76,10 +63,13 @@ class TensorFile:
             self._file = safe_open(path, framework="pt", device="cpu")
             header = (self._file.metadata() or {}).get(ENTRY, "")
             names = sorted(self._file.keys())
-            digests = _bytes(self._file.get_tensor(DIGESTS)) if DIGESTS in names else b""
+            digests = bytes_of(self._file.get_tensor(DIGESTS)) if DIGESTS in names else b""
         except SafetensorError as error:
             raise ValueError(f"{path} is no safetensors file, or a damaged one: {error}") from error
-        self.metadata = _parsed(header)
+        try:
+            self.metadata: dict[str, Any] = dict(json.loads(header))
+        except (TypeError, ValueError, RecursionError):  # not of this package
+            self.metadata = {}
         if self.metadata.get("format") != format:
             raise ValueError(f"{path} holds no {format}: its format is {self.metadata.get('format')!r}")
         if self.metadata.get("version") != version:
@@ -98,11 +88,7 @@ class TensorFile:
 
     @lasting
     def tensor(self, name: str) -> Tensor:
-        """One of the tensors, compared with its digest.
-
-        Raises:
-            ValueError: It is not what was written.
-        """
+        """One of the tensors; raises ValueError if it is not what was written."""
         found: Tensor = self._file.get_tensor(name)
         if self._digests[name] != _digest(name, found):
             raise ValueError(f"{self.path} is damaged: its tensor {name!r} is not what was written")
@@ -116,21 +102,14 @@ class TensorFile:
 
 def _digest(name: str, tensor: Tensor) -> bytes:
     total = hashlib.sha256(json.dumps([name, str(tensor.dtype), list(tensor.shape)]).encode())
-    total.update(_bytes(tensor))
+    total.update(bytes_of(tensor))
     return total.digest()
 
 
-def _bytes(tensor: Tensor) -> bytes:
+def bytes_of(tensor: Tensor) -> bytes:
+    """The numbers of a tensor in main memory."""
     return tensor.contiguous().reshape(-1).view(torch.uint8).numpy().tobytes()
 
 
 def _header_digest(header: str, names: Sequence[str], rows: Sequence[bytes]) -> bytes:
     return hashlib.sha256(json.dumps([header, list(names)]).encode() + b"".join(rows)).digest()
-
-
-def _parsed(header: str) -> dict[str, Any]:
-    try:
-        found = json.loads(header)
-    except (ValueError, RecursionError):
-        return {}
-    return found if isinstance(found, dict) else {}

@@ -22,18 +22,11 @@ def to_numpy(array: Array) -> NDArray[Any]:
 
 
 def check_frames(frames: Array, faces: Array, name: str = "frames") -> tuple[FloatArray, IntArray]:
-    """Shapes and faces as NumPy arrays, after the checks that every output needs.
-
-    Args:
-        frames: Vertex positions. *Shape:* ``(N, V, 3)``.
-        faces: Vertex indices. *Shape:* ``(F, 3)``.
-        name: Of ``frames``, for messages.
-
-    Returns:
-        ``frames`` as float64, ``faces`` as int64.
+    """Shapes ``(N, V, 3)`` as float64 and faces ``(F, 3)`` as int64, after the checks that every output needs.
 
     Raises:
-        ValueError: A shape is wrong, a value is not finite, or a face names a vertex that does not exist.
+        ValueError: A shape is wrong, a value is not finite, or a face names a vertex that does not exist; the message
+            calls the shapes ``name``.
     """
     shapes, triangles = to_numpy(frames), to_numpy(faces)
     if shapes.ndim != 3 or shapes.shape[2] != 3 or 0 in shapes.shape:
@@ -67,22 +60,13 @@ def check_indices(indices: Sequence[int], n_frames: int, name: str) -> list[int]
     return numbers
 
 
-def check_suffix(path: Path, suffixes: Collection[str], name: str = "out") -> str:
-    """The suffix of a file in small letters, with its dot.
-
-    Args:
-        path: The file.
-        suffixes: Those that can be written.
-        name: Of the argument, for the message.
-
-    Raises:
-        ValueError: It is none of those.
-    """
+def check_suffix(path: Path, suffixes: Collection[str]) -> str:
+    """The suffix of a file in small letters, with its dot; raises if it is none of those that can be written."""
     suffix = path.suffix.lower()
     if suffix not in suffixes:
         *others, last = suffixes
         wanted = f"{', '.join(others)} or {last}" if others else last
-        raise ValueError(f"{name} must end in {wanted}, got {path.name!r}.")
+        raise ValueError(f"out must end in {wanted}, got {path.name!r}.")
     return suffix
 
 

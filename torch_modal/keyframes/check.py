@@ -17,7 +17,7 @@ from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.rigid import looks_mirrored
 from torch_modal.keyframes.arrays import as_faces, as_positions
 
-__all__ = ["Keyframes", "MeshError", "MeshWarning", "check_keyframes", "require_area", "require_solid"]
+__all__ = ["Keyframes", "MeshError", "MeshWarning", "check_keyframes"]
 
 # Rounding of a length, relative to the coordinates.
 _RESOLUTION = {torch.float32: 1e-6, torch.float64: 1e-12}
@@ -82,56 +82,6 @@ def checked_arrays(keyframes: Any, faces: Any, min_keyframes: int = 1) -> tuple[
         MeshError: Wrong shapes, values that are not finite, or invalid indices.
     """
     positions, indices = as_positions(keyframes), as_faces(faces)
-    _check_shapes(positions, indices, min_keyframes)
-    shapes = positions.detach().cpu().double().resolve_neg().numpy()
-    _check_values(shapes, indices)
-    return positions, shapes, indices
-
-
-def require_solid(vertices: Any, faces: Any) -> None:
-    """Reject a planar surface, which has no interior.
-
-    Args:
-        vertices: Positions of one shape. *Shape:* ``(V, 3)``.
-        faces: Vertex indices. *Shape:* ``(F, 3)``.
-
-    Raises:
-        MeshError: The extent across the plane that fits best is below 1e-6 of the largest extent.
-    """
-    extents = _extents(vertices, faces)
-    if extents[2] <= inspect.FLATNESS * extents[0]:
-        raise MeshError(
-            f"the surface is flat: its extents are {extents[0]:.3g}, {extents[1]:.3g} and {extents[2]:.3g}, so it "
-            'encloses nothing that could be filled with tetrahedra; take the modes of the surface (method="shell"), or '
-            "give it a thickness"
-        )
-
-
-def require_area(vertices: Any, faces: Any) -> None:
-    """Reject a surface on a line, which has no area.
-
-    Args:
-        vertices: Positions of one shape. *Shape:* ``(V, 3)``.
-        faces: Vertex indices. *Shape:* ``(F, 3)``.
-
-    Raises:
-        MeshError: The second extent is below 1e-6 of the largest.
-    """
-    extents = _extents(vertices, faces)
-    if extents[1] <= inspect.FLATNESS * extents[0]:
-        raise MeshError(
-            f"all vertices lie on a line: the extents are {extents[0]:.3g}, {extents[1]:.3g} and {extents[2]:.3g}; a "
-            "surface has an area"
-        )
-
-
-def _extents(vertices: Any, faces: Any) -> FloatArray:
-    """Extents of the referenced vertices along their principal axes, descending. *Shape:* ``(3,)``."""
-    points = torch.as_tensor(vertices).detach().cpu().double().numpy()
-    return inspect.principal_extents(points[np.unique(torch.as_tensor(faces).cpu().numpy())])
-
-
-def _check_shapes(positions: torch.Tensor, faces: IntArray, min_keyframes: int) -> None:
     shape = tuple(positions.shape)
     if len(shape) == 2 and shape[1] == 3:
         raise MeshError(f"keyframes have shape {shape}, which is one shape; pass keyframes[None] for (K, V, 3)")
@@ -141,18 +91,16 @@ def _check_shapes(positions: torch.Tensor, faces: IntArray, min_keyframes: int) 
         raise MeshError(f"{shape[0]} key-frame(s) arrived, at least {max(min_keyframes, 1)} are needed")
     if shape[1] == 0:
         raise MeshError(f"keyframes have shape {shape}: there are no vertices")
-    if faces.ndim == 2 and faces.shape[1] == 4:
+    if indices.ndim == 2 and indices.shape[1] == 4:
         raise MeshError(
-            f"faces have shape {faces.shape}, which is quads (or tetrahedra); triangles (F, 3) are needed: "
+            f"faces have shape {indices.shape}, which is quads (or tetrahedra); triangles (F, 3) are needed: "
             "cut each quad along one diagonal, the same for all key-frames"
         )
-    if faces.size == 0:
-        raise MeshError(f"faces have shape {faces.shape}: there are no faces; key-frames are surfaces of triangles")
-    if faces.ndim != 2 or faces.shape[1] != 3:
-        raise MeshError(f"faces have shape {faces.shape}; (F, 3) is needed, one for all key-frames")
-
-
-def _check_values(shapes: FloatArray, faces: IntArray) -> None:
+    if indices.size == 0:
+        raise MeshError(f"faces have shape {indices.shape}: there are no faces; key-frames are surfaces of triangles")
+    if indices.ndim != 2 or indices.shape[1] != 3:
+        raise MeshError(f"faces have shape {indices.shape}; (F, 3) is needed, one for all key-frames")
+    shapes = positions.detach().cpu().double().resolve_neg().numpy()
     finite = np.isfinite(shapes)
     if not finite.all():
         bad = ~finite.all(axis=2)
@@ -161,14 +109,15 @@ def _check_values(shapes: FloatArray, faces: IntArray) -> None:
             f"{bad.sum()} vertices have NaN or infinite positions; the first is vertex {v} of key-frame {k}: "
             f"{shapes[k, v].tolist()}"
         )
-    if faces.min() < 0 or faces.max() >= shapes.shape[1]:
-        wrong = ((faces < 0) | (faces >= shapes.shape[1])).any(axis=1)
+    if indices.min() < 0 or indices.max() >= shape[1]:
+        wrong = ((indices < 0) | (indices >= shape[1])).any(axis=1)
         face = int(np.flatnonzero(wrong)[0])
-        hint = "; indices count from 0, not from 1" if faces.min() == 1 and faces.max() == shapes.shape[1] else ""
+        hint = "; indices count from 0, not from 1" if indices.min() == 1 and indices.max() == shape[1] else ""
         raise MeshError(
             f"{wrong.sum()} faces use vertices that do not exist; the first is face {face}, vertices "
-            f"{faces[face].tolist()}, with {shapes.shape[1]} vertices{hint}"
+            f"{indices[face].tolist()}, with {shape[1]} vertices{hint}"
         )
+    return positions, shapes, indices
 
 
 def _repaired(faces: IntArray, n_vertices: int, note: Callable[[str], None]) -> tuple[Connectivity, bool]:
@@ -186,31 +135,26 @@ def _repaired(faces: IntArray, n_vertices: int, note: Callable[[str], None]) -> 
         if len(kept) == 0:
             raise MeshError("all faces use a vertex twice, so none is a triangle")
     mesh = Connectivity(faces[kept], n_vertices)
-    winding = inspect.consistent_winding(mesh)
-    if len(winding.flipped):
-        first = kept[winding.flipped[0]]
+    wound, flipped, non_orientable = inspect.consistent_winding(mesh)
+    if len(flipped):
+        first = kept[flipped[0]]
         note(
-            f"{len(winding.flipped)} faces wind against their neighbours and were turned over; the first is "
+            f"{len(flipped)} faces wind against their neighbours and were turned over; the first is "
             f"face {first}, {faces[first].tolist()}"
         )
-    if len(winding.non_orientable):
-        first = kept[winding.non_orientable[0]]
+    if len(non_orientable):
+        first = kept[non_orientable[0]]
         note(
-            f"{len(winding.non_orientable)} faces belong to a surface that has no consistent winding (like a "
+            f"{len(non_orientable)} faces belong to a surface that has no consistent winding (like a "
             "Moebius strip) and were left as they are, so some dihedral angles have the wrong sign and the "
             f"volume means nothing; the first is face {first}, {faces[first].tolist()}"
         )
-    if len(winding.flipped):
-        mesh = Connectivity(winding.faces, n_vertices)
-    return mesh, not len(winding.non_orientable)
+    if len(flipped):
+        mesh = Connectivity(wound, n_vertices)
+    return mesh, not len(non_orientable)
 
 
-def _check_sizes(
-    shapes: FloatArray,
-    mesh: Connectivity,
-    dtype: torch.dtype,
-    note: Callable[[str], None],
-) -> FloatArray:
+def _check_sizes(shapes: FloatArray, mesh: Connectivity, dtype: torch.dtype, note: Callable[[str], None]) -> FloatArray:
     """Reject unusable sizes; return centred shapes with a diagonal of 1."""
     surface = shapes[:, mesh.used]
     with np.errstate(over="ignore", invalid="ignore"):
@@ -250,11 +194,7 @@ def _check_sizes(
 
 
 def _check_surface(
-    scaled: FloatArray,
-    mesh: Connectivity,
-    orientable: bool,
-    resolution: float,
-    note: Callable[[str], None],
+    scaled: FloatArray, mesh: Connectivity, orientable: bool, resolution: float, note: Callable[[str], None]
 ) -> None:
     """Report flaws that the solver tolerates; reject mirrored closed meshes."""
     faces, edges, counts = mesh.faces, mesh.edges, mesh.counts
@@ -287,9 +227,13 @@ def _check_surface(
         )
     boundary = mesh.boundary_edges
     if len(boundary):
+        # Rendering formats create coincident vertices at texture seams.
+        copies = np.unique(scaled[0][np.unique(boundary)], axis=0, return_counts=True)[1]
+        split = int(copies[copies > 1].sum())
+        seam = f"; {split} of its vertices lie exactly on each other, perhaps a seam: torch_modal.weld_seams joins them"
         note(
             f"the surface is open: {len(boundary)} edges belong to one face only, the first is edge "
-            f"{boundary[0].tolist()}" + _seam_hint(scaled[0], boundary)
+            f"{boundary[0].tolist()}{seam if split else ''}"
         )
     elif orientable and not (counts % 2).any():
         volumes = np.array([inspect.signed_volume(shape, faces) for shape in scaled])
@@ -304,15 +248,3 @@ def _check_surface(
                     f"{few}, seen from outside, and no motion without passing through itself leads from one to the "
                     "other; mirror it back (negate one coordinate)"
                 )
-
-
-def _seam_hint(vertices: FloatArray, boundary: IntArray) -> str:
-    """Hint at coincident boundary vertices, which rendering formats create at texture seams."""
-    ends = np.unique(boundary)
-    _, copies = np.unique(vertices[ends], axis=0, return_counts=True)
-    split = int(copies[copies > 1].sum())
-    return (
-        f"; {split} of its vertices lie exactly on each other, perhaps a seam: torch_modal.weld_seams joins them"
-        if split
-        else ""
-    )

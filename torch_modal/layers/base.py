@@ -1,7 +1,6 @@
 """The common part of all layers of in-betweens: bases, settings, the solver, and the border."""
 
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import Any
 
 import torch
@@ -11,13 +10,12 @@ from torch_modal.autograd import full_precision, lasting, outlasting, require_nu
 from torch_modal.contact.in_between import ContactSolver
 from torch_modal.energy.term import Mesh
 from torch_modal.energy.volume import Volume, encloses
-from torch_modal.inbetween.results import InBetweenResult, Samples, report
+from torch_modal.inbetween.results import InBetweenResult, Samples
 from torch_modal.inbetween.settings import Settings
 from torch_modal.inbetween.solver import InBetweenSolver
 from torch_modal.keyframes.arrays import as_faces
 from torch_modal.keyframes.check import checked_surface
-from torch_modal.precompute.basis import ModalBasis
-from torch_modal.solve.implicit import Report
+from torch_modal.modes.basis import ModalBasis
 
 
 class BasisBuffers(nn.Module):
@@ -126,20 +124,14 @@ class InBetweenLayer(PreciseModule):
         """The dtype of the computation."""
         return self.core.alignment.scale.dtype
 
-    def report(self) -> Report:
-        """The function that ``forward`` passes solutions to, for warnings."""
-        forbid = self.solver.unconverged == "raise" and torch.is_grad_enabled()
-        return partial(report, max_steps=self.solver.max_steps, forbid=forbid)
-
     @full_precision
-    def solved(self, keyframes: Tensor, weights: Tensor, lead: torch.Size, report: Report | None) -> InBetweenResult:
+    def solved(self, keyframes: Tensor, weights: Tensor, lead: torch.Size) -> InBetweenResult:
         """The in-betweens of key-frames and weights that were checked, in the layer's dtype.
 
         Args:
             keyframes: *Shape:* ``(*lead, K, V, 3)``, or one that expands to that.
             weights: *Shape:* ``(*lead, K)``, likewise.
             lead: The leading dimensions.
-            report: Receives the solution.
         """
         if self.solver.gradient == "implicit" or self.solver.local_steps:
             require_numbers(type(self).__name__, keyframes)
@@ -147,7 +139,7 @@ class InBetweenLayer(PreciseModule):
         flat = keyframes.to(self.dtype).expand(*lead, n, *item).reshape(-1, n, *item)
         pulls = weights.to(self.dtype).expand(*lead, n).reshape(-1, n)
         samples = Samples(flat, pulls, self.mu_of(pulls, lead), self.stiffness_of(pulls, lead))
-        return self.core(samples, report).unflattened(lead)
+        return self.core(samples).unflattened(lead)
 
     # ------------------------------------------------------------------------------------------------------ the border
     def check_shapes(self, **given: Tensor) -> None:

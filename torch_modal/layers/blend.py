@@ -4,10 +4,9 @@ import torch
 from torch import Tensor
 
 from torch_modal.autograd import broadcast_shapes, lasting, made_outside, once, traced
-from torch_modal.inbetween.results import InBetweenResult, with_exact_keyframes
+from torch_modal.inbetween.results import InBetweenResult, report, with_exact_keyframes
 from torch_modal.inbetween.settings import Objective, Preset, Solver, settings
 from torch_modal.layers.base import Bases, InBetweenLayer, basis_buffers
-from torch_modal.solve.implicit import Report
 
 MOST_BELOW_ZERO = 0.25
 """What weights below zero may add up to: energies then still have a minimum."""
@@ -59,10 +58,6 @@ class Blend(InBetweenLayer):
             raise ValueError("a blend needs one basis or more, got none")
         super().__init__(several * 2 if len(several) == 1 else several, faces, chosen)
 
-    def solve(self, keyframes: Tensor, weights: Tensor) -> InBetweenResult:
-        """The shapes, and how each minimisation went, without a warning. Arguments as for :meth:`forward`."""
-        return self._solved(keyframes, weights, None)
-
     def forward(self, keyframes: Tensor, weights: Tensor) -> Tensor:
         """The weighted in-betweens.
 
@@ -80,9 +75,12 @@ class Blend(InBetweenLayer):
             ValueError: Shapes, dtypes, devices or weights that do not fit.
             ConvergenceError: A sample did not converge, gradients are recorded and ``unconverged="raise"``.
         """
-        return self._solved(keyframes, weights, self.report()).shapes
+        found = self.solve(keyframes, weights)
+        report(found.solution, self.solver)
+        return found.shapes
 
-    def _solved(self, keyframes: Tensor, weights: Tensor, report: Report | None) -> InBetweenResult:
+    def solve(self, keyframes: Tensor, weights: Tensor) -> InBetweenResult:
+        """The shapes, and how each minimisation went, without a warning. Arguments as for :meth:`forward`."""
         lead = self._check(keyframes, weights)
         pulls = weights
         if torch.finfo(weights.dtype).bits < 32:  # of an autocast model: to more digits, they do not add up to one
@@ -91,7 +89,7 @@ class Blend(InBetweenLayer):
         x, several = keyframes, weights.shape[-1] > 2
         if several:  # second derivatives pass what goes in, in reverse mode, or what comes out, in forward mode
             x, pulls = once(x, SECOND), once(pulls, SECOND)
-        result = self.solved(x, pulls, lead, report)
+        result = self.solved(x, pulls, lead)
         shapes = once(result.shapes, SECOND) if several else result.shapes
         return result._replace(shapes=with_exact_keyframes(shapes, keyframes, weights))
 

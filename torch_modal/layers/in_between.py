@@ -5,10 +5,9 @@ from torch import Tensor
 
 from torch_modal.autograd import broadcast_shapes, lasting, made_outside, traced
 from torch_modal.geometry.crossings import require_contact
-from torch_modal.inbetween.results import InBetweenResult, with_exact_keyframes
+from torch_modal.inbetween.results import InBetweenResult, report, with_exact_keyframes
 from torch_modal.inbetween.settings import Objective, Preset, Solver, settings
 from torch_modal.layers.base import Bases, InBetweenLayer, basis_buffers
-from torch_modal.solve.implicit import Report
 
 
 class InBetween(InBetweenLayer):
@@ -65,10 +64,6 @@ class InBetween(InBetweenLayer):
             raise ValueError("the paired space (Eq. 4) is one of modes; pass bases, not key-frames")
         super().__init__(ends * 2 if len(ends) == 1 else ends, faces, chosen)
 
-    def solve(self, x_a: Tensor, x_b: Tensor, t: Tensor | float) -> InBetweenResult:
-        """The in-betweens, and how each minimisation went, without a warning. Arguments as for :meth:`forward`."""
-        return self._solved(x_a, x_b, t, None)
-
     def forward(self, x_a: Tensor, x_b: Tensor, t: Tensor | float) -> Tensor:
         """The in-betweens.
 
@@ -88,9 +83,12 @@ class InBetween(InBetweenLayer):
             ValueError: Shapes, dtypes, devices or times that do not fit.
             ConvergenceError: A sample did not converge, gradients are recorded and ``unconverged="raise"``.
         """
-        return self._solved(x_a, x_b, t, self.report()).shapes
+        found = self.solve(x_a, x_b, t)
+        report(found.solution, self.solver)
+        return found.shapes
 
-    def _solved(self, x_a: Tensor, x_b: Tensor, t: Tensor | float, report: Report | None) -> InBetweenResult:
+    def solve(self, x_a: Tensor, x_b: Tensor, t: Tensor | float) -> InBetweenResult:
+        """The in-betweens, and how each minimisation went, without a warning. Arguments as for :meth:`forward`."""
         self.check_shapes(x_a=x_a, x_b=x_b)
         times = torch.as_tensor(t, dtype=self.dtype, device=x_a.device)
         try:
@@ -107,7 +105,7 @@ class InBetween(InBetweenLayer):
         dtype = torch.promote_types(x_a.dtype, x_b.dtype)
         keyframes = torch.stack(torch.broadcast_tensors(x_a.to(dtype), x_b.to(dtype)), -3)
         weights = torch.stack([1 - times, times], -1)
-        result = self.solved(keyframes, weights, lead, report)
+        result = self.solved(keyframes, weights, lead)
         return result._replace(shapes=with_exact_keyframes(result.shapes, keyframes, weights))
 
 

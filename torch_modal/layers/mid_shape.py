@@ -8,7 +8,7 @@ from torch_modal.inbetween.results import InBetweenResult
 from torch_modal.inbetween.settings import Objective, Preset, Solver, settings
 from torch_modal.layers.base import Bases
 from torch_modal.layers.in_between import InBetween
-from torch_modal.precompute.basis import ModalBasis
+from torch_modal.modes.basis import ModalBasis
 
 
 class MidShape(nn.Module):

@@ -1,4 +1,4 @@
-"""Elastic energy of a decoder's shapes along small steps and along paths in its latent space."""
+"""Elastic energy of small steps in the latent space of a decoder."""
 
 from collections.abc import Callable
 from typing import Any, Literal
@@ -94,15 +94,21 @@ class LatentElasticity(nn.Module):
         steps = [row.expand_as(z) for row in directions]
         if self.step is not None:
             both = [(decoder(z + self.step * row), decoder(z - self.step * row)) for row in steps]
-            return checked_decoded(decoder(z), z), [(up - down) / (2 * self.step) for up, down in both]
-        try:
-            found: list[Any] = [torch.func.jvp(decoder, (z,), (row,)) for row in steps]
-        except (NotImplementedError, RuntimeError) as error:
-            decoder(z)  # a decoder that fails without derivatives too has an error of its own
-            raise NotImplementedError(
-                f"the decoder has no forward mode ({error}); pass LatentElasticity(..., step=1e-3) for differences"
-            ) from error
-        return checked_decoded(found[0][0], z), [tangent for _, tangent in found]
+            x, tangents = decoder(z), [(up - down) / (2 * self.step) for up, down in both]
+        else:
+            try:
+                found: list[Any] = [torch.func.jvp(decoder, (z,), (row,)) for row in steps]
+            except (NotImplementedError, RuntimeError) as error:
+                decoder(z)  # a decoder that fails without derivatives too has an error of its own
+                raise NotImplementedError(
+                    f"the decoder has no forward mode ({error}); pass LatentElasticity(..., step=1e-3) for differences"
+                ) from error
+            x, tangents = found[0][0], [tangent for _, tangent in found]
+        if x.dim() != 3 or x.shape[-1] != 3 or len(x) != len(z):
+            raise ValueError(
+                f"the decoder makes shapes ({len(z)}, V, 3) of latents {tuple(z.shape)}; got {tuple(x.shape)}"
+            )
+        return x.to(torch.promote_types(x.dtype, torch.float32)), tangents  # of an autocast decoder
 
     @full_precision
     def _gram(self, x: Tensor, along: list[Tensor]) -> Tensor:
@@ -116,51 +122,3 @@ class LatentElasticity(nn.Module):
             scaled = torch.stack(rates, 1) * weights.sqrt()[:, None]  # (B, k, M)
             gram = gram + scaled @ scaled.mT
         return gram
-
-
-class PathEnergy(nn.Module):
-    r"""Elastic energy of a path of codes: :math:`(T-1) \sum_k W(x_{k+1}, x_k)` with :class:`ShellLoss` as ``W``.
-
-    The discrete path energy of Heeren et al. 2012, of decoded shapes. Minimised over the inner codes with the ends
-    fixed, a straight line in the latent becomes a motion in which the shapes bend more than they stretch.
-
-    Args:
-        faces: Vertex indices. *Shape:* ``(F, 3)``.
-        stiffness: ``alpha``, ``beta`` and ``gamma`` of :class:`ShellLoss`.
-    """
-
-    def __init__(self, faces: Tensor, **stiffness: float | Tensor) -> None:
-        super().__init__()
-        self.shell = ShellLoss(faces, **stiffness)
-
-    def forward(self, decoder: Decoder, codes: Tensor) -> Tensor:
-        """The energy of each path.
-
-        Args:
-            decoder: Maps latents ``(B, n)`` to shapes ``(B, V, 3)``.
-            codes: T of 2 or more. *Shape:* ``(..., T, n)``.
-
-        Returns:
-            *Shape:* ``(...)``.
-
-        Raises:
-            ValueError: There are fewer than two codes, or the decoder has another shape.
-        """
-        if codes.dim() < 2 or codes.shape[-2] < 2:
-            raise ValueError(f"a path has two codes or more, (..., T, n); got {tuple(codes.shape)}")
-        flat = codes.reshape(-1, codes.shape[-1])
-        x = checked_decoded(decoder(flat), flat)
-        x = x.view(*codes.shape[:-1], *x.shape[1:])
-        each: Tensor = self.shell(x[..., 1:, :, :], x[..., :-1, :, :])
-        return (codes.shape[-2] - 1) * each.sum(-1)
-
-
-def checked_decoded(x: Tensor, z: Tensor) -> Tensor:
-    """Decoded shapes, in float32 or more.
-
-    Raises:
-        ValueError: They are not ``(B, V, 3)``.
-    """
-    if x.dim() != 3 or x.shape[-1] != 3 or len(x) != len(z):
-        raise ValueError(f"the decoder makes shapes ({len(z)}, V, 3) of latents {tuple(z.shape)}; got {tuple(x.shape)}")
-    return x.to(torch.promote_types(x.dtype, torch.float32))  # of an autocast decoder

@@ -11,16 +11,18 @@ coordinates that turn along.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
 
-from torch_modal.autograd import made_outside, traced
+from torch_modal.autograd import in_use, made_outside, mapped, traced
 
 # Velocities are cut from this many times the slower one of the steps before and after on, and never reach three times:
 # what stops, stops, and no quantity that grows overshoots (Fritsch and Carlson 1980).
 LIMIT = 2.75
+
+Part = TypeVar("Part")
 
 Squared = Callable[[Tensor], Tensor]
 """The squared size of a quantity, which broadcasts against it."""
@@ -47,14 +49,9 @@ class Cubics(NamedTuple):
 def cubics(
     steps: Tensor, durations: Tensor, cyclic: bool, squared: Squared = torch.square, scheme: Scheme | None = None
 ) -> Cubics:
-    """The cubics of given steps.
+    """The cubics of given steps and durations, by :func:`limited_spline` unless there is another scheme.
 
-    Args:
-        steps: *Shape:* ``(N, ...)``.
-        durations: *Shape:* ``(N,)``.
-        cyclic: True where the last step leads back to the first key-frame.
-        squared: The squared size of a quantity.
-        scheme: The path scheme. Default: :func:`limited_spline`.
+    *Shape:* ``(N, ...), (N,)``. A cycle's last step leads back to its first key-frame.
     """
     h = durations.to(steps).view(-1, *[1] * (steps.dim() - 1))
     velocities = (scheme or limited_spline)(steps / h, durations, cyclic, squared)
@@ -86,21 +83,16 @@ def limited_spline(speeds: Tensor, durations: Tensor, cyclic: bool, squared: Squ
         matrix[0, :2], matrix[-1, -2:] = torch.tensor([[2.0, 1], [1, 2]]).to(h)
         right[0, 0] = right[-1, -1] = 3
     velocities = torch.tensordot(torch.linalg.solve(matrix, right).to(speeds), speeds, 1)
-    found = limited(velocities[inner], speeds[before], speeds[inner], squared)
-    if cyclic:
-        return torch.cat([found, found[:1]])
-    return torch.cat([1.5 * speeds[:1] - 0.5 * found[:1], found, 1.5 * speeds[-1:] - 0.5 * found[-1:]])
-
-
-def limited(velocities: Tensor, before: Tensor, after: Tensor, squared: Squared) -> Tensor:
-    """Velocities, shortened where they exceed the geometric mean of those before and after by :data:`LIMIT`."""
-    slow, fast, found = squared(before), squared(after), squared(velocities)
+    slow, fast, found = squared(speeds[before]), squared(speeds[inner]), squared(velocities[inner])
     both = slow + fast
     most = LIMIT**2 * slow * fast / torch.where(both > 0, both, 1)
     # Up to the limit nothing changes; beyond it, velocities fall so that no corner is left, there or at rest.
     cut = most < found
     part = torch.where(cut, most, 1) / torch.where(cut, found, 1)
-    return velocities * (part * (2 - part))
+    found = velocities[inner] * (part * (2 - part))
+    if cyclic:
+        return torch.cat([found, found[:1]])
+    return torch.cat([1.5 * speeds[:1] - 0.5 * found[:1], found, 1.5 * speeds[-1:] - 0.5 * found[-1:]])
 
 
 def offset(first: Tensor, last: Tensor, u: Tensor) -> Tensor:
@@ -109,7 +101,7 @@ def offset(first: Tensor, last: Tensor, u: Tensor) -> Tensor:
 
 
 def located(t: Tensor, times: Tensor, cyclic: bool, rounding: float = 0.0) -> tuple[Tensor, Tensor]:
-    """The interval between key-frames that each time lies in, and how far along it is.
+    """The interval between key-frames that each time lies in, and how far along it is. *Shape of each:* ``(B,)``.
 
     Args:
         t: *Shape:* ``(B,)``.
@@ -117,9 +109,6 @@ def located(t: Tensor, times: Tensor, cyclic: bool, rounding: float = 0.0) -> tu
         cyclic: True where times are taken modulo the period.
         rounding: Relative. Times so near to a key-frame are taken for its own: 0.3 in float32 is beside 0.3 in float64,
             and would miss the key-frame, or lie after the last.
-
-    Returns:
-        *Shape of each:* ``(B,)``.
 
     Raises:
         ValueError: A time is before the first or after the last.
@@ -138,15 +127,33 @@ def located(t: Tensor, times: Tensor, cyclic: bool, rounding: float = 0.0) -> tu
 
 
 def _check_times(t: Tensor, times: Tensor) -> None:
-    outside = ~((t >= times[0]) & (t <= times[-1]))
-    if bool(outside.any()):
-        raise ValueError(
-            f"t lies between the times of the first and the last key-frame, {float(times[0]):g} and "
-            f"{float(times[-1]):g}; got {float(t[outside][0]):g}"
-        )
+    outside = t[~((t >= times[0]) & (t <= times[-1]))].tolist()
+    if outside:
+        ends = f"{float(times[0]):g} and {float(times[-1]):g}"
+        raise ValueError(f"t lies between the times of the first and the last key-frame, {ends}; got {outside[0]:g}")
 
 
 def wrapped(t: Tensor, times: Tensor) -> Tensor:
     """Times modulo the period of a cycle. *Shape:* ``(B,)``."""
     period = times[-1] - times[0]
     return t - period * torch.floor((t.detach() - times[0]) / period)
+
+
+def by_interval(
+    segment: Tensor, n: int, shapes: Callable[[int, Tensor | slice], Part], everywhere: bool = False
+) -> tuple[list[Part], Tensor]:
+    """Shapes whose intervals are computed one after the other, and where each stands among those of all intervals.
+
+    Args:
+        segment: The interval of each shape. *Shape:* ``(B,)``.
+        n: Number of intervals.
+        shapes: Computes some rows of the batch, which are in one interval.
+        everywhere: True to compute all rows of each interval, as where ``vmap`` maps the intervals.
+    """
+    intervals = in_use(segment, n) or [0]  # of nothing, nothing
+    if everywhere or mapped(segment):
+        place, size = sum((segment == i) * place for place, i in enumerate(intervals)), segment.shape[0]
+        order = place * size + torch.arange(size, device=segment.device)
+        return [shapes(i, slice(None)) for i in intervals], order
+    rows = [torch.nonzero(segment == i).flatten() for i in intervals]
+    return [shapes(i, own) for i, own in zip(intervals, rows, strict=True)], torch.argsort(torch.cat(rows))

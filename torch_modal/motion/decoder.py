@@ -12,15 +12,15 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from torch_modal.autograd import broadcast_shapes, full_precision, in_use, lasting, mapped, require_numbers, traced
+from torch_modal.autograd import broadcast_shapes, full_precision, lasting, require_numbers, traced
 from torch_modal.backends.torch.backend import TorchBackend
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.local_rotations import Trajectory
 from torch_modal.geometry.rotations import exp
-from torch_modal.geometry.triangle_frames import Frames, bend, convected, frames, sides
+from torch_modal.geometry.triangle_frames import Frames, bend, frames, sides
 from torch_modal.keyframes.arrays import checked_times
 from torch_modal.keyframes.check import checked_arrays
-from torch_modal.motion.cubics import located
+from torch_modal.motion.cubics import by_interval, located
 from torch_modal.motion.spline import Knots, Spline
 
 UNIT = 0.01
@@ -84,8 +84,9 @@ class ModalDecoder(nn.Module):
         rms = modes.square().sum(-1).mean(1).sqrt().clamp_min(torch.finfo(torch.float64).tiny)
         displaced = (modes * (UNIT * self.size / rms)[:, None, None]).movedim(-1, 0).contiguous()
         own = frames(sides(self.reference.T[:, None].contiguous(), self.faces))
+        turn, strain = bend(sides(displaced, self.faces), own)
         #: What an amplitude of 1 does to each triangle. *Shape:* ``(k, 6, F)``.
-        self.register_buffer("columns", _bounded(convected(bend(sides(displaced, self.faces), own), own), own))
+        self.register_buffer("columns", _bounded(torch.cat([own.coordinates(turn), strain]), own))
         #: What it does to the centres of loose pieces, if there are several. *Shape:* ``(k, 3V)``, or none.
         several = int(self._mesh.vertex_pieces.max()) > 0
         centres = (
@@ -126,11 +127,6 @@ class ModalDecoder(nn.Module):
         return other
 
     @property
-    def n_intervals(self) -> int:
-        """Between key-frames."""
-        return len(self.times) - 1
-
-    @property
     def n_modes(self) -> int:
         """Number of amplitudes, k."""
         return len(self.columns)
@@ -165,39 +161,29 @@ class ModalDecoder(nn.Module):
         lead = broadcast_shapes(amplitudes.shape[:-1], t.shape)
         a = amplitudes.expand(*lead, -1).reshape(-1, self.n_modes)
         segment, u = self.located(t.expand(lead).reshape(-1))
-        order: list[Tensor] = []
-        parts: list[Tensor] = []
-        everywhere = traced(segment) or mapped(segment)
-        for i in in_use(segment, self.n_intervals):
+        size = max(1, CHUNK // self.keyframes.shape[1])
+
+        def shapes(i: int, rows: Tensor | slice) -> Tensor:
             trajectory = self.spline.trajectory(knots, i)
-            if everywhere:  # of each interval all shapes, of which some are taken
-                x = self._shapes(knots, i, trajectory, a, u)
-                parts = [x if not parts else torch.where((segment == i)[:, None, None], x, parts[0])]
-                continue
-            for rows in torch.nonzero(segment == i).flatten().split(max(1, CHUNK // self.keyframes.shape[1])):
-                order.append(rows)
-                parts.append(self._shapes(knots, i, trajectory, a[rows], u[rows]))
-        if not parts:
-            return amplitudes.new_zeros(*lead, *self.keyframes.shape[1:])
-        x = parts[0] if everywhere else torch.cat(parts)[torch.argsort(torch.cat(order))]
+            if isinstance(rows, slice):
+                return self._shapes(knots, i, trajectory, a, u)
+            return torch.cat([self._shapes(knots, i, trajectory, a[own], u[own]) for own in rows.split(size)])
+
+        parts, order = by_interval(segment, len(self.times) - 1, shapes, traced(segment))
+        x = torch.cat(parts)[order]
         if motions is not None:
             x = moved(x, motions.expand(*lead, 6).reshape(-1, 6), self.size)
         return x.reshape(*lead, *x.shape[1:])
 
     def _shapes(self, knots: Knots, i: int, trajectory: Trajectory, a: Tensor, u: Tensor) -> Tensor:
+        """Shapes of one interval. *Shape:* ``(B, k), (B,)``."""
         which = torch.zeros_like(u, dtype=torch.int64)
-        return self.spline.alignment.restore(
-            self.bent(knots, i, trajectory, a, u), self.spline.pose(knots, i, which, u)
-        )
-
-    def bent(self, knots: Knots, i: int, trajectory: Trajectory, a: Tensor, u: Tensor) -> Tensor:
-        """Shapes of one interval, in the coordinates of the knots' shapes. *Shape:* ``(B, k), (B,)``."""
-        straight = self.spline.straight(knots, i, torch.zeros_like(u, dtype=torch.int64), u)
+        straight = self.spline.straight(knots, i, which, u)
         if self.moves.shape[1]:
             straight = straight + (a @ self.moves).unflatten(1, (-1, 3))
         bending = (a @ self.columns.flatten(1)).unflatten(1, (6, -1)).movedim(1, 0)
-        which = torch.zeros_like(u, dtype=torch.int64)
-        return self.spline(knots, i, which, u, trajectory, straight, bending)
+        x = self.spline(knots, i, which, u, trajectory, straight, bending)
+        return self.spline.alignment.restore(x, self.spline.pose(knots, i, which, u))
 
     def located(self, t: Tensor) -> tuple[Tensor, Tensor]:
         """The interval of each time, and how far along it is. *Shape:* ``(B,)``."""

@@ -34,7 +34,7 @@ class PathEditor:
         self.keyframes = keyframes.clone()
         self.steps = steps
         # The shapes of each interval, with what they were made of.
-        self._made: list[tuple[Tensor, list[Tensor]] | None] = [None] * (len(path.times) - 1)
+        self._made: list[tuple[Tensor, tuple[Tensor, Tensor]] | None] = [None] * (len(path.times) - 1)
 
     def replace(self, i: int, shape: Tensor) -> None:
         """Put another shape in the place of a key-frame.
@@ -86,7 +86,8 @@ class PathEditor:
         """All shapes; intervals that no change has touched are those of the last time. *Shape:* ``(T, V, 3)``."""
         at, found = self.times(), []
         for i, (made, needed) in enumerate(zip(self._made, self._needed(), strict=True)):
-            if made is None or not _alike(made[1], needed):
+            same = made is not None and torch.equal(made[1][0], needed[0])
+            if made is None or not same or not bool(((made[1][1] - needed[1]).abs() <= SLIGHT).all()):
                 own = at[i * self.steps : (i + 1) * self.steps]
                 made = lasting(self.path)(self.keyframes, own), needed
                 self._made[i] = made
@@ -94,20 +95,21 @@ class PathEditor:
         return torch.cat(found if self.path.cyclic else [*found, self.keyframes[-1:]])
 
     @lasting
-    def _needed(self) -> list[list[Tensor]]:
-        """Data that the shapes of each interval follow from, in units in which a change of one is visible."""
-        n, path = len(self._made), self.path
+    def _needed(self) -> list[tuple[Tensor, Tensor]]:
+        """Key-frames and velocities that each interval follows from, in visible units. *Shape:* ``(2, V, 3), (n,)``."""
+        path, closed = self.path, torch.cat([self.keyframes, self.keyframes[:1]])
+        ends = [closed[i : i + 2] for i in range(len(self._made))]
+        if not path.smooth:
+            return [(own, own.new_zeros(0)) for own in ends]
         size = (self.keyframes.amax(1) - self.keyframes.amin(1)).norm(dim=-1).amax()
-        closed = torch.cat([self.keyframes, self.keyframes[:1]]) / size
-        needed = [[closed[i], closed[i + 1]] for i in range(n)]
-        if path.smooth:
-            knots = path.spline.knots(self.keyframes[None].to(path.dtype))
-            scale = 1 / knots.shapes.abs().amax()
-            for i, own in enumerate(needed):
-                for tangent in (1, 2):
-                    turns, growth = knots.triangles[tangent][i].split(3)
-                    own += [turns, growth * scale, knots.turns[tangent][i], knots.moves[tangent][i] / size]
-        return needed
+        knots = path.spline.knots(self.keyframes[None].to(path.dtype))
+        unit = torch.ones(6, 1, 1).to(knots.shapes)
+        unit[3:] /= knots.shapes.abs().amax()  # of turns 1, of sizes those of the shapes
+        velocities = (
+            torch.cat([part.flatten(1) for part in (unit * triangles, turns, moves / size)], 1)
+            for triangles, turns, moves in zip(knots.triangles[1:], knots.turns[1:], knots.moves[1:], strict=True)
+        )
+        return list(zip(ends, torch.cat(list(velocities), 1), strict=True))
 
     def _checked(self, shape: Tensor) -> Tensor:
         if shape.shape != self.keyframes.shape[1:] or not bool(shape.isfinite().all()):
@@ -116,9 +118,3 @@ class PathEditor:
                 f"{tuple(shape.shape)}"
             )
         return shape.to(self.keyframes)
-
-
-def _alike(a: list[Tensor], b: list[Tensor]) -> bool:
-    """True where the key-frames, which come first, are the same, and velocities differ slightly at most."""
-    same = all(torch.equal(x, y) for x, y in zip(a[:2], b[:2], strict=True))
-    return same and all(bool((x - y).abs().amax() <= SLIGHT) for x, y in zip(a[2:], b[2:], strict=True))

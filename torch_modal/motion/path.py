@@ -1,13 +1,13 @@
 """Motion through many key-frames: smooth in time, at any time, differentiable."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from torch_modal.autograd import broadcast_shapes, full_precision, in_use, lasting, mapped, require_numbers
+from torch_modal.autograd import broadcast_shapes, full_precision, lasting, require_numbers
 from torch_modal.backends.choice import choose
 from torch_modal.contact.active import refuse_transforms
 from torch_modal.contact.in_between import push_apart
@@ -17,16 +17,15 @@ from torch_modal.energy.term import Mesh
 from torch_modal.geometry.crossings import require_contact
 from torch_modal.inbetween.alignment import Pose
 from torch_modal.inbetween.comparison import SLACK_OF_PATHS, no_worse
-from torch_modal.inbetween.results import InBetweenResult, unminimised, warn_of_starts, with_exact_keyframes
+from torch_modal.inbetween.results import InBetweenResult, report, unminimised, with_exact_keyframes
 from torch_modal.inbetween.settings import Objective, Preset, Solver, settings
 from torch_modal.keyframes.arrays import as_faces, checked_times
 from torch_modal.keyframes.check import checked_surface
 from torch_modal.layers.base import Bases, BasisBuffers, PreciseModule, basis_buffers
 from torch_modal.layers.blend import Blend
 from torch_modal.layers.in_between import InBetween
-from torch_modal.motion.cubics import Scheme, located, wrapped
+from torch_modal.motion.cubics import Scheme, by_interval, located, wrapped
 from torch_modal.motion.spline import Knots, Spline
-from torch_modal.solve.implicit import Report
 from torch_modal.solve.minimise import Solution
 
 # Even times between two key-frames at which a path looks for contacts.
@@ -97,11 +96,13 @@ class Path(PreciseModule):
         self.contact = objective.contact
         if self.contact:
             require_contact()
-        #: Number of even times in an interval at which contacts are searched.
-        self.n_searched = N_SEARCHED
         self.objective = replace(objective, contact=False)
         self.register_buffer("times", checked_times(times, n, cyclic))
         self.bases = nn.ModuleList(own)
+        #: Number of key-frames, K.
+        self.n_keyframes = n
+        #: The key-frames of each interval.
+        self.pairs = [(i, (i + 1) % n) for i in range(len(self.times) - 1)]
         self.faces = torch.from_numpy(as_faces(faces))
         self.cyclic, self.smooth = cyclic, bool(smooth) and (n > 2 or cyclic)
         #: The path scheme; None for the default.
@@ -110,7 +111,7 @@ class Path(PreciseModule):
         #: In-betweens of each interval; of a smooth path none, or, with contact or further terms, those of all bases.
         self.layers: Any = nn.ModuleList()
         if not self.smooth:
-            self.layers.extend(InBetween([own[i], own[j]], self.faces, **given) for i, j in self._pairs())
+            self.layers.extend(InBetween([own[i], own[j]], self.faces, **given) for i, j in self.pairs)
         elif self.objective.terms or self.contact:
             self.layers.append(Blend(own, self.faces, **given))
         self._build()
@@ -128,19 +129,9 @@ class Path(PreciseModule):
         self.distortion = backend.distortion(Mesh(connectivity), None).to(like)
 
     @property
-    def n_keyframes(self) -> int:
-        """Number of key-frames, K."""
-        return len(self.bases)
-
-    @property
     def dtype(self) -> torch.dtype:
         """The dtype of the computation."""
         return self.spline.alignment.scale.dtype
-
-    def _pairs(self) -> list[tuple[int, int]]:
-        """The key-frames of each interval."""
-        n = len(self.bases)
-        return [(i, (i + 1) % n) for i in range(n if self.cyclic else n - 1)]
 
     @lasting
     def insert(self, t: float) -> "Path":
@@ -164,24 +155,13 @@ class Path(PreciseModule):
         if bool(((self.times - at).abs() <= SAME_TIME * scale).any()):
             raise ValueError(f"there is a key-frame at {t:g} already; replace it in the keyframes that are passed")
         i, own = int(segment[0]), [BasisBuffers(basis.reference, basis.modes) for basis in self.bases]
-        nearest = own[self._pairs()[i][int(u[0] > 0.5)]]
+        nearest = own[self.pairs[i][int(u[0] > 0.5)]]
         passed = self(torch.stack([basis.reference for basis in own]).to(self.dtype), t)
         own.insert(i + 1, BasisBuffers(passed, nearest.modes))
         times = torch.cat([self.times[: i + 1], at, self.times[i + 1 :]])
         given: dict[str, Any] = {"objective": self.objective, "solver": self.solver, "contact": self.contact}
         other = Path(own, self.faces, times, self.cyclic, self.scheme or self.smooth, **given)
         return other.to(self.bases[0].reference)
-
-    def solve(self, keyframes: Tensor, t: Tensor | float, knots: Knots | None = None) -> InBetweenResult:
-        """The shapes, and how each minimisation went, without a warning. Arguments as for :meth:`forward`.
-
-        ``knots``, of :meth:`knots`, are found once for several calls with the same key-frames.
-        """
-        return self._solved(keyframes, t, None, knots)
-
-    def knots(self, keyframes: Tensor) -> Knots | None:
-        """The velocities at the key-frames of smooth paths. *Shape:* ``(..., K, V, 3)``."""
-        return self.spline.knots(keyframes.to(self.dtype).flatten(0, -4)) if self.smooth else None
 
     def forward(self, keyframes: Tensor, t: Tensor | float) -> Tensor:
         """The shapes at given times.
@@ -197,46 +177,72 @@ class Path(PreciseModule):
             ValueError: Shapes that do not fit, or a time before the first or after the last key-frame.
             ConvergenceError: As for :class:`torch_modal.InBetween`.
         """
-        return self._solved(keyframes, t, self.layers[0].report() if self.layers else warn_of_starts).shapes
+        found = self.solve(keyframes, t)
+        report(found.solution, self.solver)
+        return found.shapes
 
-    @full_precision
-    def _solved(
-        self, keyframes: Tensor, t: Tensor | float, report: Report | None, knots: Knots | None = None
-    ) -> InBetweenResult:
+    def solve(self, keyframes: Tensor, t: Tensor | float) -> InBetweenResult:
+        """The shapes, and how each minimisation went, without a warning. Arguments as for :meth:`forward`."""
         flat, which, segment, u, lead = self._located(keyframes, t)
-        knots = self.spline.knots(flat) if self.smooth and knots is None else knots
-
-        def of_interval(i: int, rows: Tensor | slice) -> InBetweenResult:
-            own, at = which[rows], u[rows]
-            found = self._of_interval(knots, flat, i, own, at, report)
-            return self._separated(knots, flat, i, own, at, found) if self.contact else found
-
-        result = by_interval(segment, len(self._pairs()), of_interval)
-        if knots is not None and self.objective.terms:
-            # Each shape is compared with itself.
-            x = result.shapes[:, None]
-            result = self.layers[0].solved(x, torch.ones_like(x[..., 0, 0]), u.shape, report)
-        pairs = torch.tensor(self._pairs(), device=segment.device)[segment]
+        knots = self.spline.knots(flat) if self.smooth else None
+        parts, order = by_interval(
+            segment, len(self.pairs), lambda i, rows: self.within(knots, flat, i, which[rows], u[rows])
+        )
+        result = joined(parts, order)
+        pairs = torch.tensor(self.pairs, device=segment.device)[segment]
         ends = torch.stack([flat[which, k] for k in pairs.unbind(-1)], 1).to(keyframes.dtype)
         exact = with_exact_keyframes(result.shapes, ends, torch.stack([1 - u, u], -1))
         return result._replace(shapes=exact).unflattened(lead)
 
-    def _of_interval(
-        self, knots: Knots | None, flat: Tensor, i: int, which: Tensor, u: Tensor, report: Report | None
+    @full_precision
+    def within(
+        self,
+        knots: Knots | None,
+        flat: Tensor,
+        i: int,
+        which: Tensor,
+        u: Tensor,
+        n_searched: int = N_SEARCHED,
     ) -> InBetweenResult:
-        """Shapes of one interval, without contact. *Shape:* ``(L, K, V, 3), (B,), (B,) -> (B, V, 3)``."""
-        if knots is not None:
-            return self._on_spline(knots, i, which, u, report)
-        ends = flat[which][:, list(self._pairs()[i])]
-        return self.layers[i].solved(ends, torch.stack([1 - u, u], -1), u.shape, report)  # type: ignore[no-any-return]
+        """Shapes of one interval.
+
+        Args:
+            knots: Of the motions; None if they are not smooth.
+            flat: The motions, in the dtype of the computation. *Shape:* ``(L, K, V, 3)``.
+            i: The interval.
+            which: The motion of each shape. *Shape:* ``(B,)``.
+            u: Times, 0 to 1. *Shape:* ``(B,)``.
+            n_searched: Number of even times at which contacts are searched.
+        """
+        found = self._alone(knots, flat, i, which, u)
+        if self.contact:
+            found = self._separated(knots, flat, i, which, u, found, n_searched)
+        if knots is not None and self.objective.terms:
+            x = found.shapes[:, None]  # each is compared with itself
+            found = self.layers[0].solved(x, torch.ones_like(x[..., 0, 0]), u.shape)
+        return found
+
+    def _alone(self, knots: Knots | None, flat: Tensor, i: int, which: Tensor, u: Tensor) -> InBetweenResult:
+        """Shapes without contact and further terms. Arguments as for :meth:`within`."""
+        weights = torch.stack([1 - u, u], -1)
+        if knots is None:
+            ends = flat[which][:, list(self.pairs[i])]
+            return self.layers[i].solved(ends, weights, u.shape)  # type: ignore[no-any-return]
+        straight = self.spline.straight(knots, i, which, u)
+        x, usable = self.spline(knots, i, which, u, straight=straight), knots.usable[which]
+        stiffness = [u.new_full((len(u), 1), value) for value in (ALPHA, BETA)]
+        rests = RestShapes(knots.shapes[i : i + 2, which].movedim(0, 1), weights, stiffness, None)
+        x, solution = no_worse(x, [straight], unminimised(x, usable), self.distortion, rests, SLACK_OF_PATHS)
+        shapes = self.spline.alignment.restore(x, self.spline.pose(knots, i, which, u))
+        return InBetweenResult(torch.where(usable[:, None, None], shapes, torch.nan), solution)
 
     def _separated(
-        self, knots: Knots | None, flat: Tensor, i: int, which: Tensor, u: Tensor, result: InBetweenResult
+        self, knots: Knots | None, flat: Tensor, i: int, which: Tensor, u: Tensor, result: InBetweenResult, n: int
     ) -> InBetweenResult:
-        """Shapes of one interval pushed apart, by a displacement found at even times of each motion."""
+        """Shapes pushed apart by a displacement found at ``n`` even times of each motion."""
         refuse_transforms(result.shapes)
-        layer, pair, n = self.layers[0 if self.smooth else i], list(self._pairs()[i]), len(self._pairs())
-        core, even = layer.core, torch.arange(1, self.n_searched + 1).to(u) / (self.n_searched + 1)
+        layer, pair = self.layers[0 if self.smooth else i], list(self.pairs[i])
+        core, even = layer.core, torch.arange(1, n + 1).to(u) / (n + 1)
         shapes, left = result.shapes.clone(), torch.zeros_like(result.solution.status)
 
         def placed(own: Tensor, at: Tensor) -> tuple[Pose, Tensor | None, Tensor]:
@@ -250,11 +256,12 @@ class Path(PreciseModule):
             with torch.no_grad():
                 own = torch.full_like(even, motion, dtype=torch.int64)
                 pose, known, ends = placed(own, even)
-                x = core.alignment.bring(self._of_interval(knots, flat, i, own, even, None).shapes, pose)
+                x = core.alignment.bring(self._alone(knots, flat, i, own, even).shapes, pose)
                 pulls = torch.stack([1 - even, even], -1)
                 pulls = torch.ones_like(pulls[:, :1]) if known is None else pulls
                 rests = RestShapes(x[:, None] if known is None else known, pulls, layer.stiffness_of(even, even.shape))
-                goes_on = self.smooth and (self.cyclic or i > 0), self.smooth and (self.cyclic or i < n - 1)
+                last = len(self.pairs) - 1
+                goes_on = self.smooth and (self.cyclic or i > 0), self.smooth and (self.cyclic or i < last)
                 both = torch.stack([ends, flat[motion, pair]])
                 found = push_apart(core, x, even, rests, pose, both, goes_on)
             mine = torch.nonzero(which == motion).flatten()
@@ -263,38 +270,19 @@ class Path(PreciseModule):
             shapes = shapes.index_copy(0, mine, core.alignment.restore(pushed, pose))
         return InBetweenResult(shapes, result.solution._replace(n_crossing=left))
 
-    def _on_spline(self, knots: Knots, i: int, which: Tensor, u: Tensor, report: Report | None) -> InBetweenResult:
-        """Shapes of one interval. *Shape:* ``(B,), (B,) -> (B, V, 3)``."""
-        spline = self.spline
-        straight = spline.straight(knots, i, which, u)
-        x = spline(knots, i, which, u, straight=straight)
-        usable = knots.usable[which]
-        ends, weights = knots.shapes[i : i + 2, which].movedim(0, 1), torch.stack([1 - u, u], -1)
-        stiffness = [u.new_full((len(u), 1), value) for value in (ALPHA, BETA)]
-        rests = RestShapes(ends, weights, stiffness, None)
-        x, solution = no_worse(x, [straight], unminimised(x, usable), self.distortion, rests, SLACK_OF_PATHS)
-        if report is not None:
-            warn_of_starts(solution)
-        shapes = spline.alignment.restore(x, spline.pose(knots, i, which, u))
-        return InBetweenResult(torch.where(usable[:, None, None], shapes, torch.nan), solution)
-
     def _located(self, keyframes: Tensor, t: Tensor | float) -> tuple[Tensor, Tensor, Tensor, Tensor, torch.Size]:
         """Motions, *shape* ``(L, K, V, 3)``; of each shape the motion, the interval, and the time there; dimensions."""
         require_numbers("Path", keyframes)
         reference = self.spline.alignment.reference
-        if not isinstance(keyframes, Tensor) or not keyframes.is_floating_point():
-            got = keyframes.dtype if isinstance(keyframes, Tensor) else type(keyframes).__name__
-            raise ValueError(f"keyframes are a floating-point tensor; got {got}")
         wanted = (self.n_keyframes, *reference.shape)
-        if keyframes.shape[-3:] != wanted:
+        if not isinstance(keyframes, Tensor) or not keyframes.is_floating_point() or keyframes.shape[-3:] != wanted:
+            is_tensor = isinstance(keyframes, Tensor)
+            got = f"{tuple(keyframes.shape)} of {keyframes.dtype}" if is_tensor else type(keyframes).__name__
             raise ValueError(
-                f"keyframes of this path have the shape (..., {', '.join(map(str, wanted))}); got "
-                f"{tuple(keyframes.shape)}"
+                f"keyframes of this path are floating-point of shape (..., {', '.join(map(str, wanted))}); got {got}"
             )
         if keyframes.device != reference.device:
-            raise ValueError(
-                f"keyframes are on {keyframes.device}, the path on {reference.device}; move one with .to()"
-            )
+            raise ValueError(f"keyframes are on {keyframes.device}, the path on {reference.device}; move one")
         rounding = torch.finfo(t.dtype).eps if isinstance(t, Tensor) and t.is_floating_point() else 0.0
         t = torch.as_tensor(t, dtype=self.times.dtype, device=keyframes.device)
         own = keyframes.shape[:-3]
@@ -309,25 +297,6 @@ class Path(PreciseModule):
         which = torch.arange(len(flat), device=t.device).reshape(own).expand(lead).reshape(-1)
         segment, u = located(t.expand(lead).reshape(-1), self.times, self.cyclic, rounding)
         return flat, which, segment, u.to(flat), lead
-
-
-def by_interval(
-    segment: Tensor, n: int, of_interval: Callable[[int, Tensor | slice], InBetweenResult]
-) -> InBetweenResult:
-    """Shapes whose intervals are computed one after the other.
-
-    Args:
-        segment: The interval of each shape. *Shape:* ``(B,)``.
-        n: Number of intervals.
-        of_interval: Computes some rows of the batch, which are in one interval.
-    """
-    intervals = in_use(segment, n) or [0]  # of nothing, nothing
-    if mapped(segment):  # of each interval all shapes, of which some are taken
-        every = [of_interval(i, slice(None)) for i in intervals]
-        place = sum((segment == i) * place for place, i in enumerate(intervals))
-        return joined(every, place * len(segment) + torch.arange(len(segment), device=segment.device))
-    rows = [torch.nonzero(segment == i).flatten() for i in intervals]
-    return joined([of_interval(i, own) for i, own in zip(intervals, rows, strict=True)], torch.argsort(torch.cat(rows)))
 
 
 def joined(parts: Sequence[InBetweenResult], order: Tensor) -> InBetweenResult:

@@ -1,14 +1,15 @@
 """The smooth motion through key-frames: splines of triangle rotations and sizes, then one Poisson solve."""
 
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
+from torch_modal.autograd import full_precision
 from torch_modal.backends.torch.backend import TorchBackend
+from torch_modal.geometry.clusters import beyond_a_turn
 from torch_modal.geometry.connectivity import Connectivity
-from torch_modal.geometry.local_rotations import LocalRotations, Trajectory, weights_per_length
+from torch_modal.geometry.local_rotations import Trajectory, weights_per_length
 from torch_modal.geometry.rigid import best_rotation, centroid
 from torch_modal.geometry.rotations import exp, log
 from torch_modal.geometry.vectors import pick
@@ -65,11 +66,21 @@ class Spline(nn.Module):
         self.scheme, self.cyclic = scheme, len(times) > n
         self.alignment = KeyframeAlignment(references, mesh)
         self.register_buffer("times", times.clone(), persistent=False)
-        pairs = [(i, (i + 1) % n) for i in range(len(times) - 1)]
         self.poisson = backend.poisson(mesh, weights_per_length(mesh, references))
-        #: Of each interval; most share one.
-        self.rotations: Any = nn.ModuleList(_rotations(mesh, references, pairs, backend))
+        first = backend.rotations(mesh, references)
+        #: Local rotations of each interval. The tree of the first serves all in which neighbours have the same
+        #: quaternion sign by it, and so by every tree, and in which nothing goes beyond a full turn.
+        self.rotations: Any = nn.ModuleList([first])
+        one, other = torch.tensor(mesh.face_neighbours).unbind(1)
+        for i in range(1, len(times) - 1):
+            ends = references[[i, (i + 1) % n]]
+            wound = first.wound(*(first.frames(x[None]) for x in ends))
+            turns = first.turns(ends[:1], ends[1:])[:, 0]
+            alike = bool(((pick(turns, one) * pick(turns, other)).sum(0) >= 0).all())
+            plain = first.clusters is None and not beyond_a_turn(*wound) and alike
+            self.rotations.append(first if plain else backend.rotations(mesh, ends))
 
+    @full_precision
     def knots(self, keyframes: Tensor) -> Knots:
         """The velocities at all key-frames. *Shape:* ``(L, K, V, 3)``."""
         weights, reference = self.alignment.weights, self.alignment.reference
@@ -175,25 +186,3 @@ class Spline(nn.Module):
         rotation = start @ exp(wide * step) @ exp(offset(first, last, wide))
         move, first, last = (part[i][which] for part in knots.moves)
         return Pose(rotation, knots.centres[i][which] + wide * move + offset(first, last, wide))
-
-
-def _rotations(
-    mesh: Connectivity, references: Tensor, pairs: Sequence[tuple[int, int]], backend: TorchBackend
-) -> list[LocalRotations]:
-    """The local rotations of each interval.
-
-    The tree of the first serves all intervals in which neighbours have the same quaternion sign by it, and so by every
-    tree, and in which nothing goes beyond a full turn.
-    """
-    others = [k for k in range(len(references)) if k not in pairs[0]]
-    first = backend.rotations(mesh, references[[*pairs[0], *others]])
-    one, other = torch.tensor(mesh.face_neighbours).unbind(1)
-    found = [first]
-    for pair in pairs[1:]:
-        ends = references[list(pair)]
-        plain = first.clusters is None and not first.is_beyond_a_turn(*ends)
-        if plain:
-            turns = first.turns(ends[:1], ends[1:])[:, 0]
-            plain = bool(((pick(turns, one) * pick(turns, other)).sum(0) >= 0).all())
-        found.append(first if plain else backend.rotations(mesh, ends))
-    return found

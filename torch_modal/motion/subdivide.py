@@ -1,7 +1,8 @@
 """From key-frames to a dense sequence: recursive subdivision (section 3.3 of the paper) and linear fill."""
 
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from typing import Any
 
@@ -13,15 +14,15 @@ from torch_modal.errors import MeshWarning
 from torch_modal.geometry.connectivity import Connectivity, vertex_areas
 from torch_modal.geometry.crossings import Crossings, require_contact
 from torch_modal.geometry.rigid import blend
-from torch_modal.inbetween.results import warn_of_starts
+from torch_modal.inbetween.results import report
 from torch_modal.inbetween.settings import Objective, Preset, Settings, Solver, settings
 from torch_modal.keyframes.arrays import checked_times
 from torch_modal.keyframes.check import check_keyframes
 from torch_modal.layers.mid_shape import MidShape
+from torch_modal.modes.basis import ModalBasis
+from torch_modal.modes.extract import bases_of_checked
 from torch_modal.motion.path import Path
 from torch_modal.passengers.proxy import Proxy, proxy_size
-from torch_modal.precompute.basis import ModalBasis
-from torch_modal.precompute.extract import bases_of_checked
 from torch_modal.progress import Progress, ProgressReport
 
 MAX_LEVELS = 12
@@ -32,7 +33,7 @@ def subdivide(
     faces: Any,
     levels: int = 3,
     *,
-    bases: Sequence[ModalBasis] | None = None,
+    bases: Sequence[ModalBasis] | Callable[[Tensor, Tensor], Sequence[ModalBasis]] | None = None,
     n_modes: int = 30,
     cyclic: bool = False,
     n_frames: int | None = None,
@@ -58,8 +59,8 @@ def subdivide(
         keyframes: Vertex positions, two key-frames or more, in any units. *Shape:* ``(K, V, 3)``.
         faces: Vertex indices. *Shape:* ``(F, 3)``.
         levels: How often the number of intervals doubles.
-        bases: The basis of each key-frame. Default: :func:`torch_modal.extract_bases`, cached on disk, where modes are
-            needed.
+        bases: The basis of each key-frame; or a function that makes them of key-frames and faces, where modes are
+            needed. Default: :func:`torch_modal.extract_bases`, cached on disk.
         n_modes: Modes of each key-frame where the bases are not given. 0: none; mid-shapes are then the blend by local
             rotations, with the steps of all vertices alone.
         cyclic: True where the last key-frame leads on to the first. The sequence then ends one frame before it would
@@ -96,35 +97,16 @@ def subdivide(
         MeshWarning: With ``contact``, which key-frames pass through themselves, and how many frames still do that no
             key-frame does.
     """
-    keyframes, working_faces = check_keyframes(keyframes, faces, min_keyframes=2)
-    n_keys = len(keyframes)
+    keyframes, faces = check_keyframes(keyframes, faces, min_keyframes=2)
+    n_keys, given = len(keyframes), keyframes
     places = keyframe_places(n_keys, levels, cyclic=cyclic, n_frames=n_frames, times=times)
-    if bases is not None:
-        if proxy:
-            raise ValueError("the bases belong to the whole mesh, and a proxy has its own: leave out bases, or proxy")
-        proxy = 0
-    n_proxy = proxy_size(proxy, keyframes.shape[1])
-    if n_proxy:
-        carrier = Proxy(keyframes, working_faces, n_proxy)
-        shapes = subdivide(
-            carrier.keyframes,
-            carrier.faces,
-            levels,
-            n_modes=n_modes,
-            cyclic=cyclic,
-            n_frames=n_frames,
-            times=times,
-            smooth=smooth,
-            preset=preset,
-            objective=objective,
-            solver=solver,
-            contact=contact,
-            mu=mu,
-            regions=regions,
-            proxy=0,
-            progress=progress,
-        )
-        return carrier.carried(shapes, places, keyframes)
+    made = None if callable(bases) else bases
+    if made is not None and proxy:
+        raise ValueError("the bases belong to the whole mesh, and a proxy has its own: leave out bases, or proxy")
+    n_proxy = proxy_size(proxy if made is None else 0, keyframes.shape[1])
+    carrier = Proxy(keyframes, faces, n_proxy) if n_proxy else None
+    if carrier:
+        keyframes, faces = check_keyframes(carrier.keyframes, carrier.faces)
     chosen = settings(preset, objective, solver, contact, None, mu, regions)
     if smooth is None:
         smooth = n_keys > 2 and chosen.objective.space == "joint"
@@ -133,27 +115,32 @@ def subdivide(
     if chosen.objective.contact:
         require_contact()
     needs_modes = chosen.objective.contact or bool(chosen.objective.terms) or not (smooth and n_keys > 2)
-    if bases is None and n_modes and needs_modes:
-        bases = bases_of_checked(
-            keyframes, working_faces, n_modes, progress=progress, meanwhile=choose(chosen.solver.backend).load
-        )
-    bases = keyframes.detach() if bases is None else bases
-    if len(bases) != n_keys:
-        raise ValueError(f"each key-frame needs its basis: got {len(bases)} bases for {n_keys} key-frames")
+    if made is None and n_modes and needs_modes:
+        if callable(bases):
+            made = bases(keyframes, faces)
+        else:
+            with ThreadPoolExecutor(1) as pool:
+                loading = pool.submit(choose(chosen.solver.backend).load)  # takes a second
+                made = bases_of_checked(keyframes, faces, n_modes, progress=progress)
+                loading.result()
+    made = keyframes.detach() if made is None else made
+    if len(made) != n_keys:
+        raise ValueError(f"each key-frame needs its basis: got {len(made)} bases for {n_keys} key-frames")
     # With contact, pairs are not subdivided either: what was done at one time would not fit what was done at the next.
     by_path = smooth or chosen.objective.contact
     sequence = keyframes.new_empty(places[-1] + 1, *keyframes.shape[1:])
     total = (len(places) - 1) * (1 if by_path else levels)
     with ProgressReport(total, "in-between shapes", progress) as bar, torch.no_grad():
         if by_path:
-            parts = _along_path(keyframes, working_faces, bases, places, times, cyclic, smooth, chosen)
+            parts = _along_path(keyframes, faces, made, places, times, cyclic, smooth, chosen)
         else:
-            parts = _by_recursion(keyframes, working_faces, bases, places, levels, n_frames, chosen, bar)
+            parts = _by_recursion(keyframes, faces, made, places, levels, n_frames, chosen, bar)
         for i, shapes in enumerate(parts):
             sequence[places[i]], sequence[places[i] + 1 : places[i + 1]] = keyframes[i], shapes
             bar.update(int(by_path))
         sequence[-1] = keyframes[-1]
-    return sequence[:-1] if cyclic else sequence
+    sequence = sequence[:-1] if cyclic else sequence
+    return carrier.carried(sequence, places, given) if carrier else sequence
 
 
 def _along_path(
@@ -168,19 +155,17 @@ def _along_path(
 ) -> Iterator[Tensor]:
     """Shapes between the key-frames of each interval."""
     path = Path(bases, faces.cpu(), times, cyclic, smooth, objective=chosen.objective, solver=chosen.solver)
-    path.to(keyframes.device)
-    knots, left, total = path.knots(keyframes[None]), 0, 0
-    for when in _times_of_intervals(path.times, places):
-        path.n_searched = len(when) - 2
-        result = path.solve(keyframes, when[1:-1], knots)
-        warn_of_starts(result.solution)
-        if chosen.objective.contact:
-            total += len(when) - 2
-            assert result.solution.n_crossing is not None
+    motion = keyframes[None].to(path.to(keyframes.device).dtype)
+    knots, left = path.spline.knots(motion) if path.smooth else None, 0
+    for i, n in enumerate(b - a for a, b in pairwise(places)):
+        u = torch.arange(1, n).to(motion) / n
+        result = path.within(knots, motion, i, torch.zeros_like(u, dtype=torch.int64), u, n_searched=n - 1)
+        report(result.solution, chosen.solver)
+        if result.solution.n_crossing is not None:
             left += int((result.solution.n_crossing > 0).sum())
         yield result.shapes
-    if chosen.objective.contact:
-        _report_contacts(keyframes, faces, left, total)
+    if path.contact:
+        _report_contacts(keyframes, faces, left, places[-1] - len(places) + 1)
 
 
 def _by_recursion(
@@ -194,8 +179,9 @@ def _by_recursion(
     bar: ProgressReport,
 ) -> Iterator[Tensor]:
     """Shapes between the key-frames of each interval, of the pair alone."""
-    weights = torch.from_numpy(vertex_areas(keyframes[0].cpu().double().numpy(), faces.cpu().numpy())).to(keyframes)
-    edges = torch.tensor(Connectivity(faces.cpu().numpy(), keyframes.shape[1]).edges, device=keyframes.device)
+    mesh = Connectivity(faces.cpu().numpy(), keyframes.shape[1])
+    weights = torch.from_numpy(vertex_areas(keyframes[0].cpu().double().numpy(), mesh.faces)).to(keyframes)
+    edges = torch.tensor(mesh.edges, device=keyframes.device)
     for i, n in enumerate(b - a for a, b in pairwise(places)):
         ends = (i, (i + 1) % len(keyframes))
         layers: dict[tuple[int, int], MidShape] = {}
@@ -277,14 +263,9 @@ def frame_times(
     """
     when = checked_times(times, n_keyframes, cyclic)
     places = keyframe_places(n_keyframes, levels, cyclic=cyclic, n_frames=n_frames, times=times)
-    parts = [times[:-1] for times in _times_of_intervals(when, places)]
+    each = zip(pairwise(when.tolist()), pairwise(places), strict=True)
+    parts = [torch.linspace(*ends, b - a + 1, dtype=torch.float64)[:-1] for ends, (a, b) in each]
     return torch.cat(parts if cyclic else [*parts, when[-1:]])
-
-
-def _times_of_intervals(when: Tensor, places: Sequence[int]) -> Iterator[Tensor]:
-    """Even times of each interval, both ends among them. *Shape:* ``(K,) -> (n + 1,)``."""
-    for (start, end), (a, b) in zip(pairwise(when.tolist()), pairwise(places), strict=True):
-        yield torch.linspace(start, end, b - a + 1, dtype=torch.float64, device=when.device)
 
 
 def linear_sequence(keyframes: Tensor, places: Sequence[int]) -> Tensor:

@@ -6,17 +6,14 @@ from scipy import sparse
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.geometry.closest import ClosestFaces, closest_on_triangles
 
-# Number of candidate triangles of each point, beside the nearest: those with the nearest centroids.
 CANDIDATES = 8
-
-# Triangles farther than the nearest by this part of its distance have no influence.
+"""Number of candidate triangles of each point, beside the nearest: those with the nearest centroids."""
 WIDTH = 1.0
-
-# Part of the diagonal within which points are on the surface, and follow the nearest triangle alone.
+"""Triangles farther than the nearest by this part of its distance have no influence."""
 ON_SURFACE = 1e-9
-
-# Points that are bound together.
+"""Part of the diagonal within which points are on the surface, and follow the nearest triangle alone."""
 CHUNK = 65_536
+"""Number of points that are bound at a time."""
 
 
 def binding(
@@ -26,16 +23,8 @@ def binding(
 
     They are barycentric coordinates of the closest points on the nearest triangles, which fade out with the distance
     beyond the nearest one, so that weights are continuous around the surface. Triangles that are near in space but not
-    along the surface, such as those of the next finger, have none.
-
-    Args:
-        points: *Shape:* ``(P, 3)``.
-        vertices: Vertices of the carrier. *Shape:* ``(V, 3)``.
-        faces: *Shape:* ``(F, 3)``.
-        anchors: Known vertex of the carrier near each point, -1 where none is known. *Shape:* ``(P,)``.
-
-    Returns:
-        *Shape:* ``(P, V)``.
+    along the surface, such as those of the next finger, have none. Anchors are vertices of the carrier known to be near
+    a point, -1 where none is. *Shape:* ``(P, 3), (V, 3), (F, 3), (P,) -> (P, V)``.
     """
     surface = ClosestFaces(vertices, faces)
     extent = float(np.linalg.norm(np.ptp(vertices[np.unique(faces)], axis=0)))

@@ -7,23 +7,15 @@ import torch
 from torch import Tensor
 
 from torch_modal.autograd import lasting
+from torch_modal.modes.coarsening import coarsen
 from torch_modal.passengers.passengers import Passengers
-from torch_modal.precompute.coarsening import coarsen
 
 # Number of vertices of the carrier, of the meshes above which it is the default, and of the smallest one.
 PROXY_SIZE, ABOVE, SMALLEST = 20_000, 100_000, 100
 
 
 def proxy_size(wanted: int | None, n_vertices: int) -> int:
-    """Vertices of the carrier of a mesh, or 0 where it needs none.
-
-    Args:
-        wanted: As for :func:`torch_modal.subdivide`.
-        n_vertices: Number of vertices of the mesh.
-
-    Raises:
-        ValueError: ``wanted`` is out of range.
-    """
+    """Vertices of the carrier of a mesh, 0 where it needs none; wanted as for :func:`torch_modal.subdivide`."""
     if wanted is None:
         return PROXY_SIZE if n_vertices > ABOVE else 0
     if not isinstance(wanted, int) or wanted < 0 or 0 < wanted < SMALLEST:
@@ -32,39 +24,32 @@ def proxy_size(wanted: int | None, n_vertices: int) -> int:
 
 
 class Proxy:
-    """Key-frames of a fine mesh as a coarse one, by the same edge collapses, with the detail of each.
+    """Key-frames ``(K, V, 3)`` of a fine mesh as a carrier of about so many vertices, and the detail of each.
 
-    Args:
-        keyframes: *Shape:* ``(K, V, 3)``.
-        faces: Vertex indices. *Shape:* ``(F, 3)``.
-        n_vertices: About how many the carrier has.
+    Attributes:
+        keyframes: The carrier in each key-frame, by the same edge collapses: means of clusters. *Shape:*
+            ``(K, V_coarse, 3)``.
+        faces: Of the carrier. *Shape:* ``(F_coarse, 3)``.
+        passengers: The detail of each key-frame.
     """
 
     @lasting
     def __init__(self, keyframes: Tensor, faces: Tensor, n_vertices: int) -> None:
         fine = keyframes.detach().double().cpu()
         coarse = coarsen(fine.numpy(), faces.detach().cpu().numpy(), 2 * n_vertices)
-        #: Faces of the carrier. *Shape:* ``(F_coarse, 3)``.
         self.faces = torch.from_numpy(coarse.faces)
         own = torch.from_numpy(coarse.restrict(fine.numpy()))
         first = Passengers(own[0], self.faces, fine[0], torch.from_numpy(coarse.clusters))
         passengers = [first, *(first.rebound(x, y) for x, y in zip(own[1:], fine[1:], strict=True))]
-        #: The detail of each key-frame.
         self.passengers = [each.to(keyframes) for each in passengers]
-        #: The carrier in each key-frame: means of clusters. *Shape:* ``(K, V_coarse, 3)``.
         self.keyframes = own.to(keyframes)
 
     @torch.no_grad()
     def carried(self, shapes: Tensor, places: Sequence[int], keyframes: Tensor) -> Tensor:
         """A sequence of the carrier with the detail of the key-frames, blended from each to the next.
 
-        Args:
-            shapes: *Shape:* ``(T, V_coarse, 3)``.
-            places: Frames of the key-frames; one more than there are, if the first comes again.
-            keyframes: Key-frames at these places. *Shape:* ``(K, V, 3)``.
-
-        Returns:
-            *Shape:* ``(T, V, 3)``.
+        Places are the frames of the key-frames; one more than there are, if the first comes again. *Shape:*
+        ``(T, V_coarse, 3), (K,), (K, V, 3) -> (T, V, 3)``.
         """
         found = keyframes.new_empty(len(shapes), *keyframes.shape[1:])
         n = len(keyframes)

@@ -1,12 +1,10 @@
 """As-rigid-as-possible fit of a template to a target."""
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
 
 import numpy as np
 import torch
 from scipy import sparse
-from scipy.spatial import cKDTree
 
 from torch_modal.arrays import BoolArray, FloatArray, IntArray
 from torch_modal.geometry.closest import dot
@@ -24,19 +22,12 @@ _SMOOTHING, _SMOOTHING_ROUNDS = 0.5, 2
 _SCALE_ROUNDS, _SCALES = 30, (0.3, 3.0)
 
 
-class Stage(NamedTuple):
-    """Steps with constant parameters. Lengths are percentages of the target's diagonal."""
-
-    weight: float
-    """Weight of closest points relative to the stiffness."""
-    reach: float
-    """Largest distance of closest points."""
-    steps: int
-
-
-COARSE_STAGES = (Stage(0.05, 6, 4), Stage(0.2, 5, 6), Stage(0.5, 4, 6), Stage(2.0, 3, 4))
-FINE_STAGES = (Stage(0.3, 4, 3), Stage(1.0, 3, 3), Stage(3.0, 3, 3))
-_RELEASED, _CAUGHT = Stage(0.3, 5, 4), Stage(0.5, 5, 3)  # without flipped faces, then with them
+Stage = tuple[float, float, int]
+"""Weight of closest points relative to the stiffness, their largest distance in percent of the target's diagonal, and
+the number of steps."""
+COARSE_STAGES: tuple[Stage, ...] = ((0.05, 6, 4), (0.2, 5, 6), (0.5, 4, 6), (2.0, 3, 4))
+FINE_STAGES: tuple[Stage, ...] = ((0.3, 4, 3), (1.0, 3, 3), (3.0, 3, 3))
+_RELEASED, _CAUGHT = (0.3, 5, 4), (0.5, 5, 3)  # without flipped faces, then with them
 
 MAP_WEIGHTS = (0.02, 0.1)
 _MAP_ROUNDS = 40
@@ -44,28 +35,20 @@ _MAP_SHARE = 0.05  # weight of the map relative to closest points
 _LANDMARK_WEIGHT = 5.0
 _FIXING_WEIGHT = 1e-5  # fixes pieces without a counterpart
 _ALIKE = 0.4  # smallest cosine between the normals of closest points
-_NEAR_MAP = 0.12  # largest geodesic distance of closest points from the image of the map, for a surface of unit area
 
 
-class PointTargets(NamedTuple):
-    """Target positions of points of the surface, with weights: ``sum_m weight_m |points_m x - targets_m|^2``."""
+Pull = tuple[sparse.csr_matrix, FloatArray, FloatArray]
+"""Points of the surface, target positions and weights: ``sum_m weight_m |points_m x - targets_m|^2``.
 
-    points: sparse.csr_matrix
-    """*Shape:* ``(m, V)``."""
-    targets: FloatArray
-    """*Shape:* ``(m, 3)``."""
-    weights: FloatArray
-    """*Shape:* ``(m,)``."""
+*Shape:* ``(m, V), (m, 3), (m,)``.
+"""
 
 
 class ElasticSurface:
     r"""Minimises :math:`\sum_{ij} w_{ij} |x_i - x_j - \bar R_{ij} (r_i - r_j)|^2` plus pulls, by local-global steps.
 
-    As-rigid-as-possible surface modeling (Sorkine and Alexa 2007) with smoothed rotations.
-
-    Args:
-        rest: The rest shape.
-        stretchable: Allow smooth local scaling.
+    As-rigid-as-possible surface modeling (Sorkine and Alexa 2007) with smoothed rotations; if stretchable, also with
+    smooth local scales.
     """
 
     def __init__(self, rest: MeshSurface, *, stretchable: bool = False) -> None:
@@ -102,35 +85,20 @@ class ElasticSurface:
         scales = np.clip(np.sqrt(squares[:, 0] / np.maximum(squares[:, 1], 1e-30)), *_SCALES)
         return rotations * scales[:, None, None]
 
-    def follow(self, x: FloatArray, pulls: Sequence[PointTargets], rounds: int = 2) -> FloatArray:
+    def follow(self, x: FloatArray, pulls: Sequence[Pull], rounds: int = 2) -> FloatArray:
         """Alternate local steps (rotations) and global steps (positions). *Shape:* ``(V, 3)``."""
         matrix, pulled = self.laplacian, np.zeros_like(x)
-        for pull in pulls:
-            weighted = pull.points.T @ sparse.diags(pull.weights)
-            matrix = matrix + weighted @ pull.points
-            pulled += weighted @ pull.targets
+        for points, targets, weights in pulls:
+            weighted = points.T @ sparse.diags(weights)
+            matrix = matrix + weighted @ points
+            pulled += weighted @ targets
         solver = SparseSolver(matrix)
         for _ in range(rounds):
             frames = self.local_frames(x)
             wanted = 0.5 * np.einsum("eij,ej->ei", frames[self._i] + frames[self._j], self._sides)
-            x = solver.solve(self._gather @ (self._weights[:, None] * wanted) + pulled)
+            right = self._gather @ (self._weights[:, None] * wanted) + pulled
+            x = solver(torch.from_numpy(right)).numpy()
         return x
-
-
-class Gate:
-    """Accepts closest points near the image of a map along the surface: touching fingers do not mix.
-
-    Args:
-        target: The target's coarse shape.
-    """
-
-    def __init__(self, target: SpectralShape) -> None:
-        self._near = target.neighbourhoods(_NEAR_MAP)
-        self._tree = cKDTree(target.placed.vertices)
-
-    def accepts(self, images: IntArray, points: FloatArray) -> BoolArray:
-        """Points of the target near coarse vertices, as a mask. *Shape:* ``(n,), (n, 3) -> (n,)``."""
-        return self._near[images, self._tree.query(points)[1]]
 
 
 class TemplateFit:
@@ -140,8 +108,9 @@ class TemplateFit:
         template: The rest shape, in the target's scale.
         target: The target, with a diagonal of 100.
         back: The target or a coarse copy, whose vertices are matched to the template.
-        gate: Accepts or rejects closest points.
-        images: Coarse vertex of the target for each template vertex. *Shape:* ``(V,)``.
+        coarse: The target's coarse shape.
+        images: Vertex of that for each template vertex; closest points must be near, so that touching fingers do not
+            mix. *Shape:* ``(V,)``.
         landmarks: Points of the template and their target positions.
         stretchable: Allow parts to grow and shrink.
         tick: Called after each step.
@@ -152,7 +121,7 @@ class TemplateFit:
         template: MeshSurface,
         target: MeshSurface,
         back: MeshSurface,
-        gate: Gate,
+        coarse: SpectralShape,
         images: IntArray,
         landmarks: tuple[sparse.csr_matrix, FloatArray] | None,
         *,
@@ -161,27 +130,22 @@ class TemplateFit:
     ) -> None:
         self.template, self.target, self.back, self.tick = template, target, back, tick
         self.elastic = ElasticSurface(template, stretchable=stretchable)
-        self._gate, self._images = gate, images
+        self._coarse, self._images = coarse, images
         self._everywhere = sparse.identity(len(images), format="csr")
         self._share = template.vertex_areas / template.vertex_areas.mean()
         self._back_share = back.vertex_areas / back.vertex_areas.mean() * (len(images) / len(back.vertices))
-        self._landmarks: list[PointTargets] = []
-        self._map: list[PointTargets] = []
-        if landmarks is not None:
-            self._landmarks = [self._pull(*landmarks, np.full(len(landmarks[1]), _LANDMARK_WEIGHT))]
+        self._landmarks = [] if landmarks is None else [self._pull(*landmarks, _LANDMARK_WEIGHT)]
+        self._map: list[Pull] = []
 
-    def _pull(self, points: sparse.csr_matrix, places: FloatArray, weights: FloatArray) -> PointTargets:
-        return PointTargets(points, places, self.elastic.stiffness * weights)
-
-    def _pull_all(self, places: FloatArray, weight: float) -> PointTargets:
-        return self._pull(self._everywhere, places, np.full(len(places), weight))
+    def _pull(self, points: sparse.csr_matrix, places: FloatArray, weights: FloatArray | float) -> Pull:
+        return points, places, self.elastic.stiffness * np.broadcast_to(weights, len(places))
 
     def follow_map(self, x: FloatArray, places: FloatArray) -> FloatArray:
         """Fit to the positions of a map, which keep a small weight in later steps. *Shape:* ``(V, 3), (V, 3)``."""
         for weight in MAP_WEIGHTS:
-            x = self.elastic.follow(x, [self._pull_all(places, weight), *self._landmarks], _MAP_ROUNDS)
+            x = self.elastic.follow(x, [self._pull(self._everywhere, places, weight), *self._landmarks], _MAP_ROUNDS)
             self.tick()
-        self._map = [self._pull_all(places, _MAP_SHARE)]
+        self._map = [self._pull(self._everywhere, places, _MAP_SHARE)]
         return x
 
     def run(self, x: FloatArray, stages: Sequence[Stage], releases: int) -> FloatArray:
@@ -202,42 +166,43 @@ class TemplateFit:
         return x
 
     def _steps(self, x: FloatArray, stage: Stage, released: BoolArray | None = None) -> FloatArray:
-        for _ in range(stage.steps):
+        weight, reach, n_steps = stage
+        for _ in range(n_steps):
             shape = self.template.moved(x)
-            pulls = [self._to_target(shape, stage, released), self._from_target(shape, stage, released)]
-            pulls += [pull._replace(weights=pull.weights * stage.weight) for pull in self._map]
-            x = self.elastic.follow(x, [*pulls, *self._landmarks, self._pull_all(x, _FIXING_WEIGHT)])
+            pulls = [self._to_target(shape, weight, reach, released), self._from_target(shape, weight, reach, released)]
+            pulls += [(points, places, weights * weight) for points, places, weights in self._map]
+            x = self.elastic.follow(x, [*pulls, *self._landmarks, self._pull(self._everywhere, x, _FIXING_WEIGHT)])
             self.tick()
         return x
 
-    def _to_target(self, shape: MeshSurface, stage: Stage, released: BoolArray | None) -> PointTargets:
+    def _to_target(self, shape: MeshSurface, weight: float, reach: float, released: BoolArray | None) -> Pull:
         """Pull template vertices to closest points on the target."""
         closest = self.target.closest(shape.vertices)
         places, normals = closest.points.copy(), shape.vertex_normals
         used = dot(normals, self.target.face_normals[closest.faces]) > _ALIKE
-        used &= self._gate.accepts(self._images, places)
+        used &= self._coarse.is_near(self._images, places)
         # If another sheet is closer, take the nearest vertex with a similar normal.
         hidden = np.flatnonzero(~used)
         beside = self.target.nearest_alike(shape.vertices[hidden], normals[hidden])
         places[hidden] = self.target.vertices[beside]
         used[hidden] = dot(normals[hidden], self.target.vertex_normals[beside]) > _ALIKE
-        used[hidden] &= self._gate.accepts(self._images[hidden], places[hidden])
-        used &= np.linalg.norm(places - shape.vertices, axis=1) < stage.reach
+        used[hidden] &= self._coarse.is_near(self._images[hidden], places[hidden])
+        used &= np.linalg.norm(places - shape.vertices, axis=1) < reach
         used &= shape.on_boundary | ~self.target.on_open_edge(closest)
         if released is not None:
             used &= ~released
         kept = np.flatnonzero(used)
-        return self._pull(self._everywhere[kept], places[kept], stage.weight * self._share[kept])
+        return self._pull(self._everywhere[kept], places[kept], weight * self._share[kept])
 
-    def _from_target(self, shape: MeshSurface, stage: Stage, released: BoolArray | None) -> PointTargets:
+    def _from_target(self, shape: MeshSurface, weight: float, reach: float, released: BoolArray | None) -> Pull:
         """Pull the closest points on the template to the target's vertices."""
         closest = shape.closest(self.back.vertices)
         corners = shape.faces[closest.faces]
         used = dot(self.back.vertex_normals, shape.face_normals[closest.faces]) > _ALIKE
-        used &= closest.distances < stage.reach
+        used &= closest.distances < reach
         used &= self.back.on_boundary | ~shape.on_open_edge(closest)
-        used &= self._gate.accepts(self._images[corners[:, 0]], self.back.vertices)
+        used &= self._coarse.is_near(self._images[corners[:, 0]], self.back.vertices)
         if released is not None:
             used &= ~released[corners].any(1)
         kept = np.flatnonzero(used)
-        return self._pull(shape.rows(closest)[kept], self.back.vertices[kept], stage.weight * self._back_share[kept])
+        return self._pull(shape.rows(closest)[kept], self.back.vertices[kept], weight * self._back_share[kept])

@@ -1,4 +1,4 @@
-"""Landmarks: corresponding points, their files, and suggestions."""
+"""Landmarks: corresponding points of meshes, and their files."""
 
 import os
 from collections.abc import Sequence
@@ -11,95 +11,43 @@ from scipy.spatial import cKDTree
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.errors import MeshError
 from torch_modal.io.write import to_numpy
-from torch_modal.keyframes.check import check_keyframes
-from torch_modal.registration.maps import SpectralShape
-from torch_modal.registration.surface import referenced
-
-N_SUGGESTED = 14
-# A tip has the largest mean geodesic distance within this radius, for a surface of unit area.
-_TIP_RADIUS = 0.12
-
-
-def landmark_points(landmarks: Any, template: FloatArray, target: FloatArray) -> FloatArray:
-    """Landmarks of `register` as points, the template's and the target's. *Shape:* ``(n, 2, 3)``.
-
-    Args:
-        landmarks: None, pairs of vertex indices ``(n, 2)``, or two arrays of points ``(n, 3)``.
-        template: *Shape:* ``(V, 3)``.
-        target: *Shape:* ``(V_target, 3)``.
-
-    Raises:
-        MeshError: The shapes are wrong, or a vertex does not exist.
-    """
-    if landmarks is None:
-        return np.zeros((0, 2, 3))
-    if isinstance(landmarks, (tuple, list)) and len(landmarks) == 2 and all(np.ndim(part) == 2 for part in landmarks):
-        here, there = (to_numpy(part).astype(np.float64) for part in landmarks)
-        if here.shape != there.shape or here.shape[1] != 3 or not np.isfinite([here, there]).all():
-            raise MeshError(
-                f"landmarks are arrays of shapes {here.shape} and {there.shape}; two arrays of finite points (n, 3) "
-                "are needed, the template's and the target's"
-            )
-        return np.stack([here, there], axis=1)
-    pairs = to_numpy(landmarks)
-    if pairs.size == 0:
-        return np.zeros((0, 2, 3))
-    if pairs.ndim != 2 or pairs.shape[1] != 2 or pairs.dtype.kind not in "iu":
-        raise MeshError(
-            f"landmarks have shape {pairs.shape} and dtype {pairs.dtype}; pairs of vertex indices (n, 2) are needed, "
-            "template first, or two arrays of points (n, 3)"
-        )
-    return _named_vertices(pairs, (template, target), ("the template", "the target"))
 
 
 def landmark_table(landmarks: Any, shapes: Sequence[FloatArray]) -> FloatArray:
-    """Landmarks of all meshes as points. *Shape:* ``(n, K, 3)``.
-
-    Args:
-        landmarks: A landmark file, vertices ``(n, K)``, or points ``(n, K, 3)``.
-        shapes: Vertices of the K meshes.
+    """Landmarks as points of all K meshes, from None, a file, vertices ``(n, K)`` or points. *Shape:* ``(n, K, 3)``.
 
     Raises:
         FileNotFoundError: There is no such file.
-        MeshError: Landmarks do not match the meshes.
+        MeshError: Landmarks do not match the meshes, or a vertex does not exist.
     """
     n = len(shapes)
+    if landmarks is None:
+        return np.zeros((0, n, 3))
     table: Any = read_landmarks(landmarks, n) if isinstance(landmarks, (str, os.PathLike)) else to_numpy(landmarks)
-    if table.ndim == 3 and table.shape[1:] == (n, 3):
-        return table.astype(np.float64)
+    if table.size == 0:
+        return np.zeros((0, n, 3))
+    if table.ndim == 3 and table.shape[1:] == (n, 3) and table.dtype.kind in "iuf" and np.isfinite(table).all():
+        return table.astype(np.float64)  # type: ignore[no-any-return]
     if table.ndim != 2 or table.shape[1] != n or table.dtype.kind not in "iu":
         raise MeshError(
             f"landmarks have shape {table.shape} and dtype {table.dtype}; for {n} meshes they are vertex numbers (n, "
-            f"{n}) or points (n, {n}, 3)"
+            f"{n}) or finite points (n, {n}, 3)"
         )
-    return _named_vertices(table, shapes, [f"mesh {k}" for k in range(n)])
-
-
-def _named_vertices(numbers: IntArray, shapes: Sequence[FloatArray], names: Sequence[str]) -> FloatArray:
-    """Positions of numbered vertices, a column for each mesh. *Shape:* ``(n, K) -> (n, K, 3)``.
-
-    Raises:
-        MeshError: A vertex does not exist; the message names the mesh.
-    """
-    for own, vertices, name in zip(numbers.T, shapes, names, strict=True):
+    for k, (own, vertices) in enumerate(zip(table.T, shapes, strict=True)):
         wrong = np.flatnonzero((own < 0) | (own >= len(vertices)))
         if len(wrong):
             raise MeshError(
-                f"landmark {wrong[0]} names vertex {own[wrong[0]]} of {name}, which has {len(vertices)} vertices, "
-                "counted from 0"
+                f"landmark {wrong[0]} names vertex {own[wrong[0]]} of mesh {k}, which has {len(vertices)} vertices, "
+                "both counted from 0"
             )
-    return np.stack([vertices[own] for own, vertices in zip(numbers.T, shapes, strict=True)], axis=1)
+    return np.stack([vertices[own] for own, vertices in zip(table.T, shapes, strict=True)], axis=1)
 
 
 def read_landmarks(path: str | os.PathLike[str], n_meshes: int) -> IntArray | FloatArray:
-    """Read a landmark file: a line for each landmark, a column for each mesh; ``#`` begins a comment.
+    """Read a landmark file: vertices ``(n, n_meshes)``, int64, or points ``(n, n_meshes, 3)``, float64.
 
-    Args:
-        path: A text file. Each line names one vertex of each mesh, counted from 0, or gives three coordinates for each.
-        n_meshes: Number of meshes.
-
-    Returns:
-        Vertices, int64, *shape* ``(n, n_meshes)``, or points, float64, *shape* ``(n, n_meshes, 3)``.
+    Each line of the text names one vertex of each mesh, counted from 0, or gives three coordinates for each; ``#``
+    begins a comment.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -138,47 +86,9 @@ def read_landmarks(path: str | os.PathLike[str], n_meshes: int) -> IntArray | Fl
 
 
 def landmark_vertices(path: str | os.PathLike[str], shapes: Sequence[FloatArray]) -> IntArray:
-    """Landmarks of a file as vertex indices; points give the nearest vertices. *Shape:* ``(n, K)``.
-
-    Args:
-        path: As for `read_landmarks`.
-        shapes: Vertices of the K meshes. *Shape of each:* ``(V, 3)``.
-
-    Raises:
-        FileNotFoundError: There is no such file.
-        MeshError: A line cannot be used, or a mesh has no such vertex.
-    """
+    """Landmarks of a file as vertex indices; points give the nearest vertices. *Shape:* ``(n, K)``."""
     table: Any = read_landmarks(path, len(shapes))
     points = landmark_table(table, shapes)
     if table.ndim == 2:
         return np.asarray(table, dtype=np.int64)
     return np.stack([cKDTree(shape).query(points[:, k])[1] for k, shape in enumerate(shapes)], axis=1)
-
-
-def suggest_landmarks(vertices: Any, faces: Any, n: int = N_SUGGESTED) -> IntArray:
-    """Suggest vertices that are easy to identify on another mesh: tips first, then farthest points.
-
-    Tips are local maxima of the mean geodesic distance: the ends of limbs, ears, noses.
-
-    Args:
-        vertices: Vertex positions. *Shape:* ``(V, 3)``.
-        faces: Vertex indices. *Shape:* ``(F, 3)``.
-        n: Number of landmarks.
-
-    Returns:
-        Vertex indices. *Shape:* ``(n,)``, fewer on a mesh with fewer vertices.
-
-    Raises:
-        MeshError: The mesh cannot work.
-        MissingPackageError: The extra ``register`` is not installed.
-    """
-    checked = check_keyframes([vertices], faces, warn=False)
-    points = checked.keyframes[0].detach().cpu().double().numpy()
-    surface, used = referenced(points, checked.faces.cpu().numpy())
-    shape = SpectralShape(surface)
-    eccentricity = shape.farthest_points(4 * n)[1].mean(1)
-    highest = np.where(shape.neighbourhoods(_TIP_RADIUS), eccentricity, -np.inf).max(1)
-    tips = np.flatnonzero(eccentricity >= highest)
-    tips = tips[np.argsort(-eccentricity[tips])][:n]
-    chosen = shape.farthest_points(n, start=tips)[0]
-    return used[surface.nearest_alike(shape.placed.vertices[chosen], shape.coarse.vertex_normals[chosen])]

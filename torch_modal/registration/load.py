@@ -83,7 +83,7 @@ def load_keyframes(
             continue
         from torch_modal.registration.register import register as registered
 
-        pair = None if marks is None else (marks[:, k - 1], marks[:, k])
+        pair = None if marks is None else marks[:, k - 1 : k + 1]
         caching: dict[str, Any] = {"cache_dir": cache_dir, "cache": cache, "progress": progress}
         found = registered(shapes[-1], faces, there, there_faces, landmarks=pair, same_subject=same_subject, **caching)
         name, origin = os.fspath(paths[k]), os.fspath(paths[k - 1])

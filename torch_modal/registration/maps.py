@@ -7,12 +7,14 @@ square roots of the area.
 
 import itertools
 from collections.abc import Callable, Iterator
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 from scipy import sparse
 from scipy.sparse import csgraph
 from scipy.sparse.linalg import eigsh
+from scipy.spatial import cKDTree
 
 from torch_modal import extras
 from torch_modal.arrays import BoolArray, FloatArray, IntArray
@@ -36,6 +38,7 @@ N_REFINED = 4
 N_SAMPLES = 40
 """Number of samples between which distances are compared."""
 _STEP = 3
+_NEAR = 0.12  # largest geodesic distance of closest points from the image of a map, for a surface of unit area
 
 # Weight of the round-trip error relative to the oriented area.
 _ROUND_TRIP = 3.0
@@ -48,13 +51,7 @@ _CONSISTENT, _FEWEST = 0.12, 8
 
 
 class SpectralShape:
-    """The main part of a surface, decimated and scaled to unit area, with eigenfunctions of its Laplacian.
-
-    A surface with at most a fifth more vertices than :data:`N_COARSE` is not decimated.
-
-    Args:
-        surface: The fine surface.
-    """
+    """The main part of a surface, decimated and scaled to unit area, with eigenfunctions of its Laplacian."""
 
     def __init__(self, surface: MeshSurface) -> None:
         clean = largest_pieces(surface, DUST)
@@ -84,9 +81,9 @@ class SpectralShape:
         """Number of coarse vertices."""
         return len(self.coarse.vertices)
 
-    def wave_kernel_signatures(self, n_energies: int = 40) -> FloatArray:
-        """Wave kernel signatures (Aubry et al. 2011) in unit columns. *Shape:* ``(n, n_energies)``."""
-        logs = np.log(np.maximum(self.eigenvalues[1:], 1e-9))
+    def wave_kernel_signatures(self) -> FloatArray:
+        """Wave kernel signatures (Aubry et al. 2011) of 40 energies, in unit columns. *Shape:* ``(n, 40)``."""
+        n_energies, logs = 40, np.log(np.maximum(self.eigenvalues[1:], 1e-9))
         energies = np.linspace(logs[0], logs[-1] / 1.02, n_energies)
         width = max(7 * (logs[-1] - logs[0]) / n_energies, 1e-9)
         weights = np.exp(-((energies[:, None] - logs) ** 2) / (2 * width**2))
@@ -97,24 +94,27 @@ class SpectralShape:
         """Distances along the surface by the heat method. *Shape:* ``(m,) -> (n, m)``."""
         return np.stack([self._heat.compute_distance(int(source)) for source in sources], axis=1)
 
-    def neighbourhoods(self, radius: float) -> BoolArray:
-        """Pairs of vertices within a distance along edges, as a mask. *Shape:* ``(n, n)``."""
+    def is_near(self, vertices: IntArray, points: FloatArray) -> BoolArray:
+        """Points in space whose nearest coarse vertices are near given ones, as a mask. *Shape:* ``(n,), (n, 3)``."""
+        return self._near[vertices, self._tree.query(points)[1]]  # type: ignore[no-any-return]
+
+    @cached_property
+    def _near(self) -> BoolArray:
+        """Pairs of vertices that are near along edges, as a mask. *Shape:* ``(n, n)``."""
         i, j = self.coarse.edges.T
         lengths = np.linalg.norm(self.coarse.vertices[i] - self.coarse.vertices[j], axis=1)
         graph = sparse.csr_matrix((np.maximum(lengths, 1e-12), (i, j)), shape=(len(self),) * 2)
-        near: BoolArray = csgraph.dijkstra(graph, directed=False, limit=radius) <= radius
+        near: BoolArray = csgraph.dijkstra(graph, directed=False, limit=_NEAR) <= _NEAR
         return near
 
-    def farthest_points(self, n: int, start: IntArray | None = None) -> tuple[IntArray, FloatArray]:
-        """Farthest-point samples and the distances to them. *Shape:* ``(m,), (n, m)``.
+    @cached_property
+    def _tree(self) -> cKDTree:
+        return cKDTree(self.placed.vertices)
 
-        Args:
-            n: Number of samples; fewer on a shape with fewer vertices.
-            start: The first samples; by default the vertex farthest from the first vertex.
-        """
-        if start is None:
-            start = self.geodesics_from(np.zeros(1, dtype=np.int64)).argmax(0)
-        chosen, distances = list(start), self.geodesics_from(start)
+    def farthest_points(self, n: int) -> tuple[IntArray, FloatArray]:
+        """Farthest-point samples, ``n`` or all vertices, and the distances to them. *Shape:* ``(m,), (n, m)``."""
+        chosen = [int(self.geodesics_from(np.zeros(1, dtype=np.int64)).argmax())]
+        distances = self.geodesics_from(np.array(chosen))
         while len(chosen) < min(n, len(self)):
             chosen.append(int(distances.min(1).argmax()))
             distances = np.hstack([distances, self.geodesics_from(np.array(chosen[-1:]))])
@@ -122,24 +122,19 @@ class SpectralShape:
 
 
 class Map(NamedTuple):
-    """A map and its scores."""
+    """A map, and its scores for the second shape and for its mirror image. *Shape:* ``(n_first,)``.
+
+    A score is the oriented area of the worse direction minus three times the mean round-trip error: 0.7 or more for
+    correct maps of one subject, negative for mirrored ones.
+    """
 
     vertices: IntArray
-    """*Shape:* ``(n_first,)``."""
     score: float
-    """Oriented area of the worse direction minus three times the mean round-trip error; correct maps of one subject
-    have 0.7 or more, mirrored ones a negative one."""
     mirrored_score: float
-    """Score for the mirror image of the second shape."""
 
 
 class CoarsePair:
-    """Maps from one coarse shape to another.
-
-    Args:
-        first: *n_first vertices.*
-        second: *n_second vertices.*
-    """
+    """Maps from one coarse shape, of n_first vertices, to another."""
 
     def __init__(self, first: SpectralShape, second: SpectralShape) -> None:
         self.first, self.second = first, second
@@ -175,13 +170,7 @@ class CoarsePair:
         return found
 
     def refined(self, vertices: IntArray, start: int, stop: int = FINE_FUNCTIONS) -> Map:
-        """Refine a map with an increasing number of eigenfunctions (ZoomOut, Melzi et al. 2019).
-
-        Args:
-            vertices: The map. *Shape:* ``(n_first,)``.
-            start: Initial number of eigenfunctions.
-            stop: Final number of eigenfunctions.
-        """
+        """Refine a map with from ``start`` to ``stop`` eigenfunctions (ZoomOut, Melzi et al. 2019)."""
         most = min(stop, self.first.functions.shape[1], self.second.functions.shape[1])
         for k in [*range(min(start, most), most, _STEP), most]:
             rows = self.second.functions[:, :k] @ self._functional(vertices, k).T
@@ -199,12 +188,8 @@ class CoarsePair:
     def from_spectra(self, n_signs: int, tick: Callable[[], None] = lambda: None) -> list[Map]:
         """The best maps from spectra, best first; the last is the best map to the mirrored target.
 
-        The initial maps are all sign patterns of the lowest eigenfunctions, wave kernel signatures and rigid alignments
-        of principal axes. All are refined with few eigenfunctions, the best with all.
-
-        Args:
-            n_signs: Number of eigenfunctions with both signs: ``2**n_signs`` initial maps.
-            tick: Called after each initial map.
+        The initial maps are all ``2**n_signs`` sign patterns of the lowest eigenfunctions, wave kernel signatures and
+        rigid alignments of principal axes. All are refined with few eigenfunctions, the best with all.
         """
         coarse = []
         for vertices, k in self._starts(n_signs):
@@ -221,10 +206,13 @@ class CoarsePair:
         for signs in itertools.product([1.0, -1.0], repeat=n_signs):
             yield nearest_rows(first.functions[:, :k], second.functions[:, :k] * [1.0, *signs]), k
         yield nearest_rows(first.wave_kernel_signatures(), second.wave_kernel_signatures()), 6
-        axes, (centred, target) = [], [shape.coarse.vertices - shape.coarse.centroid for shape in (first, second)]
-        for shape, points in ((first, centred), (second, target)):
-            frame = np.linalg.eigh(points.T @ (shape.coarse.vertex_areas[:, None] * points))[1]
+        axes, centred_shapes = [], []
+        for surface in (first.coarse, second.coarse):
+            points = surface.vertices - np.average(surface.vertices, 0, surface.vertex_areas)
+            frame = np.linalg.eigh(points.T @ (surface.vertex_areas[:, None] * points))[1]
             axes.append(frame * [1, 1, np.sign(np.linalg.det(frame))])
+            centred_shapes.append(points)
+        centred, target = centred_shapes
         flips = ([1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1])
         goal = np.hstack([target, 0.1 * second.coarse.vertex_normals])
         for turn in (np.eye(3), *(axes[0] * signs @ axes[1].T for signs in flips)):

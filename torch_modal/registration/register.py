@@ -15,8 +15,8 @@ from torch_modal.io.cache import Cache
 from torch_modal.keyframes.arrays import weld_seams
 from torch_modal.keyframes.check import check_keyframes
 from torch_modal.progress import Progress, ProgressReport
-from torch_modal.registration.fit import COARSE_STAGES, FINE_STAGES, MAP_WEIGHTS, Gate, TemplateFit
-from torch_modal.registration.landmarks import landmark_points
+from torch_modal.registration.fit import COARSE_STAGES, FINE_STAGES, MAP_WEIGHTS, TemplateFit
+from torch_modal.registration.landmarks import landmark_table
 from torch_modal.registration.maps import (
     FINE_FUNCTIONS,
     MORE_SIGNS,
@@ -26,7 +26,7 @@ from torch_modal.registration.maps import (
     Map,
     SpectralShape,
 )
-from torch_modal.registration.report import TRUSTED, Quality, Registration, judge, measure, ramp, support
+from torch_modal.registration.report import TRUSTED, Quality, Registration, judge, measure, ramp
 from torch_modal.registration.surface import MeshSurface, main_part, outward, referenced
 
 VERSION = 5
@@ -83,8 +83,8 @@ def register(
         template_faces: Vertex indices. *Shape:* ``(F, 3)``.
         target: Vertex positions. *Shape:* ``(V_target, 3)``.
         target_faces: Vertex indices. *Shape:* ``(F_target, 3)``.
-        landmarks: Pairs of vertices, template first, *shape* ``(n, 2)``; or two arrays of points ``(n, 3)``, in the
-            coordinates of the template and of the target.
+        landmarks: Vertices of the template and of the target, *shape* ``(n, 2)``; points, in the coordinates of each,
+            *shape* ``(n, 2, 3)``; or a file of either.
         same_subject: True for nearly isometric poses of one body. Different bodies need five landmarks.
         cache_dir: Folder of the cache; by default ``TORCH_MODAL_CACHE`` or the user's cache folder.
         cache: Keep results on disk, and find them there.
@@ -101,7 +101,7 @@ def register(
     checked = check_keyframes([template], template_faces, warn=False)
     goal = check_keyframes([target], target_faces, warn=False)
     shapes = [mesh.keyframes[0].detach().cpu().double().numpy() for mesh in (checked, goal)]
-    points = landmark_points(landmarks, *shapes)
+    points = landmark_table(landmarks, shapes)
     # Texture seams must not cut the surface open.
     welded, welded_goal = (
         weld_seams(x[None], mesh.faces.cpu()) for x, mesh in zip(shapes, (checked, goal), strict=True)
@@ -156,7 +156,6 @@ class _RegistrationProblem:
         self.rest = rest * self.size
         self.template = own.moved(own.vertices * self.size)
         self.first, self.second = SpectralShape(self.template), SpectralShape(self.target)
-        self.gate = Gate(self.second)
         self.pair = CoarsePair(self.first, self.second)
         self.marks = points[:, 0] * self.size
         self.mark_places = (points[:, 1] - self.origin) / self.unit
@@ -220,7 +219,7 @@ class _RegistrationProblem:
         template = self.first.placed.moved(scale * self.first.placed.vertices)
         back = self.second.placed
         fit = self._fit(template, back, found.vertices, scale)
-        self.progress.expect(len(MAP_WEIGHTS) + sum(stage.steps for stage in COARSE_STAGES))
+        self.progress.expect(len(MAP_WEIGHTS) + sum(n_steps for *_, n_steps in COARSE_STAGES))
         places = self.second.placed.vertices[found.vertices]
         if x is None:
             rest, goal, areas = map(torch.from_numpy, (template.vertices, places, template.vertex_areas))
@@ -228,7 +227,7 @@ class _RegistrationProblem:
                 placed = best_fit(rest, goal, areas).apply(rest).numpy()
             x = fit.follow_map(placed, places)
         x = fit.run(x, COARSE_STAGES, releases=2)
-        return _Candidate(found, distortion, scale, x, fit, measure(template, x, back))
+        return _Candidate(found, distortion, scale, x, fit, measure(template, x, back)[0])
 
     def _fit(self, template: MeshSurface, back: MeshSurface, images: IntArray, scale: float) -> TemplateFit:
         landmarks = None
@@ -239,7 +238,7 @@ class _RegistrationProblem:
             template,
             self.target,
             back,
-            self.gate,
+            self.second,
             images,
             landmarks,
             stretchable=not self.same_subject,
@@ -247,10 +246,7 @@ class _RegistrationProblem:
         )
 
     def _refined(self, candidate: _Candidate) -> _Candidate:
-        """Repeat the fit from the start with the map of its result, until convergence.
-
-        An elastic fit accumulates sliding; its map, first refined by all eigenfunctions, does not.
-        """
+        """Repeat the fit from the start with the map of its result, which accumulates no sliding, until convergence."""
         if not self.same_subject:
             return candidate
         most = candidate.cost + _WORSE
@@ -285,7 +281,7 @@ class _RegistrationProblem:
         start = _carried(template.vertices, coarse, x, frames)
         images = self.second.placed.nearest_alike(start, template.moved(start).vertex_normals)
         fit = self._fit(template, self.target, images, candidate.scale)
-        self.progress.expect(sum(stage.steps for stage in FINE_STAGES))
+        self.progress.expect(sum(n_steps for *_, n_steps in FINE_STAGES))
         found = fit.run(start, FINE_STAGES, releases=1)
         everything = _carried(self.rest * candidate.scale, coarse, x, frames)
         everything[self.used] = found
@@ -293,7 +289,7 @@ class _RegistrationProblem:
 
     # ----------------------------------------------------------------------------------------------------------- report
     def _report(self, x: FloatArray, everything: FloatArray, best: _Candidate) -> Registration:
-        quality = measure(self.template, x, self.target)
+        quality, supported = measure(self.template, x, self.target)
         coarse = best.fit.template.moved(best.x)
         images = self.second.placed.nearest_alike(coarse.vertices, coarse.vertex_normals)
         score = self.pair.rated(images).score
@@ -304,7 +300,6 @@ class _RegistrationProblem:
             rows = self.template.rows(self.template.closest(self.marks))
             errors = np.linalg.norm(rows @ x - self.mark_places, axis=1)
         lead = float(self.mirrored - (score - distortion))
-        supported = support(self.template, x, self.target)
         if self.same_subject:
             # Of a vertex in a wrong place, many distances are wrong; of the others, the few to such vertices.
             misplaced = np.quantile(self.pair.errors(images), _MOST, axis=1)

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from torch_modal.arrays import BoolArray, FloatArray
+from torch_modal.arrays import FloatArray
 from torch_modal.errors import MeshError
 from torch_modal.geometry.closest import dot
 from torch_modal.io.write import to_numpy
@@ -22,14 +22,11 @@ _STRAY = 0.03  # distance from the template above which a piece of the target is
 
 
 class Distances(NamedTuple):
-    """Distances from vertices to the other surface, in percent of the target's bounding-box diagonal."""
+    """Distances from vertices to the other surface, in percent of the target's diagonal; the mean is by area."""
 
     mean: float
-    """Area-weighted mean."""
     percentile_95: float
-    """95th percentile over the vertices."""
     max: float
-    """Maximum over the vertices."""
 
     @classmethod
     def between(cls, surface: MeshSurface, other: MeshSurface, diagonal: float) -> "Distances":
@@ -55,25 +52,39 @@ class Quality(NamedTuple):
         return self.stretch + 0.1 * (self.to_target.mean + self.from_target.mean) + self.flipped_area
 
 
-def measure(template: MeshSurface, x: FloatArray, target: MeshSurface) -> Quality:
-    """Measure the quality of a fitted template."""
+def measure(template: MeshSurface, x: FloatArray, target: MeshSurface) -> tuple[Quality, FloatArray]:
+    """Quality of a fitted template, and the part of the area around each vertex that has a counterpart on the target.
+
+    *Shape:* ``(V, 3) -> (V,)``.
+    """
     shape = template.moved(x)
     target = _without_strays(target, shape)
     i, j = shape.edges.T
     now, rest = (np.linalg.norm(p[i] - p[j], axis=1) for p in (x, template.vertices))
     usable = (now > 0) & (rest > 0)
     logs = np.log(now[usable] / rest[usable])
-    against = target.looks_away(x[shape.faces].mean(1), shape.face_normals)
+    centres = x[shape.faces].mean(1)
+    against = target.looks_away(centres, shape.face_normals)
     pairs = shape.connectivity.face_neighbours
     cosines = [dot(n[pairs[:, 0]], n[pairs[:, 1]]) for n in (template.face_normals, shape.face_normals)]
-    return Quality(
+    # Faces without a counterpart are far from the target, at one of its holes, or collapsed.
+    closest = target.closest(centres)
+    change = shape.face_areas / np.maximum(template.face_areas, 1e-30)
+    missing = (closest.distances > _FAR * target.diagonal) | (
+        change < _SHRUNK * np.median(change[template.face_areas > 0])
+    )
+    missing |= target.on_open_edge(closest) & ~shape.on_boundary[shape.faces].any(1)
+    corners, whole = template.faces.reshape(-1), template.face_areas
+    own, every = (np.bincount(corners, np.repeat(areas, 3), len(x)) for areas in (whole * ~missing, whole))
+    quality = Quality(
         Distances.between(shape, target, target.diagonal),
         Distances.between(target, shape, target.diagonal),
         float(np.sqrt(np.mean((logs - np.median(logs)) ** 2))) if len(logs) else 0.0,
-        float(template.face_areas[against].sum() / template.area),
+        float(whole[against].sum() / template.area),
         int(((cosines[0] > 0) & (cosines[1] < -0.5)).sum()),
-        float(template.face_areas[_unsupported(template, shape, target)].sum() / template.area),
+        float(whole[missing].sum() / template.area),
     )
+    return quality, own / np.maximum(every, np.finfo(np.float64).tiny)
 
 
 def _without_strays(target: MeshSurface, shape: MeshSurface) -> MeshSurface:
@@ -85,27 +96,6 @@ def _without_strays(target: MeshSurface, shape: MeshSurface) -> MeshSurface:
     np.minimum.at(nearest, pieces, shape.closest(target.vertices).distances)
     kept = (nearest <= _STRAY * shape.diagonal)[pieces[target.faces[:, 0]]]
     return referenced(target.vertices, target.faces[kept])[0] if kept.any() else target
-
-
-def _unsupported(template: MeshSurface, shape: MeshSurface, target: MeshSurface) -> BoolArray:
-    """Faces that are far from the target, at one of its holes, or collapsed, as a mask. *Shape:* ``(F,)``."""
-    closest = target.closest(shape.vertices[shape.faces].mean(1))
-    open_there = target.on_open_edge(closest) & ~shape.on_boundary[shape.faces].any(1)
-    change = shape.face_areas / np.maximum(template.face_areas, 1e-30)
-    usual = np.median(change[template.face_areas > 0])
-    found: BoolArray = (closest.distances > _FAR * target.diagonal) | open_there | (change < _SHRUNK * usual)
-    return found
-
-
-def support(template: MeshSurface, x: FloatArray, target: MeshSurface) -> FloatArray:
-    """Part of the area around each vertex that has a counterpart on the target. *Shape:* ``(V, 3) -> (V,)``."""
-    shape = template.moved(x)
-    areas = template.face_areas * ~_unsupported(template, shape, _without_strays(target, shape))
-    own, whole = (
-        np.bincount(template.faces.reshape(-1), np.repeat(a, 3), len(x)) for a in (areas, template.face_areas)
-    )
-    found: FloatArray = own / np.maximum(whole, np.finfo(np.float64).tiny)
-    return found
 
 
 class Registration(NamedTuple):

@@ -23,25 +23,19 @@ CUT = 0.04
 
 
 class Closest(NamedTuple):
-    """Closest points on a surface."""
+    """Closest points on a surface, their faces, and non-negative coordinates in these.
+
+    *Shape:* ``(n,), (n,), (n, 3), (n, 3)``.
+    """
 
     distances: FloatArray
-    """*Shape:* ``(n,)``."""
     faces: IntArray
-    """Face of each point. *Shape:* ``(n,)``."""
     points: FloatArray
-    """*Shape:* ``(n, 3)``."""
     barycentric: FloatArray
-    """Non-negative coordinates in the faces. *Shape:* ``(n, 3)``."""
 
 
 class MeshSurface:
-    """A triangle mesh with cached derived quantities.
-
-    Args:
-        vertices: *Shape:* ``(V, 3)``.
-        faces: *Shape:* ``(F, 3)``, or their connectivity.
-    """
+    """A triangle mesh with cached derived quantities. *Shape:* ``(V, 3)``, and ``(F, 3)`` or a connectivity."""
 
     def __init__(self, vertices: FloatArray, faces: IntArray | Connectivity) -> None:
         self.vertices = np.ascontiguousarray(vertices, dtype=np.float64)
@@ -81,11 +75,6 @@ class MeshSurface:
     def area(self) -> float:
         """Total area."""
         return float(self.face_areas.sum())
-
-    @property
-    def centroid(self) -> FloatArray:
-        """Area-weighted mean of the vertices. *Shape:* ``(3,)``."""
-        return np.average(self.vertices, 0, self.vertex_areas)
 
     @property
     def diagonal(self) -> float:
@@ -133,18 +122,12 @@ class MeshSurface:
         return cKDTree(np.hstack([self.vertices, LEAN * self.diagonal * self.vertex_normals]))
 
     def nearest_alike(self, points: FloatArray, normals: FloatArray) -> IntArray:
-        """Nearest vertex in position and normal, which distinguishes touching sheets.
-
-        *Shape:* ``(n, 3), (n, 3) -> (n,)``.
-        """
+        """Nearest vertex in position and normal, to tell sheets that touch. *Shape:* ``(n, 3), (n, 3) -> (n,)``."""
         rows = np.hstack([points, LEAN * self.diagonal * normals])
         return self._tree_with_normals.query(rows)[1].astype(np.int64)
 
     def looks_away(self, points: FloatArray, normals: FloatArray) -> BoolArray:
-        """Normals opposed to those of the closest point and of the nearest sheet with a similar normal, as a mask.
-
-        *Shape:* ``(n, 3), (n, 3) -> (n,)``.
-        """
+        """True where normals oppose the closest face and any sheet beside it. *Shape:* ``(n, 3), (n, 3) -> (n,)``."""
         away = dot(normals, self.face_normals[self.closest(points).faces]) < 0
         some = np.flatnonzero(away)
         away[some] = dot(normals[some], self.vertex_normals[self.nearest_alike(points[some], normals[some])]) < 0
@@ -178,12 +161,7 @@ def largest_pieces(surface: MeshSurface, share: float = 1.0) -> MeshSurface:
 
 
 def sewn(surface: MeshSurface, reach: float = CUT) -> MeshSurface:
-    """Surface with strips of triangles between the boundaries of adjacent pieces, which close cuts.
-
-    Args:
-        surface: A surface of several pieces.
-        reach: Widest closed gap, in diagonals.
-    """
+    """Surface with strips of triangles that close cuts between its pieces, up to a width in diagonals."""
     mesh = surface.connectivity
     pieces = mesh.vertex_pieces
     open_sides = np.flatnonzero((mesh.counts == 1)[mesh.sides])

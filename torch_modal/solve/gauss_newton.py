@@ -1,38 +1,16 @@
 """The damped Gauss-Newton step on modal amplitudes."""
 
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from torch_modal.autograd import full_precision
 from torch_modal.energy.modal_energy import Derivatives
+from torch_modal.solve.minimise import AmplitudeEnergy, ridged
 
 # Parts of a step that are tried side by side.
 STEP_LENGTHS = (1.0, 0.5, 0.25, 0.1, 0.03, 0.003)
-
-# Rounding errors add up along the sum over edges and hinges; this many times their size is as far as a gradient goes.
-ROUNDING_MARGIN = 4.0
-
-
-class AmplitudeEnergy(Protocol):
-    """Protocol of an energy of amplitudes with its derivatives."""
-
-    @property
-    def n_amplitudes(self) -> int:
-        """Number of amplitudes, n."""
-
-    def value(self, a: Tensor, placement: Any) -> Tensor:
-        """Energy. *Shape:* ``(..., B, n) -> (..., B)``."""
-
-    def derivatives(self, a: Tensor, placement: Any, second_order: bool = True) -> Derivatives:
-        """Derivatives. *Shape:* ``(B, n)``."""
-
-    def value_and_gradient(self, a: Tensor, placement: Any) -> tuple[Tensor, Tensor]:
-        """Energy and gradient. *Shape:* ``(B, n) -> (B,), (B, n)``."""
-
-    def gradient(self, a: Tensor, placement: Any) -> Tensor:
-        """Gradient, to be differentiated in all that the placement holds. *Shape:* ``(B, n) -> (B, n)``."""
 
 
 class Step(NamedTuple):
@@ -106,20 +84,6 @@ class GaussNewtonStep(nn.Module):
         moved = lowest <= value + 4 * torch.finfo(value.dtype).eps * value.abs()
         reached, energy = torch.where(moved[:, None], best, a), torch.where(moved, lowest, value)
         return Step(reached, energy, derivatives.gradient.norm(dim=-1), moved)
-
-
-def ridged(hessian: Tensor, damping: float | None = None) -> Tensor:
-    """A Hessian with a ridge relative to its mean diagonal. *Shape:* ``(..., n, n)``."""
-    if damping is None:
-        damping = 1e-12 if hessian.dtype == torch.float64 else 1e-6
-    size = hessian.diagonal(dim1=-2, dim2=-1).mean(-1)
-    ridge = damping * size.abs() + torch.finfo(size.dtype).tiny
-    return hessian + torch.diag_embed(ridge[..., None].expand(hessian.shape[:-1]))
-
-
-def gradient_floor(derivatives: Derivatives) -> Tensor:
-    """Gradient norm below which there is only rounding. *Shape:* ``(B,)``."""
-    return ROUNDING_MARGIN * derivatives.resolution
 
 
 def _directions(derivatives: Derivatives, damping: float | None) -> Tensor:

@@ -9,15 +9,12 @@ from torch import Tensor
 
 from torch_modal import trees
 from torch_modal.autograd import applied, flattened, recorded, transposed
-from torch_modal.solve.gauss_newton import AmplitudeEnergy, GaussNewtonStep, gradient_floor, ridged
-from torch_modal.solve.minimise import Solution, Status, minimise
+from torch_modal.solve.gauss_newton import GaussNewtonStep
+from torch_modal.solve.minimise import AmplitudeEnergy, Solution, Status, minimise, ridged
 
 
 class ConvergenceWarning(UserWarning):
     """A minimisation stopped before its gradient vanished, or has no gradient where it stopped."""
-
-
-Report = Callable[[Solution], None]
 
 
 class _ArgMin(torch.autograd.Function):
@@ -33,12 +30,10 @@ class _ArgMin(torch.autograd.Function):
     def forward(
         energy: AmplitudeEnergy, limits: tuple[Any, ...], tree: Any, usable: Tensor, *tensors: Tensor
     ) -> tuple[Tensor, ...]:
-        method, max_steps, tolerance, report = limits
+        method, max_steps, tolerance = limits
         start = usable.new_zeros(len(usable), energy.n_amplitudes, dtype=tensors[0].dtype)
         solution = method(energy, start, trees.filled(tree, tensors), max_steps, tolerance)
         solution = solution._replace(status=torch.where(usable, solution.status, Status.INVALID))
-        if report is not None:
-            report(solution)
         return tuple(value for value in solution if value is not None)
 
     @staticmethod
@@ -73,15 +68,7 @@ class _ArgMin(torch.autograd.Function):
 def _adjoint(
     energy: AmplitudeEnergy, tree: Any, amplitudes: Tensor, status: Tensor, *tensors: Tensor
 ) -> Callable[[Tensor], tuple[Tensor, ...]]:
-    """From gradients in the amplitudes, ``(B, n)``, to those in the tensors of the placement: linear.
-
-    Args:
-        energy: The energy of the amplitudes.
-        tree: Skeleton of the placement.
-        amplitudes: That were found. *Shape:* ``(B, n)``.
-        status: *Shape:* ``(B,)``.
-        tensors: Of the placement.
-    """
+    """From gradients in the amplitudes, ``(B, n)``, to those in the tensors of the placement: linear."""
     placement = trees.filled(tree, tensors)
     converged = (status == Status.CONVERGED)[:, None]
     derivatives = energy.derivatives(amplitudes, placement)
@@ -125,7 +112,6 @@ def solve_implicit(
     usable: Tensor,
     max_steps: int,
     tolerance: float,
-    report: Report | None,
     method: Callable[..., Solution] = minimise,
 ) -> Solution:
     """Minimise from zeros; gradients of the amplitudes by the implicit function theorem.
@@ -136,19 +122,18 @@ def solve_implicit(
         usable: False for samples whose status is ``INVALID`` whatever comes out. *Shape:* ``(B,)``.
         max_steps: Of :func:`~torch_modal.solve.minimise.minimise`.
         tolerance: Likewise.
-        report: Receives the solution.
         method: Minimises, with the arguments of :func:`~torch_modal.solve.minimise.minimise`.
     """
-    limits = method, max_steps, tolerance, report
-    return Solution(*applied(_ArgMin, energy, limits, trees.skeleton(placement), usable, *trees.leaves(placement)))
+    given = energy, (method, max_steps, tolerance), trees.skeleton(placement), usable, *trees.leaves(placement)
+    return Solution(*applied(_ArgMin, *given))
 
 
 def solve_unrolled(
-    energy: AmplitudeEnergy, placement: Any, usable: Tensor, max_steps: int, tolerance: float, report: Report | None
+    energy: AmplitudeEnergy, placement: Any, usable: Tensor, max_steps: int, tolerance: float
 ) -> Solution:
     """Take exactly ``max_steps`` steps from zeros; gradients flow back through all of them.
 
-    Nothing here depends on data but what is computed: no early end, no report. Arguments as for :func:`solve_implicit`.
+    Nothing here depends on data but what is computed: no early end. Arguments as for :func:`solve_implicit`.
     """
     step, a = GaussNewtonStep(energy), trees.leaves(placement)[0].new_zeros(len(usable), energy.n_amplitudes)
     first = None
@@ -159,7 +144,7 @@ def solve_unrolled(
     derivatives = energy.derivatives(a, placement, second_order=False)
     norm = derivatives.gradient.norm(dim=-1)
     first = norm if first is None else first
-    found = norm <= torch.maximum(tolerance * first, gradient_floor(derivatives))
+    found = norm <= torch.maximum(tolerance * first, derivatives.floor)
     status = torch.where(found, Status.CONVERGED, Status.OUT_OF_STEPS)
     status = torch.where(usable & norm.isfinite(), status, Status.INVALID)
     relative = norm / first.clamp_min(torch.finfo(first.dtype).tiny)

@@ -5,13 +5,14 @@ Hessians of a Newton method, and need no second-order term.
 """
 
 from enum import IntEnum
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
 from torch_modal import trees
-from torch_modal.solve.gauss_newton import AmplitudeEnergy, gradient_floor, ridged
+from torch_modal.energy.energy import ENERGY_ROUNDING
+from torch_modal.energy.modal_energy import Derivatives
 
 # Evaluations of the gradient with one Hessian of Gauss and Newton. Samples that need more get another.
 MOST_EVALUATIONS = 40
@@ -19,8 +20,25 @@ MOST_EVALUATIONS = 40
 # Steps shorter than this part of the quasi-Newton step make no progress worth an evaluation.
 SHORTEST = 0.02
 
-# Roundings of an energy, relative to it, by which it may rise.
-ENERGY_ROUNDING = 64.0
+
+class AmplitudeEnergy(Protocol):
+    """Protocol of an energy of amplitudes with its derivatives."""
+
+    @property
+    def n_amplitudes(self) -> int:
+        """Number of amplitudes, n."""
+
+    def value(self, a: Tensor, placement: Any) -> Tensor:
+        """Energy. *Shape:* ``(..., B, n) -> (..., B)``."""
+
+    def derivatives(self, a: Tensor, placement: Any, second_order: bool = True) -> Derivatives:
+        """Derivatives. *Shape:* ``(B, n)``."""
+
+    def value_and_gradient(self, a: Tensor, placement: Any) -> tuple[Tensor, Tensor]:
+        """Energy and gradient. *Shape:* ``(B, n) -> (B,), (B, n)``."""
+
+    def gradient(self, a: Tensor, placement: Any) -> Tensor:
+        """Gradient, to be differentiated in all that the placement holds. *Shape:* ``(B, n) -> (B, n)``."""
 
 
 class Status(IntEnum):
@@ -85,6 +103,8 @@ class _State(NamedTuple):
     """Of the next step, relative to the quasi-Newton step; 0 of converged samples. *Shape:* ``(B,)``."""
     goal: Tensor
     """The gradient norm at which it has converged. *Shape:* ``(B,)``."""
+    rounding: Tensor
+    """Rounding of the energy that that of the positions explains, over the root of the energy. *Shape:* ``(B,)``."""
     n_steps: Tensor
     """Steps taken. *Shape:* ``(B,)``, int64."""
     placement: Any
@@ -117,13 +137,15 @@ def minimise(
         derivatives = energy.derivatives(found[rows], some, second_order=False)
         own_norm = derivatives.gradient.norm(dim=-1)
         if not used:
-            start, goal = own_norm, torch.maximum(tolerance * own_norm, gradient_floor(derivatives))
+            start, goal = own_norm, torch.maximum(tolerance * own_norm, derivatives.floor)
         factor, info = torch.linalg.cholesky_ex(ridged(derivatives.gauss_newton))
         regular = (info == 0) & own_norm.isfinite() & reached[rows].isfinite()
         inverse = torch.cholesky_inverse(torch.where(regular[:, None, None], factor, eye))
         own = found[rows, :, None], reached[rows], derivatives.gradient[..., None], own_norm, inverse
         length, before = (regular & (own_norm > goal[rows])).to(a), n_steps[rows]
-        state = _State(rows, *own, length, goal[rows], before, some)
+        stiffest = derivatives.gauss_newton.diagonal(dim1=-2, dim2=-1).amax(-1)
+        rounding = derivatives.resolution / stiffest.clamp_min(torch.finfo(a.dtype).tiny).sqrt()
+        state = _State(rows, *own, length, goal[rows], rounding, before, some)
         whole = found, reached, norm, n_steps, drowned
         for _ in range(min(MOST_EVALUATIONS, max_steps - used)):
             n_active = int(torch.count_nonzero(state.length))
@@ -167,8 +189,11 @@ def _advanced(energy: AmplitudeEnergy, state: _State) -> _State:
     there = a + move
     value, slope = energy.value_and_gradient(there.squeeze(-1), state.placement)
     slope = slope[..., None]
-    # Energies are sums of squares. They may rise by their rounding.
-    better = (length > 0) & (value <= state.energy * (1 + ENERGY_ROUNDING * torch.finfo(value.dtype).eps))
+    norm = torch.linalg.vector_norm(slope, dim=(1, 2))
+    # Energies are sums of squares. They may rise by their rounding, and where the gradient falls, by that of positions.
+    bound = state.energy * (1 + ENERGY_ROUNDING * torch.finfo(value.dtype).eps)
+    bound = torch.where(norm < state.norm, bound + state.rounding * state.energy.clamp_min(0).sqrt(), bound)
+    better = (length > 0) & (value <= bound)
     change = slope - gradient
     if bool(better.all()):
         length = torch.ones_like(length)
@@ -176,6 +201,7 @@ def _advanced(energy: AmplitudeEnergy, state: _State) -> _State:
         taken = better[:, None, None]
         there, move, change = torch.where(taken, there, a), move * taken, torch.where(taken, change, 0)
         value, slope = torch.where(better, value, state.energy), torch.where(taken, slope, gradient)
+        norm = torch.where(better, norm, state.norm)
         shorter = torch.where(length > SHORTEST, 0.5 * length, 0)
         length = torch.where(better, 1, shorter)
     # The update keeps the inverse positive definite where the gradient grows along the step; elsewhere it is left out.
@@ -184,7 +210,6 @@ def _advanced(energy: AmplitudeEnergy, state: _State) -> _State:
     share = torch.where(curvature > 0, curvature.reciprocal(), 0)
     half = torch.bmm(across, pushed).mul_(share).add_(1).mul_(0.5)
     other, scaled = torch.addcmul(pushed, half, move, value=-1), move * share
-    norm = torch.linalg.vector_norm(slope, dim=(1, 2))
     return state._replace(
         a=there,
         energy=value,
@@ -194,3 +219,12 @@ def _advanced(energy: AmplitudeEnergy, state: _State) -> _State:
         length=length * (norm > state.goal),
         n_steps=state.n_steps + better,
     )
+
+
+def ridged(hessian: Tensor, damping: float | None = None) -> Tensor:
+    """A Hessian with a ridge relative to its mean diagonal. *Shape:* ``(..., n, n)``."""
+    if damping is None:
+        damping = 1e-12 if hessian.dtype == torch.float64 else 1e-6
+    size = hessian.diagonal(dim1=-2, dim2=-1).mean(-1)
+    ridge = damping * size.abs() + torch.finfo(size.dtype).tiny
+    return hessian + torch.diag_embed(ridge[..., None].expand(hessian.shape[:-1]))

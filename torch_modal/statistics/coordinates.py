@@ -1,23 +1,14 @@
-"""Linear coordinates of shapes, rotations and strains of triangles from a mean shape, and principal components."""
+"""Linear coordinates of shapes: rotations and strains of triangles from a mean shape."""
 
 import torch
 from torch import Tensor
 
-from torch_modal.autograd import lasting
 from torch_modal.geometry.canonical import size
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.local_rotations import LocalRotations
 from torch_modal.geometry.poisson import Reconstruction
 from torch_modal.geometry.rigid import RigidMotion, best_fit
-from torch_modal.geometry.triangle_frames import (
-    BentTriangles,
-    Frames,
-    Sides,
-    bending_between,
-    bent_sides,
-    frames,
-    sides,
-)
+from torch_modal.geometry.triangle_frames import Sides, bending_between, bent_sides, frames_of
 
 # Logarithmic strains beyond this, a factor of 3,000, are those of triangles without area.
 MOST_STRAIN = 8.0
@@ -35,18 +26,14 @@ class BendingCoordinates:
 
     After the columns of the triangles there is one for each piece but the largest, the offset of its centre from the
     motion of the vertices that it follows, and one for each vertex of no face, its displacement; in sizes of the mean.
-    E is the number of all columns.
-
-    Args:
-        mean: The shape whose coordinates are zero, float64 on the CPU. *Shape:* ``(V, 3)``.
-        faces: Vertex indices. *Shape:* ``(F, 3)``.
+    E is the number of all columns. The mean is float64 on the CPU. *Shape:* ``(V, 3), (F, 3)``.
     """
 
     def __init__(self, mean: Tensor, faces: Tensor) -> None:
         self.mean, self.faces = mean, faces
         self.mesh = Connectivity(faces.numpy(), len(mean))
         self.reconstruction = Reconstruction(mean, faces)
-        self.frames = self._frames(mean[None])
+        self.frames = frames_of(mean[None], faces)
         areas = 0.5 * self.frames.doubled_areas[0]
         self._has_area = areas > SMALLEST_AREA * areas.mean()
         self.size = size(mean.numpy(), faces.numpy())
@@ -63,9 +50,6 @@ class BendingCoordinates:
         #: Weights of squared coordinates: parts of the area, twice beside the diagonal of strains. *Shape:* ``(6, E)``.
         self.shares = parts * areas.new_tensor([1, 1, 1, 1, 2, 1])[:, None]
 
-    def _frames(self, x: Tensor) -> Frames:
-        return frames(sides(x.movedim(-1, 0).contiguous(), self.faces))
-
     def of(self, shapes: Tensor) -> Tensor:
         """The coordinates of shapes, in the pose in which they fit the mean best. *Shape:* ``(B, V, 3) -> (B, 6, E)``.
 
@@ -74,9 +58,9 @@ class BendingCoordinates:
         found, placed = [], self.aligned(shapes)
         for x in placed:
             rotations = LocalRotations(self.mesh, torch.stack([self.mean, x.detach()]))
-            own = self._frames(x[None])
-            bending = bending_between(self.frames, own, rotations.turns(self.mean[None], x[None]))
-            turn, strain = bending.turn[:, 0], torch.stack(bending.strain)[:, 0].clamp(-MOST_STRAIN, MOST_STRAIN)
+            own = frames_of(x[None], self.faces)
+            turn, strain = bending_between(self.frames, own, rotations.turns(self.mean[None], x[None]))
+            turn, strain = turn[:, 0], strain[:, 0].clamp(-MOST_STRAIN, MOST_STRAIN)
             areas = own.doubled_areas[0]
             flat = ~self._has_area | (areas <= SMALLEST_AREA * areas.mean())
             flat = flat | ~(turn.isfinite().all(0) & strain.isfinite().all(0))
@@ -117,7 +101,7 @@ class BendingCoordinates:
     def sides(self, coordinates: Tensor) -> Sides:
         """Target sides of the triangles. *Shape:* ``(B, 6, E)``."""
         rows = coordinates[..., : len(self.faces)].movedim(1, 0)
-        return bent_sides(BentTriangles(rows[:3], (rows[3], rows[4], rows[5])), self.frames)
+        return bent_sides(rows[:3], rows[3:], self.frames)
 
     def shapes(self, coordinates: Tensor) -> Tensor:
         """The shapes of coordinates, in the pose of the mean. *Shape:* ``(B, 6, E) -> (B, V, 3)``."""
@@ -129,56 +113,3 @@ class BendingCoordinates:
             found = found.index_add(1, piece, (motion.rotation @ move[..., None]).mT.expand(-1, len(piece), -1))
         unused = self.mean[self._unused] + offsets[:, len(moves) :]
         return self.aligned(found).index_copy(1, self._unused, unused)
-
-
-class Components:
-    """Directions in which the shapes of a set vary most, and coordinates along them.
-
-    They are those of rotations and strains of the triangles, weighted by area: a component bends a leg where one of
-    displacements would shear it.
-
-    Args:
-        coordinates: About the mean.
-        bending: Those of the given shapes. *Shape:* ``(K, 6, E)``.
-        n: Number of components, at most K - 1.
-        origin: Point that was subtracted from the shapes. *Shape:* ``(3,)``.
-    """
-
-    @lasting
-    def __init__(self, coordinates: BendingCoordinates, bending: Tensor, n: int, origin: Tensor) -> None:
-        self._coordinates, self._origin = coordinates, origin
-        self._average = bending.mean(0)
-        off = ((bending - self._average) * coordinates.shares.sqrt()).flatten(1)
-        left, values, _ = torch.linalg.svd(off, full_matrices=False)
-        left, values = left[:, :n], values[:n]
-        # The sign under which the first shape that is not in the middle lies on the positive side.
-        first = left.abs().argmax(0, keepdim=True)
-        left = left * torch.where(left.gather(0, first) < 0, -1, 1)
-        #: Variance along each, in squared radians (or squared strains). *Shape:* ``(n,)``.
-        self.variances = values.square() / max(len(bending) - 1, 1)
-        #: Part of the whole variance that each has. *Shape:* ``(n,)``.
-        self.shares = values.square() / off.square().sum().clamp_min(torch.finfo(off.dtype).tiny)
-        #: Directions of root mean square one over the area. *Shape:* ``(n, 6, E)``.
-        self.directions = torch.einsum(
-            "kn,kjf->njf", left / values.clamp_min(torch.finfo(off.dtype).tiny), bending - self._average
-        )
-
-    def __len__(self) -> int:
-        return len(self.directions)
-
-    def coordinates(self, shapes: Tensor) -> Tensor:
-        """Coordinates of shapes along the components. *Shape:* ``(..., V, 3) -> (..., n)``."""
-        flat = shapes.reshape(shapes.shape[:-2].numel(), *shapes.shape[-2:]).to(self.directions)
-        off = (self._coordinates.of(flat) - self._average) * self._coordinates.shares
-        found = torch.einsum("bjf,njf->bn", off, self.directions)
-        return found.view(*shapes.shape[:-2], len(self)).to(shapes)
-
-    def shapes(self, coordinates: Tensor) -> Tensor:
-        """The shapes of coordinates, in the pose of the mean; zeros give the average of rotations and strains.
-
-        *Shape:* ``(..., n) -> (..., V, 3)``.
-        """
-        flat = coordinates.reshape(coordinates.shape[:-1].numel(), coordinates.shape[-1]).to(self.directions)
-        bending = self._average + torch.einsum("bn,njf->bjf", flat, self.directions[: flat.shape[1]])
-        found = self._coordinates.shapes(bending) + self._origin
-        return found.view(*coordinates.shape[:-1], *found.shape[1:]).to(coordinates)

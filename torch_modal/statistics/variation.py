@@ -48,13 +48,9 @@ ROUNDS, SMOOTHER = 4, 0.5
 
 
 class Variation:
-    """Shapes whose parts are mixed from given ones with weights of their own.
+    """Shapes whose parts are mixed from given ones, float64 on the CPU, with weights of their own.
 
-    All positions are relative to :attr:`origin`.
-
-    Args:
-        shapes: *Shape:* ``(K, V, 3)``, float64 on the CPU.
-        faces: Vertex indices. *Shape:* ``(F, 3)``.
+    All positions are relative to :attr:`origin`. *Shape:* ``(K, V, 3), (F, 3)``.
     """
 
     def __init__(self, shapes: Tensor, faces: Tensor) -> None:
@@ -92,10 +88,6 @@ class Variation:
     def __len__(self) -> int:
         return len(self.shapes)
 
-    def local(self, factors: Tensor, about: Tensor) -> Tensor:
-        """Weights at the vertices; they add up to one. *Shape:* ``(K, n), (K,) -> (K, V)``."""
-        return about[:, None] + (factors - factors.mean(0)) @ self.fields
-
     def bending(self, weights: Tensor) -> Tensor:
         """Coordinates of local weights. *Shape:* ``(K, V) -> (6, E)``."""
         return self.average + torch.einsum("ke,kje->je", self.coordinates.spread(weights), self.deviations)
@@ -108,14 +100,9 @@ class Variation:
     def relaxed(
         self, x: Tensor, weights: Tensor, n_steps: int, n_products: int, pulls: FurtherEnergy | None = None
     ) -> Tensor:
-        """Steps of all vertices towards weighted means of the lengths and angles of the given shapes.
+        """Newton steps of all vertices towards weighted means of the lengths and angles of the given shapes.
 
-        Args:
-            x: In the pose of the mean. *Shape:* ``(V, 3)``.
-            weights: *Shape:* ``(K, V)``.
-            n_steps: Newton steps.
-            n_products: Iterations of conjugate gradients in each.
-            pulls: An energy beside it, at a size of 100.
+        The shape is in the pose of the mean; the pulls are an energy at a size of 100. *Shape:* ``(V, 3), (K, V)``.
         """
         energy = self.fine.energy
         rest = trees.mapped(energy.mixed(self.rest, weights), lambda part: part[None])
@@ -124,29 +111,44 @@ class Variation:
         return self.fine.towards(self.scale * x[None], reference, n_steps, n_products, beside)[0] / self.scale
 
     # ----------------------------------------------------------------------------------------------------- new members
-    def draw(self, concentration: float, locality: float, generator: torch.Generator | None) -> tuple[Tensor, Tensor]:
-        """Random weights, and factors of the fields over which their logarithms vary. *Shape:* ``(K,), (K, n - 1)``."""
+    def draw(
+        self, n: int, concentration: float, locality: float, generator: torch.Generator | None
+    ) -> tuple[Tensor, Tensor]:
+        """Random weights, and factors of the fields over which their logarithms vary.
+
+        *Shape:* ``(n, K), (n, K, n_fields - 1)``.
+
+        Raises:
+            ValueError: An argument is out of range.
+        """
+        if n < 0:
+            raise ValueError(f"n is 0 or more, got {n}")
+        check_density(concentration, locality)
         device = torch.device("cpu") if generator is None else generator.device
         shape = torch.full((len(self),), concentration, dtype=torch.float64, device=device)
-        # Gamma variates by their logarithms: those of small concentrations underflow.
-        drawn = torch._standard_gamma(shape + 1, generator=generator).log()
-        drawn = drawn + torch.rand(len(self), dtype=torch.float64, generator=generator, device=device).log() / shape
-        size = len(self), len(self.fields) - 1
-        factors = torch.randn(size, dtype=torch.float64, generator=generator, device=device).cpu()
-        return torch.softmax(drawn, 0).cpu(), locality * factors
+        weights = torch.empty(n, len(self), dtype=torch.float64)
+        factors = torch.empty(n, len(self), len(self.fields) - 1, dtype=torch.float64)
+        for i in range(n):
+            # Gamma variates by their logarithms: those of small concentrations underflow.
+            drawn = torch._standard_gamma(shape + 1, generator=generator).log()
+            drawn = drawn + torch.rand(len(self), dtype=torch.float64, generator=generator, device=device).log() / shape
+            weights[i] = torch.softmax(drawn, 0)
+            factors[i] = torch.randn(factors.shape[1:], dtype=torch.float64, generator=generator, device=device)
+        return weights, locality * factors
+
+    def members(self, weights: Tensor, factors: Tensor) -> Tensor:
+        """Members of the set, in the pose of the mean. *Shape:* ``(n, K), (n, K, n_fields - 1) -> (n, V, 3)``."""
+        out = self.shapes.new_empty(len(weights), *self.shapes.shape[1:])
+        for i, drawn in enumerate(zip(weights, factors, strict=True)):
+            out[i] = self.member(*drawn)[0]
+        return out
 
     def member(self, weights: Tensor, factors: Tensor) -> tuple[Tensor, Tensor]:
         """A member of the set, in the pose of the mean, and its local weights; less local, if it would fold.
 
-        If it folds even then, it is the given shape of the largest weight. None of the weights is below zero, and they
-        add up to one.
-
-        Args:
-            weights: Weights of the given shapes. *Shape:* ``(K,)``.
-            factors: Factors from :meth:`draw`. *Shape:* ``(K, n - 1)``.
-
-        Returns:
-            *Shape:* ``(V, 3)``, ``(K, V)``.
+        If it folds even then, it is the given shape of the largest weight. None of the local weights is below zero, and
+        they add up to one. *Shape:* ``(K,), (K, n_fields - 1) -> (V, 3), (K, V)``, with weights and factors of
+        :meth:`draw`.
         """
         most = max(self.folds(x) for x in self.shapes)
         logarithms = weights.clamp_min(torch.finfo(weights.dtype).tiny).log()[:, None]
@@ -167,12 +169,7 @@ class Variation:
 
 
 class Patches:
-    """Patches around vertices that are far from each other along the surface, so that fingers do not mix.
-
-    Args:
-        mean: A shape. *Shape:* ``(V, 3)``.
-        reconstruction: Poisson problem of the connectivity; gaps to loose pieces are measured in space.
-    """
+    """Patches around vertices of a shape that are far apart along the surface, so that fingers do not mix."""
 
     def __init__(self, mean: Tensor, reconstruction: Reconstruction) -> None:
         graph, used = _graph(mean, reconstruction), np.unique(reconstruction.faces.numpy())
@@ -201,13 +198,9 @@ class Patches:
         return len(self.shares)
 
     def fields(self, length: float) -> Tensor:
-        """Fields on the vertices whose sums with normal factors are as smooth as a length says.
+        """Fields whose sums with normal factors vary over a length, relative to the largest distance of two centres.
 
-        Args:
-            length: Over which they vary, relative to the largest distance of two centres.
-
-        Returns:
-            *Shape:* ``(n, V)``; the first is one everywhere.
+        *Shape:* ``(n, V)``; the first is one everywhere.
         """
         among = self.distances[self.distances.isfinite()]
         scale = length * among.amax().clamp_min(torch.finfo(among.dtype).tiny)
@@ -218,12 +211,7 @@ class Patches:
 
 
 class LocalMixtures:
-    """Weights with which shapes, each in its best rotation, make up the patches of another shape.
-
-    Args:
-        patches: The patches.
-        shapes: *Shape:* ``(K, V, 3)``.
-    """
+    """Weights with which shapes, each in its best rotation, make up the patches of another. *Shape:* ``(K, V, 3)``."""
 
     def __init__(self, patches: Patches, shapes: Tensor) -> None:
         self.patches, k = patches, len(shapes)
@@ -235,15 +223,9 @@ class LocalMixtures:
         self.moments = products - self.centres[:, :, None, :, None] * self.centres[:, None, :, None, :]
 
     def weights(self, x: Tensor) -> Tensor:
-        r"""Weights of the shapes at each vertex, with sum one.
+        r"""Weights of the shapes at each vertex, with sum one. *Shape:* ``(V, 3) -> (K, V)``.
 
         In each patch they minimise :math:`|x - \sum_k w_k R_k x_k|^2`, with the rotations that fit best.
-
-        Args:
-            x: *Shape:* ``(V, 3)``.
-
-        Returns:
-            *Shape:* ``(K, V)``.
         """
         masses, n = self.patches.masses, self.moments.shape[1]
         products = torch.stack([(masses * row) @ self.columns for row in x.mT], 1).unflatten(2, (n, 3))
@@ -280,3 +262,9 @@ def _graph(mean: Tensor, reconstruction: Reconstruction) -> sparse.csr_matrix:
     lengths = np.maximum(lengths, 1e-9 * lengths.mean())
     upper = sparse.coo_matrix((lengths, (starts, ends)), shape=(len(mean), len(mean)))
     return (upper + upper.T).tocsr()
+
+
+def check_density(concentration: float, locality: float) -> None:
+    """Raise a ValueError if what new members are drawn with is out of range."""
+    if not 0 < concentration < torch.inf or not 0 <= locality < torch.inf:
+        raise ValueError(f"concentration is above 0, locality 0 or more; got {concentration} and {locality}")

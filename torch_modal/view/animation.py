@@ -13,7 +13,7 @@ from torch_modal.arrays import Array
 from torch_modal.extras import require_installed
 from torch_modal.io.asset import Asset
 from torch_modal.io.files import temporary_beside
-from torch_modal.io.formats import ANIMATION_FORMATS, Animation, make_timing, resample
+from torch_modal.io.formats import ANIMATION_FORMATS, Animation, Timing, resample
 from torch_modal.io.write import check_frames, check_indices, check_suffix, refuse_existing
 from torch_modal.progress import Progress, ProgressReport
 from torch_modal.view.drawing import ByteArray, Scene, draw
@@ -29,11 +29,7 @@ PICTURES_AT_ONCE = 24
 
 
 def require_packages(path: Path) -> None:
-    """Refuse a file whose format needs a package that is not installed, before any work.
-
-    Raises:
-        MissingPackageError: The message says which.
-    """
+    """Raise a MissingPackageError, before any work, for a file whose format needs a package that is not installed."""
     if path.suffix.lower() in ANIMATION_FORMATS:
         found = ANIMATION_FORMATS[path.suffix.lower()]
         require_installed(found.modules, found.extra, path.name)
@@ -112,7 +108,7 @@ def save_animation(
     if cyclic and len(shapes) > 1 and np.array_equal(shapes[0], shapes[-1]):
         shapes = shapes[:-1]
         keyframes = [number for number in keyframes if number < len(shapes)]
-    timing = make_timing(
+    timing = Timing(
         len(shapes),
         max(2, len(keyframes)),
         duration=duration,

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.geometry.vectors import vertex_normals
-from torch_modal.precompute.processes import describe_exit, last_line
+from torch_modal.modes.processes import describe_exit, last_line
 
 logger = logging.getLogger("torch_modal")
 
@@ -79,14 +79,6 @@ def _draw_pyvista(scene: Scene) -> ByteArray:
     return np.stack(images)[..., :3]
 
 
-def _quartered(corners: FloatArray) -> FloatArray:
-    """Each face ``(F, 3, D)`` as four, cut at the middles of its sides. *Shape:* ``(4F, 3, D)``."""
-    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
-    ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
-    parts = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
-    return np.concatenate([np.stack(part, axis=1) for part in parts])
-
-
 def _draw_matplotlib(scene: Scene) -> ByteArray:
     """Images ``(S, height, width, 3)``: faces from back to front, each in one shade."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -100,8 +92,11 @@ def _draw_matplotlib(scene: Scene) -> ByteArray:
     for points, colors in zip(scene.points, scene.colors, strict=True):
         # Position, normal and colour of each corner of each face, in small enough faces to look smooth.
         corners = np.concatenate([points, vertex_normals(points, scene.faces), colors / 255], axis=1)[scene.faces]
-        while len(corners) < SMOOTH_FACES:
-            corners = _quartered(corners)
+        while len(corners) < SMOOTH_FACES:  # each as four, cut at the middles of its sides
+            a, b, c = corners.swapaxes(0, 1)
+            ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
+            parts = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
+            corners = np.concatenate([np.stack(part, axis=1) for part in parts])
         middle = corners.mean(axis=1)
         normals = middle[:, 3:6] / np.maximum(np.linalg.norm(middle[:, 3:6], axis=1, keepdims=True), 1e-12)
         normals *= np.where(normals[:, 2:] < 0, -1.0, 1.0)  # open meshes show their inside too

@@ -31,11 +31,7 @@ SCRIPTS = ("meshes.js", "stage.js", "page.js")
 
 
 class Page:
-    """A page of shapes, which notebooks display and :meth:`save` writes.
-
-    Attributes:
-        html: The whole page.
-        height: In pixels, in a notebook.
+    """A page of shapes as HTML, which notebooks display, with a height in pixels, and :meth:`save` writes.
 
     Raises:
         ValueError: A height below 1.
@@ -59,14 +55,7 @@ class Page:
         )
 
     def save(self, out: str | Path, overwrite: bool = False) -> Path:
-        """Write the page as one HTML file.
-
-        Args:
-            out: File to write, ``*.html``.
-            overwrite: Replace the file if it exists.
-
-        Returns:
-            The file.
+        """Write the page as one HTML file, ``*.html``; the file.
 
         Raises:
             ValueError: ``out`` does not end in .html.
@@ -134,16 +123,8 @@ def show(
         )
     if cyclic and n > 1 and not all(np.array_equal(frames[0], frames[-1]) for frames in shapes):
         stamps = np.append(stamps, stamps[-1] + (stamps[-1] - stamps[0]) / (n - 1))  # when the first comes again
-    return _page(
-        [pack_group(checked, triangles, view, up)],
-        title,
-        height,
-        n_frames=n,
-        times=stamps.tolist(),
-        has_times=times is not None,
-        fps=float(fps),
-        keyframes=keyframes,
-    )
+    data = {"n_frames": n, "times": stamps.tolist(), "has_times": times is not None, "fps": float(fps)}
+    return _page([pack_group(checked, triangles, view, up)], title, height, **data, keyframes=keyframes)
 
 
 def show_landmarks(
@@ -189,28 +170,10 @@ def show_landmarks(
     return _page(groups, title, height, landmarks=rows.tolist())
 
 
-def _page(
-    groups: list[dict[str, Any]],
-    title: str,
-    height: int,
-    *,
-    n_frames: int = 1,
-    times: Sequence[float] = (0.0,),
-    has_times: bool = False,
-    fps: float = 24.0,
-    keyframes: Sequence[int] = (),
-    landmarks: list[list[int]] | None = None,
-) -> Page:
+def _page(groups: list[dict[str, Any]], title: str, height: int, **data: Any) -> Page:
     """The page of groups of shapes, with the data that page.js reads. Titles and names are escaped."""
-    data = {
-        "groups": groups,
-        "n_frames": n_frames,
-        "times": times,
-        "has_times": has_times,
-        "fps": fps,
-        "keyframes": keyframes,
-        "landmarks": landmarks,
-    }
+    still = {"n_frames": 1, "times": [0.0], "has_times": False, "fps": 24.0, "keyframes": [], "landmarks": None}
+    data = {"groups": groups, **still, **data}
     assets = files("torch_modal.view") / "page_assets"
 
     def asset(name: str) -> str:

@@ -34,11 +34,7 @@ def pack_group(
 ) -> dict[str, Any]:
     """Data of shapes that share faces, a grid and a camera; lengths in steps of the grid, which begins at ``origin``.
 
-    Args:
-        sequences: Shapes by name. *Shape of each:* ``(N, V, 3)``.
-        faces: *Shape:* ``(F, 3)``.
-        view: As for :func:`torch_modal.show`.
-        up: As for :func:`torch_modal.show`.
+    Arguments as for :func:`torch_modal.show`.
     """
     first = next(iter(sequences.values()))[0]
     corners = np.stack([f(x.reshape(-1, 3), axis=0) for f in (np.min, np.max) for x in sequences.values()])

@@ -35,35 +35,28 @@ def read_shapes(paths: Sequence[str | os.PathLike[str]]) -> tuple[FloatArray, In
     """
     files = [Path(path) for path in paths]
     if len(files) == 1 and files[0].is_dir():
-        files = _numbered(files[0])
+        folder, found = files[0], [path for path in files[0].iterdir() if path.is_file()]
+        files = sorted(
+            (path for path in found if path.suffix.lower() in FRAME_SUFFIXES), key=lambda path: natural(path.name)
+        )
+        kinds = sorted({path.suffix.lower() for path in files})
+        if len(kinds) != 1:
+            what = (
+                f"meshes of several kinds ({', '.join(kinds)})" if kinds else f"no meshes ({', '.join(FRAME_SUFFIXES)})"
+            )
+            raise MeshError(f"{folder}: {what} in this folder; name the files instead")
     if len(files) == 1 and files[0].suffix.lower() == ".glb" and files[0].is_file():
         asset = open_asset(files[0])
         assert isinstance(asset, GltfAsset)
         animation = _animation(files[0], asset)
         if animation is not None:
-            frames, options = animation
-            return frames, asset.faces, options
+            return animation[0], asset.faces, animation[1]
     keyframes, faces = load_keyframes(files)
     return keyframes.numpy(), faces.numpy(), {}
 
 
-def _numbered(folder: Path) -> list[Path]:
-    """The meshes of a folder in the order of the numbers in their names: 2 before 10."""
-    found = [path for path in folder.iterdir() if path.suffix.lower() in FRAME_SUFFIXES and path.is_file()]
-    kinds = sorted({path.suffix.lower() for path in found})
-    if not kinds:
-        raise MeshError(f"{folder}: no meshes in this folder ({', '.join(FRAME_SUFFIXES)}); name files instead")
-    if len(kinds) > 1:
-        raise MeshError(f"{folder}: meshes of several kinds ({', '.join(kinds)}); name the files instead")
-    return sorted(found, key=lambda path: natural(path.name))
-
-
 def _animation(path: Path, asset: GltfAsset) -> tuple[FloatArray, dict[str, Any]] | None:
-    """The frames of a GLB with morph targets and the options of `show`; None without targets.
-
-    Frame 0 is the mesh, each target a further frame, fully shown at its time. The meaning of other programs' targets is
-    unknown.
-    """
+    """The frames of a GLB, its mesh and each morph target, and the options of `show`; None without targets."""
     document = asset.document
     try:
         frames = asset.morphs()

@@ -35,16 +35,7 @@ def check_view(view: tuple[float, float] | None, up: str | None) -> None:
 
 
 def check_sequences(sequences: Mapping[str, Array], faces: Array, name: str) -> tuple[dict[str, FloatArray], IntArray]:
-    """Sequences of shapes that are shown together, and their faces, as NumPy arrays.
-
-    Args:
-        sequences: *Shape of each:* ``(N, V, 3)``, the same for all.
-        faces: Vertex indices. *Shape:* ``(F, 3)``.
-        name: Of ``sequences``, for messages.
-
-    Raises:
-        ValueError: There are none, their shapes differ, or :func:`check_frames` refuses one.
-    """
+    """Sequences of shapes that are shown together, and their faces, as NumPy arrays; ``name`` is for messages."""
     if not sequences:
         raise ValueError(f"{name} is empty; it needs at least one sequence of shapes.")
     checked: dict[str, FloatArray] = {}
@@ -184,13 +175,11 @@ def render_sequence(
         titles: What stands above the columns. Default: when they are, from 0 to 1.
         keyframe_indices: Frames that are key-frames, drawn in the other colour; an empty list is none. The first
             and the last by default.
-        view: Azimuth and elevation of the camera in degrees; ``(0, 0)`` looks from the front (+Z where Y is
-            up, -Y where Z is), a positive azimuth moves the camera to the right. By default chosen from the
-            shape.
+        view: Azimuth and elevation of the camera in degrees; ``(0, 0)`` looks from the front (+Z where Y is up, -Y
+            where Z is), a positive azimuth moves the camera to the right. By default chosen from the shape.
         up: ``"y"`` or ``"z"``; by default Y, unless the first shape is flat in Y.
-        colors: A number for each vertex, for any of the rows, shown as colour with a bar. The bar ends at the
-            99.5th percentile of what is shown, with an arrow if there is more.
-            *Shape of each:* ``(N, V)``.
+        colors: A number for each vertex, for any of the rows, shown as colour with a bar. The bar ends at the 99.5th
+            percentile of what is shown, with an arrow if there is more. *Shape of each:* ``(N, V)``.
         color_label: What those numbers are, with their unit.
         renderer: ``"auto"`` is pyvista where it is installed (extra ``pictures``), otherwise matplotlib; also, with a
             warning, where pyvista cannot render.

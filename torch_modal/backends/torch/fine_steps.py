@@ -6,7 +6,7 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor, nn
 
-from torch_modal.energy.energy import Energy, Linearised, Reference, RestShapes
+from torch_modal.energy.energy import ENERGY_ROUNDING, Energy, Linearised, Reference, RestShapes
 from torch_modal.energy.shell import N_SHELL_TERMS
 from torch_modal.energy.term import Mesh, Term
 from torch_modal.geometry.canonical import CANONICAL_SIZE
@@ -20,8 +20,6 @@ _UNPACKED = [0, 1, 2, 1, 3, 4, 2, 4, 5]
 # Where steps are small, the curvature along them is rounding of energies.
 SLIGHT = 1e-5 * CANONICAL_SIZE
 
-# Roundings of an energy, relative to it, that make no step shorter.
-ENERGY_ROUNDING = 64.0
 
 # Vertices of all samples that are relaxed at a time: more would not fit into a processor's caches, or, of a GPU, into
 # its memory (6 KB a vertex where gradients are recorded).
@@ -311,16 +309,9 @@ class FineEnergy(nn.Module):
     def relax(
         self, x: Tensor, rests: RestShapes, stages: Sequence[tuple[int, int]], beside: Beside | None = None
     ) -> Tensor:
-        """Steps of all vertices, never uphill (:func:`~torch_modal.backends.torch.fine_steps.relax`).
+        """Steps of all vertices, never uphill: stages of :func:`relax` by numbers of steps and products.
 
-        Args:
-            x: Initial shapes. *Shape:* ``(B, V, 3)``.
-            rests: The rest shapes.
-            stages: Newton steps, and iterations of conjugate gradients in each.
-            beside: Energies beside that of the terms.
-
-        Returns:
-            *Shape:* ``(B, V, 3)``.
+        *Shape:* ``(B, V, 3)``.
         """
         size, parts = chunk_of(x.shape[1], x.device), []
         for i in range(0, len(x), size):

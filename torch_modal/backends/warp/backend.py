@@ -36,13 +36,21 @@ class WarpBackend(TorchBackend):
     """
 
     def __init__(self) -> None:
-        if not _is_installed():
+        if importlib.util.find_spec("warp") is None:
             raise MissingPackageError("backend='warp' needs warp-lang, which is not installed: pip install warp-lang")
 
     @staticmethod
+    @cache
     def works() -> bool:
         """Whether Warp is installed, and compiles."""
-        return _works()
+        if importlib.util.find_spec("warp") is None:
+            return False
+        try:
+            kernels("shell")
+        except Exception as error:  # whatever keeps Warp from compiling: torch does the same, only slower
+            warnings.warn(f"Warp is installed, but its kernels cannot be used, so torch is: {error}", stacklevel=2)
+            return False
+        return True
 
     def load(self) -> None:
         """As in the base class: the kernels of in-betweens."""
@@ -73,19 +81,3 @@ class WarpBackend(TorchBackend):
 def _are_of_shell(terms: Sequence[Term]) -> bool:
     """Whether the first terms are those of Eq. 5 themselves, and not classes that inherit from them."""
     return [type(term) for term in terms[:N_SHELL_TERMS]] == [Stretch, Bend, Volume]
-
-
-def _is_installed() -> bool:
-    return importlib.util.find_spec("warp") is not None
-
-
-@cache
-def _works() -> bool:
-    if not _is_installed():
-        return False
-    try:
-        kernels("shell")
-    except Exception as error:  # whatever keeps Warp from compiling: torch does the same, only slower
-        warnings.warn(f"Warp is installed, but its kernels cannot be used, so torch is: {error}", stacklevel=2)
-        return False
-    return True

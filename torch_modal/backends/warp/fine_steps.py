@@ -57,42 +57,21 @@ class WarpSteps(WarpShell):
     """:func:`torch_modal.backends.torch.fine_steps.relax` for the terms of Eq. 5 alone, in float64."""
 
     def forward(self, x: Tensor, to: ShellReference, n_steps: int, n_products: int) -> Tensor:
-        """Steps of all vertices.
-
-        Args:
-            x: Initial shapes. *Shape:* ``(B, V, 3)``.
-            to: The reference.
-            n_steps: Newton steps.
-            n_products: Iterations of conjugate gradients in each.
-
-        Returns:
-            *Shape:* ``(B, V, 3)``.
-        """
+        """Steps of all vertices: some Newton steps, with some conjugate gradients in each. *Shape:* ``(B, V, 3)``."""
         return fused(_Relaxed(self, n_steps, n_products), x, *to[:3])[0].to(x) if n_steps else x
 
     @torch.no_grad()
     def descend(
         self, x: Tensor, to: ShellReference, others: Sequence[FurtherEnergy], n_steps: int, n_products: int
     ) -> Tensor:
-        """Steps of all vertices with other energies beside Eq. 5; they have no gradient.
-
-        Args:
-            x: Initial shapes, float64. *Shape:* ``(B, V, 3)``.
-            to: The reference of Eq. 5.
-            others: The other energies.
-            n_steps: Newton steps.
-            n_products: Iterations of conjugate gradients in each.
-
-        Returns:
-            *Shape:* ``(B, V, 3)``.
-        """
+        """Steps with other energies beside Eq. 5, without gradient. Arguments as for :meth:`forward`, in float64."""
         for _ in range(n_steps):
             at, more = self.at(x, to), [other.at(x) for other in others]
             before = sum((one.value for one in more), start=at.energy)
             for one in more:
                 at.gradient.add_(one.gradient)
                 at.diagonal.add_(one.diagonal)
-            solution = self.solved(x, at, to, n_products, beside=[one.product for one in more]).solution
+            solution = self.solved(x, at, to, n_products, beside=[one.product for one in more])[0]
             after = sum((other.value(x + solution) for other in others), start=self.value(x + solution, to))
             length = step_length(before, _slope(at, solution), after, solution.abs().amax((1, 2)))
             x = x + length[:, None, None] * solution
@@ -104,16 +83,16 @@ class WarpSteps(WarpShell):
         """The steps, of which nothing is recorded. Those that are taken go to the list. *Shape:* ``(B, V, 3)``."""
         at = self.at(x, to)
         for k in range(n_steps):
-            done = self.solved(x, at, to, n_products, keep=taken is not None)
-            reached = x + done.solution
+            solution, *kept = self.solved(x, at, to, n_products, keep=taken is not None)
+            reached = x + solution
             # The whole step, linearised at once for the next one, is nearly always the one that is taken.
             there = self.at(reached, to) if k < n_steps - 1 else None
             energy = self.value(reached, to) if there is None else there.energy
-            length = step_length(at.energy, _slope(at, done.solution), energy, done.solution.abs().amax((1, 2)))
+            length = step_length(at.energy, _slope(at, solution), energy, solution.abs().amax((1, 2)))
             if taken is not None:
-                taken.append(_Taken(x, at, length, done))
+                taken.append(_Taken(x, at, length, *kept))
             if bool((length < 1).any()):
-                reached = x + length[:, None, None] * done.solution
+                reached = x + length[:, None, None] * solution
                 there = None if there is None else self.at(reached, to)
             x, at = reached, at if there is None else there
         return x
@@ -126,7 +105,7 @@ class WarpSteps(WarpShell):
         n_products: int,
         keep: bool = False,
         beside: Sequence[Callable[[Tensor], Tensor]] = (),
-    ) -> "_Iterations":
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Conjugate gradients, fused.
 
         Args:
@@ -136,6 +115,11 @@ class WarpSteps(WarpShell):
             n_products: Iterations.
             keep: Whether each iteration has memory of its own.
             beside: Further products with directions. *Shape of each:* ``(B, V, 3) -> (B, V, 3)``.
+
+        Returns:
+            The solution, *shape* ``(B, V, 3)``; residuals, directions, and the Hessian's products with these but for
+            the volume's part, of the last iteration alone where they are not kept, *shape* ``(3, n_products, B, V,
+            3)``; three scalars of each iteration (``kernels/steps.py``), *shape* ``(n_products + 1, B, 3)``.
         """
         module, (b, n), n_kept = kernels("steps"), x.shape[:2], n_products if keep else 1
         kept, scalars, solution = (
@@ -156,7 +140,7 @@ class WarpSteps(WarpShell):
             launch(module.advance, (b, n), [at.normal, inverse, to.stiffness, k, n_kept, n, *results])
             if k < n_products - 1:
                 launch(module.turn, (b, n), [at.normal, inverse, b, k, n_kept, n, *results[:2]])
-        return _Iterations(solution, kept, scalars)
+        return solution, kept, scalars
 
     def step_back(self, step: "_Taken", to: ShellReference, to_reached: Tensor, to_reference: ShellReference) -> Tensor:
         """The gradient at the start of a whole step from that at its end; the reference's is added.
@@ -167,7 +151,7 @@ class WarpSteps(WarpShell):
             to_reached: Gradient in the shapes at the end. *Shape:* ``(B, V, 3)``.
             to_reference: Is added to.
         """
-        x, at, _, (_, kept, scalars) = step
+        x, at, _, kept, scalars = step
         module, (b, n), n_products = kernels("steps"), x.shape[:2], kept.shape[1]
         force, (residual, direction, to_volume) = torch.empty_like(kept[0]), x.new_zeros(3, *x.shape)
         to_diagonal, received = torch.zeros_like(at.diagonal), x.new_zeros(n_products, b, 3)
@@ -196,21 +180,6 @@ def _slope(at: ShellPoint, direction: Tensor) -> Tensor:
     return (at.gradient * direction).sum((1, 2)) + at.moment * (at.normal * direction).sum((1, 2))
 
 
-class _Iterations(NamedTuple):
-    """The iterations of conjugate gradients."""
-
-    solution: Tensor
-    """*Shape:* ``(B, V, 3)``."""
-    kept: Tensor
-    """Residuals, directions, and the Hessian's products with these but for the volume's part; of the last iteration
-    alone where they are not kept.
-
-    *Shape:* ``(3, n_products, B, V, 3)``.
-    """
-    scalars: Tensor
-    """Three of each iteration (``kernels/steps.py``). *Shape:* ``(n_products + 1, B, 3)``."""
-
-
 class _Taken(NamedTuple):
     """A step."""
 
@@ -220,7 +189,10 @@ class _Taken(NamedTuple):
     """The energy there, its diagonal inverted."""
     length: Tensor
     """*Shape:* ``(B,)``."""
-    done: _Iterations
+    kept: Tensor
+    """Of :meth:`WarpSteps.solved`, of all iterations."""
+    scalars: Tensor
+    """Likewise."""
 
 
 class _Relaxed:

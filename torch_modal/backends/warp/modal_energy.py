@@ -148,7 +148,13 @@ class WarpModalEnergy(ModalEnergy):
         gradient, inner = products[:, :n, n], products[:, :n, :n]
         stiffest = inner.diagonal(dim1=-2, dim2=-1).amax(-1)
         rounding = torch.finfo(x.dtype).eps * x.abs().amax((-1, -2))
-        curved = self._second(x, to.stiffness * off, to) if second_order else None
+        curved = None
+        if second_order:
+            pushed = x.new_zeros(b, *blocks.shape)
+            given = [shell.constants, x, to.elements, shell.centre(x), to.stiffness * off, blocks]
+            dim = b, max(shell.n_edges, shell.n_faces)
+            launch(kernels("modal").curved_columns, dim, [*given, blocks.shape[1] // _BLOCK, pushed])
+            curved = (blocks.mT @ pushed)[:, :n, :n]
         return Derivatives(gradient, inner, curved, rounding * (stiffest * stiffness).sqrt())
 
     def value_and_gradient(self, a: Tensor, placement: Placement) -> tuple[Tensor, Tensor]:
@@ -160,13 +166,6 @@ class WarpModalEnergy(ModalEnergy):
         to: Any = placement.reference
         value, x = self.shell.value_and_gradient(self._shapes(a, placement.base), to)
         return value + to.constant, x.flatten(1) @ self.flat.double().mT
-
-    def _second(self, x: Tensor, moment: Tensor, to: ShellReference) -> Tensor:
-        shell, columns, n = self.shell, self.blocks.double(), len(self.columns)
-        pushed = x.new_zeros(len(x), *columns.shape)
-        given = [shell.constants, x, to.elements, shell.centre(x), moment, columns, columns.shape[1] // _BLOCK, pushed]
-        launch(kernels("modal").curved_columns, (len(x), max(shell.n_edges, shell.n_faces)), given)
-        return (columns.mT @ pushed)[:, :n, :n]
 
     def gradient(self, a: Tensor, placement: Placement) -> Tensor:
         """As in the base class."""

@@ -257,7 +257,10 @@ class _Merged:
     def run(self, kept: list[Any] | None, shapes: Tensor, weights: Tensor, *stiffness: Tensor) -> tuple[Tensor, ...]:
         """See :class:`~torch_modal.backends.warp.function.Operation`."""
         shell, module, dim = self.shell, kernels("shell"), (len(shapes), self.shell.n_edges)
-        measured = self._measured(shapes)
+        flat, measured = shapes.flatten(0, 1), shapes.new_zeros(*shapes.shape[:2], 3)
+        given = [shell.constants, flat, shell.centre(flat), measured]
+        launch(module.sizes, (len(flat), max(shell.n_edges, shell.n_faces)), given)
+        # All edges together, volume and area of each rest shape.
         lengths, volumes, areas = measured.unbind(-1)
         sums, constant = shapes.new_zeros(*dim, 8), shapes.new_zeros(len(shapes))
         launch(module.rest_sums, (weights.numel(), dim[1]), [*self._rest(shapes, weights, lengths, *stiffness), sums])
@@ -266,14 +269,6 @@ class _Merged:
         if kept is not None:
             kept += [measured, sums]
         return elements, volumes.clone(), torch.maximum(volumes.abs(), MIN_RELATIVE_VOLUME * areas**1.5), constant
-
-    def _measured(self, shapes: Tensor) -> Tensor:
-        """All edges together, volume and area of each rest shape. *Shape:* ``(B, K, V, 3) -> (B, K, 3)``."""
-        flat = shapes.flatten(0, 1)
-        found = flat.new_zeros(len(flat), 3)
-        dim = len(flat), max(self.shell.n_edges, self.shell.n_faces)
-        launch(kernels("shell").sizes, dim, [self.shell.constants, flat, self.shell.centre(flat), found])
-        return found.unflatten(0, shapes.shape[:2])
 
     def _rest(self, shapes: Tensor, weights: Tensor, lengths: Tensor, *stiffness: Tensor) -> list[Any]:
         shortest = MIN_RELATIVE_LENGTH / self.shell.n_edges * lengths

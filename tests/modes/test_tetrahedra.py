@@ -1,0 +1,210 @@
+"""The mesher and its process: what comes out, and every way in which it can go wrong."""
+
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from conftest import COARSE
+from solids import as_it_is, box, together
+
+from torch_modal.modes import tetwild
+from torch_modal.modes.surface import CanonicalSurface
+from torch_modal.modes.tetrahedra import Tetrahedra, TetrahedralizationError, oriented, tet_volumes, without_debris
+from torch_modal.modes.tetwild import TetWild
+
+Mesh = tuple[np.ndarray, np.ndarray]
+
+
+def test_fills_the_capsule(capsule: Mesh, capsule_tetrahedra: Tetrahedra) -> None:
+    vertices, faces = capsule
+    volumes = tet_volumes(capsule_tetrahedra)
+    assert volumes.min() > 0
+    assert volumes.sum() == pytest.approx(trimesh.Trimesh(vertices, faces).volume, rel=0.05)
+    assert np.array_equal(np.unique(capsule_tetrahedra.tets), np.arange(len(capsule_tetrahedra.vertices)))
+    np.testing.assert_allclose(capsule_tetrahedra.vertices.min(axis=0), vertices.min(axis=0), atol=0.1)
+    np.testing.assert_allclose(capsule_tetrahedra.vertices.max(axis=0), vertices.max(axis=0), atol=0.1)
+
+
+def test_inside_out_unreferenced_tiny_and_from_a_thread(capsule: Mesh) -> None:
+    vertices, faces = capsule
+    scattered = np.concatenate([[[1e3, 0, 0]], vertices]) * 1e-6  # vertex 0 is in no face
+    surface = CanonicalSurface.of(scattered, faces[:, ::-1] + 1)
+    found: list[Tetrahedra] = []
+    handler = signal.getsignal(signal.SIGINT)
+    thread = threading.Thread(target=lambda: found.append(COARSE.fill(surface, threading.Event())))
+    thread.start()
+    thread.join()
+    volume = (1e-6 * surface.scale) ** 3 * trimesh.Trimesh(vertices, faces).volume
+    assert tet_volumes(found[0]).sum() == pytest.approx(volume, rel=0.05)
+    assert signal.getsignal(signal.SIGINT) is handler
+
+
+def test_mesher_stays_out_of_this_process(tmp_path: Path) -> None:
+    code = """
+        import signal, sys
+        import trimesh
+        handler = signal.getsignal(signal.SIGINT)
+        from torch_modal.modes.extract import extract_modes
+        from torch_modal.modes.tetwild import TetWild
+        ball = trimesh.creation.icosphere(subdivisions=1)
+        extract_modes(ball.vertices, ball.faces, 4, mesher=TetWild(edge_length_fac=0.3), cache=False)
+        assert "pytetwild" not in sys.modules
+        assert signal.getsignal(signal.SIGINT) is handler
+    """
+    root = str(Path(tetwild.__file__).parents[2])
+    subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(code)],
+        check=True,
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": root},
+    )
+    assert list(tmp_path.iterdir()) == [], "nothing is left in the working folder"
+
+
+@pytest.fixture
+def worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Replace the worker's script by other code; ``job`` and ``result`` are its two paths."""
+
+    def replace(code: str) -> None:
+        script = tmp_path / "worker.py"
+        script.write_text("import os, signal, sys, time\njob, result = sys.argv[1:]\n" + textwrap.dedent(code))
+        monkeypatch.setattr(tetwild, "WORKER", script)
+
+    return replace
+
+
+@pytest.mark.parametrize(
+    ("code", "says", "lasting"),
+    [
+        ("os.kill(os.getpid(), signal.SIGKILL)", "signal SIGKILL", False),
+        ("os.kill(os.getpid(), signal.SIGBUS)", "signal SIGBUS", False),
+        ("os.abort()", "signal SIGABRT", False),
+        ("os.kill(os.getpid(), signal.SIGSEGV)", "signal SIGSEGV", True),
+        ("print('RuntimeError: no envelope'); sys.exit(3)", "exit code 3 \\(RuntimeError: no envelope\\)", True),
+        ("sys.exit('ModuleNotFoundError: pytetwild')", "exit code 1 \\(ModuleNotFoundError: pytetwild\\)", False),
+        ("pass", "no readable result", False),
+        ("open(result, 'wb').write(b'PK\\x03\\x04')", "no readable result", False),
+        (
+            "import numpy as np; np.savez(result, vertices=np.zeros((0, 3)), tets=np.zeros((0, 4), int))",
+            "the result is empty",
+            True,
+        ),
+        (
+            "import numpy as np; np.savez(result, vertices=np.eye(4)[:, :3] * 1e-3, tets=np.arange(4)[None])",
+            "of its vertices are further than",
+            True,
+        ),
+        (
+            "import numpy as np; v = np.load(job)['vertices']; v[0] *= 50; i = np.arange(len(v));"
+            "np.savez(result, vertices=v, tets=np.stack([0 * i, i, np.roll(i, 5), np.roll(i, 40)], 1))",
+            "reaches far beyond",
+            True,
+        ),
+    ],
+)
+def test_failure_says_which_mesh_and_why(worker, capsule: Mesh, code: str, says: str, lasting: bool) -> None:
+    """And whether the surface is the cause."""
+    worker(code)
+    with pytest.raises(TetrahedralizationError, match=says) as caught:
+        TetWild().fill(as_it_is(*capsule), threading.Event())
+    assert f"a mesh of {len(capsule[0])} vertices and {len(capsule[1])} faces" in str(caught.value)
+    assert caught.value.lasting == lasting
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="needs a limit of the address space")
+def test_too_little_memory_is_not_the_surfaces_fault(worker, capsule: Mesh) -> None:
+    """The real mesher where threads and memory cannot be had."""
+    real = str(tetwild.WORKER)
+    worker(
+        f"""
+        import resource, runpy
+        resource.setrlimit(resource.RLIMIT_AS, (180 * 2**20, 180 * 2**20))
+        sys.path.insert(0, "")
+        sys.argv[0] = {real!r}
+        runpy.run_path({real!r}, run_name="__main__")
+        """
+    )
+    with pytest.raises(TetrahedralizationError, match=r"SIGABRT|exit code 1") as caught:
+        COARSE.fill(as_it_is(*capsule), threading.Event())
+    assert not caught.value.lasting
+
+
+def test_the_exit_code_of_the_real_worker(capsule: Mesh, tmp_path: Path) -> None:
+    """It tells the mesher's refusal, here of a wrong edge length, from a job that cannot be read."""
+    numbers = {"edge_length_fac": 2.0, "epsilon": 1e-3, "stop_energy": 10.0, "max_surface_faces": 10**6, "timeout": 60}
+    np.savez(tmp_path / "job.npz", vertices=capsule[0], faces=capsule[1], **numbers)
+    for job, code, says in (("job.npz", tetwild.MESHER_RAISED, "ValueError: Edge"), ("none.npz", 1, "No such file")):
+        command = [sys.executable, str(tetwild.WORKER), str(tmp_path / job), str(tmp_path / "result.npz")]
+        run = subprocess.run(command, capture_output=True, text=True, timeout=120, cwd=tmp_path)
+        assert run.returncode == code
+        assert says in run.stderr.splitlines()[-1]
+
+
+def _is_running(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return Path(f"/proc/{pid}/stat").read_text().split()[2] != "Z" if Path("/proc").is_dir() else True
+
+
+@pytest.mark.skipif(not hasattr(os, "killpg"), reason="process groups are POSIX")
+def test_timeout_kills_the_worker_and_its_children(worker, capsule: Mesh, tmp_path: Path) -> None:
+    worker(f"""
+        import subprocess
+        child = subprocess.Popen(["sleep", "60"])
+        open({str(tmp_path / "pids")!r}, "w").write(f"{{os.getpid()}} {{child.pid}}")
+        time.sleep(60)
+    """)
+    start = time.monotonic()
+    with pytest.raises(TetrahedralizationError, match="no result after the timeout of 1 s") as caught:
+        TetWild(timeout=1.0).fill(as_it_is(*capsule), threading.Event())
+    assert time.monotonic() - start < 10 and not caught.value.lasting
+    time.sleep(0.1)
+    assert not any(_is_running(int(pid)) for pid in (tmp_path / "pids").read_text().split())
+
+
+def test_oriented_drops_flat_and_unused() -> None:
+    solid = box((1, 1, 1), (1.0, 1.0, 1.0))
+    n = len(solid.vertices)
+    vertices = np.concatenate([solid.vertices, [[9.0, 9.0, 9.0]]])
+    flat = [[0, 1, 2, 3]]  # four corners of one side
+    tets = np.concatenate([flat, solid.tets])
+    tets[2] = tets[2][[1, 0, 2, 3]]
+    assert tet_volumes(Tetrahedra(vertices, tets))[[0, 2]].tolist() == pytest.approx([0.0, -1 / 6])
+    result = oriented(Tetrahedra(vertices, tets))
+    assert len(result.vertices) == n
+    np.testing.assert_allclose(tet_volumes(result), np.full(6, 1 / 6))
+
+
+def test_debris_is_dropped_and_pieces_are_kept() -> None:
+    body, hinged, loose = (
+        box((4, 4, 4), (1.0, 1.0, 1.0)),
+        box((1, 1, 1), (0.1, 0.1, 0.1)),
+        box((1, 1, 1), (0.1,) * 3),
+    )
+    hinged.vertices[:] -= 0.1  # its last vertex lies on the first of the body
+    loose.vertices[:] -= 9.0
+    everything = together(body, hinged, loose)
+    tets = everything.tets.copy()
+    tets[tets == len(body.vertices) + 7] = 0
+    result = without_debris(Tetrahedra(everything.vertices, tets))
+    assert len(result.tets) == len(body.tets) + len(loose.tets)
+    assert tet_volumes(result).sum() == pytest.approx(1.001)
+    assert len(np.unique(result.tets)) == len(result.vertices) == len(body.vertices) + len(loose.vertices)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("epsilon", 0.0), ("edge_length_fac", -1.0), ("stop_energy", float("nan")), ("timeout", -1.0)]
+)
+def test_settings_out_of_range(name: str, value: float) -> None:
+    with pytest.raises(ValueError, match=name):
+        TetWild(**{name: value})

@@ -1,0 +1,174 @@
+"""Commands on modes: ``modes``, ``precompute`` and ``cache`` of ``torch-modal``.
+
+Each checks its output paths before any heavy import and any work.
+"""
+
+import argparse
+import os
+import signal
+import sys
+import threading
+from pathlib import Path
+
+from torch_modal.cli.arguments import (
+    CACHE_DIR,
+    add_common,
+    add_modes,
+    check_output,
+    is_file,
+    mode_options,
+    number,
+    reporter,
+)
+
+INCOMPLETE = 3
+"""Exit status of `precompute` when some sets have no bases."""
+
+
+def add_modes_command(sub: argparse.ArgumentParser) -> None:
+    """Arguments of ``modes``."""
+    sub.add_argument("meshes", nargs="+", type=Path, metavar="MESH", help="key-frames of one connectivity")
+    text = "FILE.safetensors for one mesh, or a folder for a file of each mesh's name"
+    sub.add_argument("--out", type=Path, required=True, metavar="FILE_OR_FOLDER", help=text)
+    add_modes(sub)
+    add_common(sub, cache_dir=CACHE_DIR)
+
+
+def modes(args: argparse.Namespace) -> None:
+    """Vibration modes of key-frames, as safetensors.
+
+    Compute the vibration modes of key-frames: the lowest elastic modes of the solid
+    that each surface encloses, restricted to the surface, or of the surface itself
+    where it is open or thin.
+
+    They are what `subdivide` computes first. Read the files with
+    torch_modal.ModalBasis.load. With --mesher tetwild, which is not deterministic, two
+    runs without the cache give slightly different modes.
+
+    Examples:
+      torch-modal modes horse.obj --out horse.safetensors
+      torch-modal modes gait-?.ply --modes 50 --out bases
+    """
+    files = [args.out]
+    if not is_file(args, [".safetensors"]):
+        files = [args.out / f"{mesh.stem}.safetensors" for mesh in args.meshes]
+        if len(set(files)) < len(files):
+            args.fail("two meshes have the same file name, so their bases would too; take them one by one")
+    elif len(args.meshes) > 1:
+        args.fail(f"--out {args.out} is one file, but there are {len(args.meshes)} meshes; name a folder")
+    check_output(files, args.meshes, args.overwrite)
+
+    import torch_modal as tm
+
+    keyframes, faces = tm.load_keyframes(args.meshes)
+    bases = tm.extract_bases(keyframes, faces, **mode_options(args))
+    report = reporter(args)
+    shown = min(8, args.modes)
+    report(f"{'lowest elastic modes':24s}" + "".join(f"{i + 1:>10d}" for i in range(shown)))
+    for file, mesh, basis in zip(files, args.meshes, bases, strict=True):
+        file.parent.mkdir(parents=True, exist_ok=True)
+        basis.save(file)
+        values = basis.eigenvalues[:shown].tolist()
+        first = next((value for value in basis.eigenvalues.tolist() if value > 0), 1.0)
+        report(f"{mesh.name:24s}" + "".join(f"{value:>10.3g}" for value in values))
+        report(f"{'  frequency / first':24s}" + "".join(f"{(value / first) ** 0.5:>10.3f}" for value in values))
+    report("eigenvalues are squared frequencies, in 1 / (unit of the mesh)^2; solids and shells differ in stiffness")
+    report(f"bases: {files[0]}" + (f" to {files[-1].name}" if len(files) > 1 else ""))
+
+
+def add_precompute(sub: argparse.ArgumentParser) -> None:
+    """Arguments of ``precompute``."""
+    add = sub.add_argument
+    add("root", type=Path, metavar="DIR", help="the folder tree with the key-frames")
+    add("--out", type=Path, required=True, metavar="DIR", help="where the bases go")
+    text = "sets at a time, each in a process with one thread (default: one for each processor)"
+    add("--workers", type=number(int, 1), metavar="N", help=text)
+    add("--scheduler", metavar="ADDRESS", help="run on the Dask cluster with this scheduler instead")
+    text = "seconds for a set, half of which the mesher may take (default: 600)"
+    add("--timeout", type=number(float, 0, above=True), metavar="S", default=600.0, help=text)
+    text = (
+        "the meshes of a folder are a motion, in natural order of their names; its file times.txt, if there is "
+        "one, says when each is, and when the first comes again if it is a cycle (default: even times)"
+    )
+    add("--sequence", action="store_true", help=text)
+    add("--retry", action="store_true", help="try sets again that failed before")
+    add_modes(sub)
+    text = "replace stored sets that this command did not write (default: refuse those sets)"
+    add_common(sub, text, "keep tetrahedra and modes in this cache as well (default: keep the bases only)")
+
+
+def precompute(args: argparse.Namespace) -> int:
+    """Bases of every key-frame set of a folder tree, in several processes or machines.
+
+    Compute the bases of every key-frame set below a folder.
+
+    A set is a folder that directly holds two or more meshes of one connectivity. The output
+    mirrors the tree, with the key-frames and bases of each set as safetensors. Every set has a
+    process and a time limit of its own: one that crashes, hangs or is refused is named at the
+    end, and the others go on. The same command again continues where it stopped, and
+    recomputes sets whose files or options changed.
+
+    exit status: 0 all sets have their bases, 3 some have not, 1 an error, 130 interrupted
+
+    Examples:
+      torch-modal precompute shapes --out bases
+      torch-modal precompute shapes --out bases --workers 4 --timeout 120 --retry
+      on machines that share their files, with a Dask cluster:
+        torch-modal precompute shapes --out bases --scheduler tcp://HOST:8786
+    """
+    if args.out.suffix.lower() == ".safetensors":
+        args.fail(f"--out is a folder here, got the file name {args.out.name!r}")
+    if args.scheduler and args.workers:
+        args.fail("--scheduler shares the sets among the workers of its cluster; leave out --workers")
+    if threading.current_thread() is threading.main_thread():  # SIGTERM of a batch system acts like Ctrl-C
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
+
+    from torch_modal.data.precompute_set import DONE, Options
+    from torch_modal.data.precompute_tree import precompute_tree
+
+    options = Options(
+        n_modes=args.modes,
+        method=args.method,
+        mesher=args.mesher,
+        cache_dir=args.cache_dir and os.path.abspath(os.path.expanduser(args.cache_dir)),
+        timeout=args.timeout,
+        retry=args.retry,
+        overwrite=args.overwrite,
+        sequence=args.sequence,
+    )
+    records = precompute_tree(
+        args.root,
+        args.out,
+        options,
+        workers=args.workers,
+        scheduler=args.scheduler,
+        say=reporter(args),
+        bar=not args.quiet and sys.stderr.isatty(),
+    )
+    return 0 if all(record.status == DONE for record in records.values()) else INCOMPLETE
+
+
+def add_cache(sub: argparse.ArgumentParser) -> None:
+    """Arguments of ``cache``."""
+    sub.add_argument("--clear", action="store_true", help="remove what is in it; other files in the folder stay")
+    sub.add_argument("--cache-dir", metavar="DIR", help=CACHE_DIR)
+
+
+def cache(args: argparse.Namespace) -> None:
+    """Size of the cache of tetrahedra and modes.
+
+    Say how large the cache is, where tetrahedra and modes are kept between runs.
+
+    It never takes more than 4 GiB, or what the environment variable TORCH_MODAL_CACHE_LIMIT
+    says (500M, 10G): what was not used for the longest makes room for what is new.
+
+    Examples:
+      torch-modal cache --clear
+    """
+    from torch_modal.io import cache as cached
+
+    folder = args.cache_dir or cached.default_cache_dir()
+    n_entries, n_bytes = cached.clear_cache(folder) if args.clear else cached.cache_content(folder)
+    size = f"{n_entries} entries, {n_bytes / 2**20:.1f} MiB"
+    limit = f"{cached.size_limit() / 2**20:g} MiB"
+    print(f"{size} removed from {folder}" if args.clear else f"{size} in {folder} (limit: {limit})")

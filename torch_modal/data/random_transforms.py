@@ -1,0 +1,240 @@
+"""Random in-betweens, extrapolations, members of the space, and rigid motions."""
+
+import math
+from typing import Any
+
+import torch
+from kornia.geometry.conversions import quaternion_to_axis_angle
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from torch_modal.data.augmentation import Parameters, ShapeAugmentation, check_range, normal, uniform
+from torch_modal.data.shape_batch import ShapeBatch
+from torch_modal.data.space import ShapeSpace
+from torch_modal.geometry.poisson import Reconstruction
+from torch_modal.geometry.rigid import RigidMotion, best_fit
+from torch_modal.geometry.rotations import exp
+from torch_modal.geometry.triangle_frames import frames, mirrored_sides, sides
+from torch_modal.statistics.variation import check_density
+
+
+class RandomInBetween(ShapeAugmentation):
+    """Replaces a shape by one between it and a partner, of least elastic energy (:class:`torch_modal.InBetween`).
+
+    Partners are other shapes of the batch, as in kornia's ``RandomMixUpV2``, or key-frames of a call's ``pool``.
+
+    Where the key-frames are a motion (``keyframe_times`` of the :class:`ShapeSpace`), the partner from a pool is the
+    key-frame before or after in time, with equal probability, and the in-between is that of :class:`torch_modal.Path`.
+    Shapes that are not key-frames have the same partners; their in-betweens depend on these two shapes only.
+
+    Args:
+        t: Range of times, drawn uniformly: 0 is the shape itself, 1 its partner.
+        blend_labels: Whether labels become ``(1-t) y_a + t y_b``; they must be floating-point then (one-hot vectors,
+            for classes). Otherwise a shape has the labels of the nearer end in time.
+        p: Probability that a shape is transformed.
+        options: As for :class:`ShapeAugmentation`.
+
+    Raises:
+        ValueError: ``t`` is no range within [0, 1].
+    """
+
+    shown: tuple[str, ...] = ("t", "blend_labels")
+
+    def __init__(
+        self, t: tuple[float, float] = (0.0, 1.0), blend_labels: bool = False, p: float = 0.5, **options: Any
+    ) -> None:
+        super().__init__(p, **options)
+        self.t = check_range("t", t, 0, 1)
+        self.blend_labels = blend_labels
+
+    def generate_parameters(self, n: int, space: Any, generator: torch.Generator | None) -> Parameters:
+        """``partner`` in [0, 1), the partner's place among the other shapes of the pool, and the times ``t``.
+
+        In a motion these are the key-frame before (below 0.5) and the one after.
+        """
+        return {"partner": uniform(n, generator), "t": uniform(n, generator, self.t)}
+
+    def apply_transform(
+        self, batch: ShapeBatch, params: Parameters, space: Any, partners: ShapeBatch | None
+    ) -> ShapeBatch:
+        """Move each shape towards its partner, or away from it."""
+        assert partners is not None and batch.nearest is not None and partners.nearest is not None
+        t = params["t"]
+        nearer = (t.detach() > 0.5).cpu()
+        return batch._replace(
+            shapes=self.shapes(batch, partners, t, space),
+            nearest=torch.where(nearer, partners.nearest, batch.nearest),
+            vertex_labels=self._labels("vertex_labels", batch.vertex_labels, partners.vertex_labels, t),
+            shape_labels=self._labels("shape_labels", batch.shape_labels, partners.shape_labels, t),
+        )
+
+    def shapes(self, batch: ShapeBatch, partners: ShapeBatch, t: Tensor, space: ShapeSpace) -> Tensor:
+        """The shapes at the times ``t``. *Shape:* ``(B,) -> (B, V, 3)``."""
+        (x_a, i, is_a), (x_b, j, is_b) = batch[:3], partners[:3]
+        assert i is not None and j is not None and is_a is not None and is_b is not None
+        tracked = x_a.requires_grad or x_b.requires_grad
+        return space.in_betweens(x_a, x_b, t, i, j, is_a & is_b & (i != j) & (not tracked))
+
+    def _labels(self, name: str, own: Tensor | None, others: Tensor | None, t: Tensor) -> Tensor | None:
+        if own is None or others is None:
+            return own
+        t = t.detach().to(own.device).reshape(-1, *[1] * (own.dim() - 1))
+        if not self.blend_labels:
+            return torch.where(t > 0.5, others, own)
+        if not own.is_floating_point():
+            raise ValueError(f"blended {name} must be floating-point, one-hot for classes; got {own.dtype}")
+        return torch.lerp(own, others, t.clamp(0, 1).to(own.dtype))
+
+
+class RandomExtrapolation(RandomInBetween):
+    r"""Replaces a shape by an extrapolation of the motion between it and a partner.
+
+    The shape at :math:`1 + s` is the mirror image of the in-between at :math:`1 - s` in the partner, and the one at
+    :math:`-s` that of the in-between at :math:`s` in the shape itself: each triangle gets the inverse of its
+    rotation and stretch, and a Poisson problem gives the vertices. So the partner is the shape half-way
+    between the two, as the discrete geodesics of shells continue (Heeren et al. 2014), and position and velocity are
+    continuous at the ends. (With a negative weight, the energies of the in-between would have no minimum.)
+
+    Args:
+        beyond: Range of s, how far outside [0, 1] the times are, drawn uniformly; at most 1. The end is drawn
+            with equal probability.
+        blend_labels: As for :class:`RandomInBetween`, with times of 0 and 1: labels are those of the nearer end.
+        p: Probability that a shape is transformed.
+        options: As for :class:`ShapeAugmentation`.
+
+    Raises:
+        ValueError: ``beyond`` is no range within [0, 1].
+    """
+
+    shown = ("beyond", "blend_labels")
+
+    def __init__(
+        self, beyond: tuple[float, float] = (0.0, 0.2), blend_labels: bool = False, p: float = 0.5, **options: Any
+    ) -> None:
+        super().__init__(blend_labels=blend_labels, p=p, **options)
+        self.beyond = check_range("beyond", beyond, 0, 1)
+
+    def generate_parameters(self, n: int, space: Any, generator: torch.Generator | None) -> Parameters:
+        """``partner`` as for :class:`RandomInBetween`, and times ``t`` beyond one end or the other."""
+        partner, draw = uniform(n, generator), uniform(n, generator, (0.0, 1.0), 2)
+        beyond = self.beyond[0] + (self.beyond[1] - self.beyond[0]) * draw[:, 0]
+        return {"partner": partner, "t": torch.where(draw[:, 1] < 0.5, -beyond, 1 + beyond)}
+
+    def shapes(self, batch: ShapeBatch, partners: ShapeBatch, t: Tensor, space: ShapeSpace) -> Tensor:
+        """Mirror images of in-betweens. *Shape:* ``(B,) -> (B, V, 3)``."""
+        after = t > 0.5
+        before_end = super().shapes(batch, partners, torch.where(after, 2 - t, -t), space)
+        ends = torch.where(after[:, None, None], partners.shapes, batch.shapes)
+        return mirror(ends, before_end, space.reconstruction(ends.device))
+
+
+def mirror(centre: Tensor, other: Tensor, reconstruction: Reconstruction) -> Tensor:
+    """The shape as far beyond ``centre`` as ``other`` lies before it, its rigid motion included.
+
+    *Shape:* ``(B, V, 3), (B, V, 3) -> (B, V, 3)``.
+    """
+    weights, faces = reconstruction.areas.to(centre), reconstruction.faces
+    motion = best_fit(centre, other, weights)
+    last, aligned = (y.movedim(-1, 0).contiguous() for y in (centre, motion.inverse().apply(other)))
+    wanted = mirrored_sides(frames(sides(last, faces)), frames(sides(aligned, faces)))
+    beyond = reconstruction(wanted, last).movedim(0, -1)
+    return RigidMotion(motion.rotation.mT, motion.source, 2 * motion.source - motion.target).apply(beyond)
+
+
+class RandomBlend(ShapeAugmentation):
+    """Replaces shapes by random mixtures of all key-frames (:meth:`ShapeSpace.sample`), aligned with the given shapes.
+
+    Labels of the vertices stay, and so do those of shapes: give it shapes whose labels all key-frames share. Gradients
+    reach the given shapes through the alignment alone.
+
+    Args:
+        concentration: As for :meth:`ShapeSpace.sample`.
+        locality: Likewise.
+        p: Probability that a shape is transformed.
+        options: As for :class:`ShapeAugmentation`.
+
+    Raises:
+        ValueError: ``concentration`` or ``locality`` is out of range.
+    """
+
+    shown = ("concentration", "locality")
+
+    def __init__(self, concentration: float = 0.2, locality: float = 3.0, p: float = 0.5, **options: Any) -> None:
+        super().__init__(p, **options)
+        check_density(concentration, locality)
+        self.concentration, self.locality = concentration, locality
+
+    def generate_parameters(self, n: int, space: Any, generator: torch.Generator | None) -> Parameters:
+        """``weights`` of the key-frames, and ``factors`` by which they vary over the surface."""
+        weights, factors = space.variation().draw(n, self.concentration, self.locality, generator)
+        return {"weights": weights, "factors": factors}
+
+    def apply_transform(
+        self, batch: ShapeBatch, params: Parameters, space: Any, partners: ShapeBatch | None
+    ) -> ShapeBatch:
+        """Draw a member for each shape; gradients reach the shapes through the rigid alignment with them alone."""
+        drawn = (params[name].detach().double().cpu() for name in ("weights", "factors"))
+        found = space.variation().members(*drawn).to(batch.shapes)
+        areas = space.reconstruction(found.device).areas.to(found)
+        shapes: Tensor = best_fit(found, batch.shapes, areas).apply(found)
+        return batch._replace(shapes=shapes, nearest=space.nearest(shapes))
+
+
+class RandomRigidMotion(ShapeAugmentation):
+    """Rotates shapes about the mean of their vertices, and translates them.
+
+    Args:
+        degrees: Range of the angle, drawn uniformly; a number is the range from it to its negative. With None,
+            rotations are uniform over SO(3) (``axis`` has no effect).
+        axis: Axis of rotation, such as ``(0, 1, 0)`` for shapes with y up; by default uniform directions.
+        translation: Largest move along each axis, in diagonals of the shape's bounding box.
+        p: Probability that a shape is transformed.
+        options: As for :class:`ShapeAugmentation`.
+
+    Raises:
+        ValueError: The angle is beyond 180 degrees, the axis has no length, or the translation is negative.
+    """
+
+    uses_keyframes = False
+    shown = ("degrees", "axis", "translation")
+
+    def __init__(
+        self,
+        degrees: float | tuple[float, float] | None = None,
+        axis: tuple[float, float, float] | None = None,
+        translation: float = 0.0,
+        p: float = 0.5,
+        **options: Any,
+    ) -> None:
+        super().__init__(p, **options)
+        if isinstance(degrees, (int, float)):
+            degrees = (-degrees, degrees)
+        self.degrees = None if degrees is None else check_range("degrees", degrees, -180, 180)
+        if axis is not None and not math.hypot(*axis) > 0:
+            raise ValueError(f"an axis has a length, got {axis}")
+        self.axis = axis
+        if translation < 0:
+            raise ValueError(f"translation is the largest move, 0 or more; got {translation}")
+        self.translation = translation
+
+    def generate_parameters(self, n: int, space: Any, generator: torch.Generator | None) -> Parameters:
+        """``rotation``, axis times angle in radians; and ``translation``, in diagonals."""
+        low, high = (math.radians(degree) for degree in self.degrees or (0.0, 0.0))
+        direction, angle = normal(n, generator, 4), uniform(n, generator, (low, high))
+        move = self.translation * uniform(n, generator, (-1.0, 1.0), 3)
+        if self.degrees is None:
+            # A normal vector of four has a uniform direction: a uniform quaternion.
+            return {"rotation": quaternion_to_axis_angle(normalize(direction, dim=1)), "translation": move}
+        axis = direction[:, 1:]
+        if self.axis is not None:
+            axis = torch.as_tensor(self.axis).to(axis).expand_as(axis)
+        return {"rotation": angle[:, None] * normalize(axis, dim=1), "translation": move}
+
+    def apply_transform(
+        self, batch: ShapeBatch, params: Parameters, space: Any, partners: ShapeBatch | None
+    ) -> ShapeBatch:
+        """Move each shape."""
+        x = batch.shapes
+        centre, diagonal = x.mean(1), (x.amax(1) - x.amin(1)).norm(dim=1, keepdim=True).detach()
+        motion = RigidMotion(exp(params["rotation"]), centre, centre + params["translation"] * diagonal)
+        return batch._replace(shapes=motion.apply(x))

@@ -1,0 +1,99 @@
+"""Shapes of one connectivity with what goes along with them: key-frames and labels."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torch_modal.data.space import ShapeSpace
+
+
+class ShapeBatch(NamedTuple):
+    """Shapes with their key-frames and labels."""
+
+    shapes: Tensor
+    """*Shape:* ``(B, V, 3)``."""
+    nearest: Tensor | None = None
+    """Index of the key-frame whose modes a shape uses; None: the nearest one. On the CPU. *Shape:* ``(B,)``."""
+    is_keyframe: Tensor | None = None
+    """True for shapes that equal that key-frame; None: none does. On the CPU. *Shape:* ``(B,)``, bool."""
+    vertex_labels: Tensor | None = None
+    """*Shape:* ``(B, V, ...)``."""
+    shape_labels: Tensor | None = None
+    """*Shape:* ``(B, ...)``."""
+
+    @classmethod
+    def of_keyframes(
+        cls,
+        space: ShapeSpace,
+        like: Tensor | None = None,
+        vertex_labels: Tensor | None = None,
+        shape_labels: Tensor | None = None,
+    ) -> "ShapeBatch":
+        """The key-frames of a space in the dtype and on the device of a tensor, with labels.
+
+        *Shape:* ``(K, V, ...), (K, ...)``.
+        """
+        every = torch.arange(len(space))
+        return cls(space.keyframes(like), every, every >= 0, vertex_labels, shape_labels)
+
+    def rows(self, index: Tensor) -> "ShapeBatch":
+        """Some of the shapes."""
+        return ShapeBatch._make(None if part is None else part[index.to(part.device)] for part in self)
+
+    def located(self, space: ShapeSpace, dtype: torch.dtype) -> "ShapeBatch":
+        """The batch in a dtype, with the nearest key-frame of each shape."""
+        shapes, none = self.shapes.to(dtype), torch.zeros(len(self.shapes), dtype=torch.bool)
+        nearest = space.nearest(shapes) if self.nearest is None else self.nearest
+        is_keyframe = none if self.is_keyframe is None else self.is_keyframe
+        return self._replace(shapes=shapes, nearest=nearest, is_keyframe=is_keyframe)
+
+    def partners(
+        self, chosen: Tensor, draw: Tensor, space: ShapeSpace, pool: "ShapeBatch | None"
+    ) -> "ShapeBatch | None":
+        """A second shape for each of some shapes; None if there is no other.
+
+        Args:
+            chosen: The shapes. *Shape:* ``(n,)``.
+            draw: Place of the partner among the other shapes, in [0, 1); of key-frames in a motion, that before (below
+                0.5) or after. *Shape:* ``(n,)``.
+            space: The space.
+            pool: Its key-frames, if partners are drawn from these.
+
+        Raises:
+            ValueError: The pool has another number of shapes.
+        """
+        others, own = self, chosen
+        if pool is not None:
+            if len(pool.shapes) != len(space):
+                raise ValueError(
+                    f"a pool holds the {len(space)} key-frames of the space; got {len(pool.shapes)} shapes"
+                )
+            assert self.nearest is not None
+            others, own = pool.located(space, self.shapes.dtype), self.nearest[chosen]
+        size = len(others.shapes)
+        if size < 2:
+            return None
+        if pool is not None and space.motion is not None:
+            return others.rows(space.motion.neighbours[own, (draw >= 0.5).long()])
+        return others.rows((own + (draw * (size - 1)).long().clamp(0, size - 2) + 1) % size)
+
+
+def check_shapes(shapes: Any, space: ShapeSpace | None) -> None:
+    """Raise a ValueError unless given shapes are a batch of shapes of a space, or one of them."""
+    v: Any = "V" if space is None else space.n_vertices
+    shape, dtype = (tuple(shapes.shape), shapes.dtype) if isinstance(shapes, Tensor) else ((), type(shapes).__name__)
+    fits = len(shape) in (2, 3) and shape[-1] == 3 and (space is None or shape[-2] == v)
+    if not fits or dtype not in (torch.float32, torch.float64):
+        raise ValueError(
+            f"shapes must be float32 or float64 of the shape (B, {v}, 3) or ({v}, 3); got {shape} of {dtype}"
+        )
+
+
+def check_labels(shape: Sequence[int], labels: Mapping[str, Tensor | None]) -> None:
+    """Raise a ValueError unless labels, if there are any, belong to as many shapes and vertices."""
+    for name, wanted in (("vertex_labels", tuple(shape)), ("shape_labels", tuple(shape[:1]))):
+        value = labels.get(name)
+        if value is not None and value.shape[: len(wanted)] != wanted:
+            raise ValueError(f"{name} begin with the shape {wanted} of the shapes; got {tuple(value.shape)}")

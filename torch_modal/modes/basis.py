@@ -1,0 +1,121 @@
+"""Vibration modes of one key-frame, as tensors."""
+
+import os
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from torch_modal.autograd import lasting, outlasting
+from torch_modal.io.tensors import TensorFile, write_tensors
+
+FORMAT = "torch_modal.basis"
+VERSION = "2"
+
+
+@dataclass(frozen=True, eq=False)
+class ModalBasis:
+    """Lowest vibration modes of one shape, restricted to its surface.
+
+    The modes are constants of the autograd graph: all tensors are detached.
+
+    Modes have unit mass at a density of 1, of the solid or of a sheet with a thickness of a hundredth of the size:
+    ``phi`` scales as ``length^-3/2`` and eigenvalues as ``length^-2`` with the units of the shape. Eigenvalues of
+    solids and sheets have different units of stiffness. Signs are arbitrary but fixed.
+
+    Attributes:
+        reference: The shape that the modes belong to, in the caller's coordinates. *Shape:* ``(V, 3)``.
+        eigenvalues: Ascending, of the elastic modes. *Shape:* ``(k,)``.
+        modes: Elastic displacements, without rigid motions; zero at unreferenced vertices. *Shape:* ``(k, V, 3)``.
+        rigid_eigenvalues: The six computed eigenvalues of rigid motions, zero up to rounding. *Shape:* ``(6,)``.
+
+    Raises:
+        ValueError: Shapes, dtypes or devices do not match.
+    """
+
+    reference: torch.Tensor
+    eigenvalues: torch.Tensor
+    modes: torch.Tensor
+    rigid_eigenvalues: torch.Tensor
+
+    @lasting
+    def __post_init__(self) -> None:
+        shapes = {name: tuple(tensor.shape) for name, tensor in self._tensors().items()}
+        v, k = shapes["reference"][:1], shapes["eigenvalues"][:1]
+        expected = {"reference": (*v, 3), "eigenvalues": k, "modes": (*k, *v, 3), "rigid_eigenvalues": (6,)}
+        if shapes != expected:
+            raise ValueError(
+                "a basis needs reference (V, 3), eigenvalues (k,), modes (k, V, 3), rigid_eigenvalues (6,); "
+                f"got {shapes}"
+            )
+        kinds = {(tensor.dtype, tensor.device) for tensor in self._tensors().values()}
+        if len(kinds) > 1 or not self.reference.is_floating_point():
+            raise ValueError(f"the tensors of a basis share one floating-point dtype and one device; got {kinds}")
+        for name, tensor in self._tensors().items():
+            object.__setattr__(self, name, outlasting(tensor.detach()))
+
+    def _tensors(self) -> dict[str, torch.Tensor]:
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+    @property
+    def n_modes(self) -> int:
+        """Number of elastic modes, k."""
+        return self.modes.shape[0]
+
+    @property
+    def n_vertices(self) -> int:
+        """Number of vertices, V."""
+        return self.modes.shape[1]
+
+    @property
+    def rigid_modes(self) -> torch.Tensor:
+        """Orthonormal translations and infinitesimal rotations of the reference. *Shape:* ``(6, V, 3)``.
+
+        In the Euclidean product over all vertices: translations along x, y and z, then rotations about their mean.
+        """
+        v = self.n_vertices
+        axes = torch.eye(3, dtype=self.reference.dtype, device=self.reference.device)
+        arms = self.reference - self.reference.mean(dim=0)
+        arms = arms / arms.abs().max()  # avoids overflow; rotations are normalised below
+        translations = axes[:, None].expand(3, v, 3) / v**0.5
+        turned = torch.linalg.cross(axes[:, None].expand(3, v, 3), arms.expand(3, v, 3))
+        rotations = torch.linalg.qr(turned.reshape(3, 3 * v).T).Q.T.reshape(3, v, 3)
+        return torch.cat([translations, rotations])
+
+    def truncate(self, k: int) -> "ModalBasis":
+        """The basis of the lowest ``k`` modes.
+
+        Raises:
+            ValueError: ``k`` is below 0 or above the number of modes.
+        """
+        if not 0 <= k <= self.n_modes:
+            raise ValueError(f"{k} modes requested from a basis of {self.n_modes}; extract more modes")
+        return replace(self, eigenvalues=self.eigenvalues[:k], modes=self.modes[:k])
+
+    def to(self, *args: Any, **kwargs: Any) -> "ModalBasis":
+        """The basis on another device or in another dtype; arguments as for `torch.Tensor.to`."""
+        return ModalBasis(**{name: tensor.to(*args, **kwargs) for name, tensor in self._tensors().items()})
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write a safetensors file atomically, into a folder that exists.
+
+        Raises:
+            OSError: The file cannot be written.
+        """
+        write_tensors(Path(path), FORMAT, VERSION, self._tensors())
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> "ModalBasis":
+        """Read a file written by `save`, to the CPU, in its dtype.
+
+        Raises:
+            FileNotFoundError: There is no such file.
+            ValueError: The file is damaged, has other content or another format version.
+        """
+        names = [field.name for field in fields(cls)]
+        tensors = TensorFile(Path(path), FORMAT, VERSION, names).tensors()
+        try:
+            return cls(**{name: tensors[name] for name in names})
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from error

@@ -1,0 +1,146 @@
+"""Edge-collapse coarsening shared by all key-frames, with cluster averages (section 3.2 of the paper)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import sparse
+
+from torch_modal.arrays import FloatArray, IntArray
+from torch_modal.geometry.connectivity import Connectivity, connected_pieces, double_areas
+from torch_modal.geometry.decimation import decimate
+from torch_modal.geometry.inspect import degenerate_faces, repeated_faces
+
+# Ratio of area to squared longest edge below which a triangle is a needle; an equilateral one has 0.43. With needles,
+# other numbers of faces are tried.
+NEEDLE = 3e-3
+MORE_FACES = (1.0, 1.1, 1.25, 1.4, 1.6)
+
+# Closed pieces with fewer faces vanish or bend without stretching.
+FACES_OF_PIECE = 20
+# Maximum number of pieces that are repaired, by area.
+MOST_PIECES = 100
+
+
+@dataclass(frozen=True)
+class Coarsening:
+    """A partition of the fine vertices into clusters, each a vertex of the coarse mesh.
+
+    The restriction of positions and of modes is the same cluster average, so ``restrict(x + phi a)`` is exactly
+    ``restrict(x) + restrict(phi) a``. The positions from quadric simplification are not linear in the pose and are not
+    used.
+    """
+
+    clusters: IntArray
+    """Coarse vertex of each fine vertex, -1 for those without a face. *Shape:* ``(V,)``."""
+    faces: IntArray
+    """Faces of the coarse mesh. *Shape:* ``(F_coarse, 3)``."""
+
+    @classmethod
+    def of_labels(cls, labels: IntArray, faces: IntArray) -> "Coarsening":
+        """Clusters of equal labels, -1 for none, without those that have no face. *Shape:* ``(V,), (F, 3)``."""
+        coarse = _coarse_faces(labels, faces)
+        used = np.unique(coarse)
+        index = np.full(labels.max() + 2, -1)  # the last for the label -1
+        index[used] = np.arange(len(used))
+        return cls(index[labels], index[coarse])
+
+    @property
+    def n_vertices(self) -> int:
+        """Number of coarse vertices."""
+        return int(self.clusters.max()) + 1
+
+    def restrict(self, x: FloatArray) -> FloatArray:
+        """Cluster averages. *Shape:* ``(..., V, 3) -> (..., V_coarse, 3)``."""
+        members = np.flatnonzero(self.clusters >= 0)
+        clusters, n = self.clusters[members], self.n_vertices
+        shares = 1.0 / np.bincount(clusters, minlength=n)
+        matrix = sparse.csr_matrix((shares[clusters], (clusters, members)), shape=(n, len(self.clusters)))
+        return np.stack([matrix @ shape for shape in x.reshape(-1, *x.shape[-2:])]).reshape(*x.shape[:-2], n, 3)
+
+
+def coarsen(
+    keyframes: FloatArray, faces: IntArray, n_faces: int = 1000, candidates: Sequence[int] | None = None
+) -> Coarsening:
+    """Partition the vertices of all key-frames by the edge collapses of one of them.
+
+    The collapses of each candidate are tried; the partition with the best triangle quality over all key-frames is used,
+    as thin coarse triangles exaggerate bending and collapse in between. Regular meshes with flat sides can lead to
+    degenerate triangles: then somewhat more faces are tried.
+
+    Args:
+        keyframes: Vertex positions. *Shape:* ``(K, V, 3)``.
+        faces: Vertex indices. *Shape:* ``(F, 3)``.
+        n_faces: Faces of the coarse mesh; smaller meshes are not coarsened.
+        candidates: Indices of the key-frames whose collapses are tried; by default all.
+
+    Raises:
+        ValueError: If ``n_faces`` is below 4.
+    """
+    if n_faces < 4:
+        raise ValueError(f"a coarse mesh needs at least 4 faces, got n_faces={n_faces}")
+    sources = range(len(keyframes)) if candidates is None else candidates
+    found: list[tuple[float, Coarsening]] = []
+    for n in (int(factor * n_faces) for factor in MORE_FACES):
+        if found and (n >= len(faces) or found[-1][0] >= NEEDLE):
+            break
+        tried = [(*_fatness(keyframes, each), each) for each in (collapsed(keyframes[i], faces, n) for i in sources)]
+        # Those without needles first, then by the 1st percentile.
+        least, _, best = max(tried, key=lambda one: (min(one[0], NEEDLE), one[1]))
+        found.append((least, best))
+    return max(found, key=lambda one: min(one[0], NEEDLE))[1]
+
+
+def _fatness(keyframes: FloatArray, coarsening: Coarsening) -> tuple[float, float]:
+    """Ratio of area to squared longest edge in the worst key-frame: the minimum and the 1st percentile of triangles."""
+    corners = coarsening.restrict(keyframes)[:, coarsening.faces]
+    sides = corners - np.roll(corners, 1, axis=2)
+    area = 0.5 * np.linalg.norm(np.cross(sides[..., 0, :], sides[..., 1, :]), axis=-1)
+    fatness = area / np.maximum((sides**2).sum(-1).max(-1), np.finfo(np.float64).tiny)
+    return float(fatness.min()), float(np.percentile(fatness, 1, axis=-1).min())
+
+
+def collapsed(points: FloatArray, faces: IntArray, n_faces: int) -> Coarsening:
+    """Partition by the edge collapses of one pose; pieces that would vanish are collapsed separately."""
+    if len(faces) <= n_faces:
+        return Coarsening.of_labels(np.arange(len(points)), faces)
+    root = _roots(points, faces, n_faces)
+    piece = connected_pieces(np.concatenate([faces[:, :2], faces[:, 1:]]), len(points))
+    before = np.bincount(piece[faces[:, 0]])
+    if np.count_nonzero(before) > 1:
+        after = np.bincount(piece[_coarse_faces(root, faces)[:, 0]], minlength=len(before))
+        poor = after < np.minimum(FACES_OF_PIECE, before)
+        areas = np.bincount(piece[faces[:, 0]], double_areas(points, faces))
+        for i in np.argsort(-areas, kind="stable")[:MOST_PIECES]:
+            if poor[i]:
+                members, own = np.unique(faces[piece[faces[:, 0]] == i], return_inverse=True)
+                few = before[i] <= FACES_OF_PIECE
+                root[members] = members if few else members[_roots(points[members], own.reshape(-1, 3), FACES_OF_PIECE)]
+    return Coarsening.of_labels(root, faces)
+
+
+def joined(points: FloatArray, faces: IntArray, coarsening: Coarsening, shortest: float) -> Coarsening:
+    """Merge clusters of a shape whose averages coincide: at edges up to ``shortest`` mean lengths."""
+    centres, edges = coarsening.restrict(points), Connectivity(coarsening.faces).edges
+    lengths = np.linalg.norm(centres[edges[:, 1]] - centres[edges[:, 0]], axis=1)
+    short = lengths <= shortest * lengths.mean()
+    joint = connected_pieces(edges[short], len(centres))
+    labels = np.where(coarsening.clusters >= 0, joint[coarsening.clusters], -1)
+    return Coarsening.of_labels(labels, faces) if short.any() else coarsening
+
+
+def _roots(points: FloatArray, faces: IntArray, n_faces: int) -> IntArray:
+    """Representative vertex of each cluster. *Shape:* ``(V,)``."""
+    collapses = decimate(points, faces, n_faces)[2]
+    root = np.arange(len(points))
+    root[collapses[:, 1]] = collapses[:, 0]
+    while not np.array_equal(root[root], root):
+        root = root[root]
+    return root
+
+
+def _coarse_faces(labels: IntArray, faces: IntArray) -> IntArray:
+    """Faces in terms of labels, without degenerate and repeated ones. *Shape:* ``(F_coarse, 3)``."""
+    left = labels[faces]
+    left = left[~degenerate_faces(left)]
+    return left[~repeated_faces(left)]

@@ -1,0 +1,242 @@
+"""Lowest vibration modes: the generalised eigenproblem ``K phi = lambda M phi``."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import scipy.linalg
+import scipy.sparse as sp
+from scipy.sparse.csgraph import connected_components
+from scipy.sparse.linalg import LinearOperator, eigsh
+
+from torch_modal.arrays import FloatArray, IntArray
+from torch_modal.geometry.sparse import factorize
+
+N_RIGID = 6
+DENSE_BELOW = 600
+"""Number of unknowns below which LAPACK is as fast as Lanczos."""
+MORE_VECTORS = 20
+"""Lanczos vectors beside the wanted ones."""
+RIGID_TOLERANCE = 1e-5
+"""Largest eigenvalue of a rigid motion relative to the first elastic one: typically 1e-13, and 1e-7 for a wire with
+aspect ratio 300."""
+ZERO = 1e-7
+"""Largest eigenvalue that counts as zero, in shifts: rounding leaves 1e-12, and the first mode of a rod of aspect ratio
+10,000 is near 1e-6."""
+LARGEST_RESIDUAL = 1e-3
+"""Largest residual of a mode; typically 1e-11. For wires and flat tetrahedra it is the rounding of ``K phi``."""
+
+
+class ModalAnalysisError(RuntimeError):
+    """The eigenproblem has no trustworthy solution; the message says which check failed."""
+
+
+class ElasticBody(NamedTuple):
+    """The eigenproblem ``K phi = lambda M phi`` of an elastic body with ``N`` vertices, of a surface with ``U`` points.
+
+    Attributes:
+        points: Vertices at rest. *Shape:* ``(N, 3)``.
+        stiffness: ``K``, symmetric positive semi-definite; row ``3 i + c`` is coordinate ``c`` of vertex ``i``.
+            *Shape:* ``(3N, 3N)``.
+        mass: ``M``, entries for vertices. *Shape:* ``(N, N)``.
+        to_surface: Displacements of the surface from those of the body. *Shape:* ``(N, 3, k) -> (U, 3, k)``.
+        shift: Positive shift of the eigenproblem, near the lowest eigenvalues of slender bodies. None: that of a
+            solid, the inverse square of the diagonal of the bounding box.
+        largest_residual: Largest residual ``|K phi - lambda M phi| / (lambda |M phi|)`` of a mode.
+    """
+
+    points: FloatArray
+    stiffness: sp.csc_matrix
+    mass: sp.csr_matrix
+    to_surface: Callable[[FloatArray], FloatArray]
+    shift: float | None = None
+    largest_residual: float = LARGEST_RESIDUAL
+
+
+class ElasticModes(NamedTuple):
+    """Lowest elastic modes of a mesh, M-orthonormal and M-orthogonal to the rigid motions, by ascending eigenvalues.
+
+    ``n_zero`` eigenvalues are zero, with the six rigid ones. *Shape:* ``(k,), (3N, k), (6,)``.
+    """
+
+    eigenvalues: FloatArray
+    modes: FloatArray
+    rigid_eigenvalues: FloatArray
+    n_zero: int
+    n_pieces: int
+
+
+def lowest_modes(body: ElasticBody, n_modes: int) -> ElasticModes:
+    """Lowest elastic modes of a body, at most ``3N - 6``.
+
+    Shift-invert Lanczos with a negative shift: ``K + shift M`` is positive definite, and the modes are those of ``K``
+    itself. Rigid motions are known and projected out, so that Lanczos need not find six equal eigenvalues. Connected
+    components are solved separately for the same reason. Small problems are solved densely. The first of the largest
+    components of each mode is positive.
+
+    Returns:
+        The modes. Rigid motions of connected components against each other come first, six for each further component,
+        beside the ``n_modes`` requested ones.
+
+    Raises:
+        ModalAnalysisError: Rigid motions have energy, the stiffness is indefinite, all modes are zero modes, or a
+            residual is too large.
+        RuntimeError, LinAlgError: Of SuperLU, ARPACK or LAPACK, where a matrix is singular.
+    """
+    positions, k, mass, _, shift, largest_residual = body
+    n_massless = int((np.asarray(mass.sum(axis=1)) <= 0).sum())
+    if n_massless:
+        raise ModalAnalysisError(f"{n_massless} vertices have no mass; remove unused vertices first")
+    if shift is None:
+        shift = 1 / float((np.ptp(positions, axis=0) ** 2).sum())
+    inertia = sp.kron(mass, sp.identity(3), format="csr")
+    n_pieces, piece = connected_components(_vertex_graph(k), directed=False)
+    if n_pieces == 1:
+        return _component_modes(k, inertia, positions, n_modes, shift, largest_residual)
+
+    rigid = np.zeros((k.shape[0], N_RIGID * n_pieces))
+    eigenvalues, modes, n_zero = [], [], N_RIGID * n_pieces
+    for index in range(n_pieces):
+        vertices = np.flatnonzero(piece == index)
+        own = _unknowns(vertices)
+        part, part_inertia = sp.csc_matrix(k[own][:, own]), inertia[own][:, own]
+        n_own = min(n_modes, 3 * len(vertices) - N_RIGID)
+        found = _component_modes(part, part_inertia, positions[vertices], n_own, shift, largest_residual)
+        whole = np.zeros((len(rigid), n_own))
+        whole[own] = found.modes
+        modes.append(whole)
+        eigenvalues.append(found.eigenvalues)
+        rigid[own, N_RIGID * index : N_RIGID * (index + 1)] = rigid_motions(positions[vertices], part_inertia)
+        n_zero += found.n_zero - N_RIGID
+    # The rigid motions of components, without those of the whole.
+    whole_rigid = rigid_motions(positions, inertia)
+    relative = rigid @ scipy.linalg.qr(rigid.T @ (inertia @ whole_rigid))[0][:, N_RIGID:]
+    order = np.argsort(np.concatenate(eigenvalues), kind="stable")[:n_modes]
+    columns = np.concatenate([relative, np.concatenate(modes, axis=1)[:, order]], axis=1)
+    values = np.concatenate([np.zeros(relative.shape[1]), np.concatenate(eigenvalues)[order]])
+    rigid_eigenvalues = np.linalg.eigvalsh(whole_rigid.T @ (k @ whole_rigid))
+    return ElasticModes(values, columns * _signs(columns), rigid_eigenvalues, n_zero, n_pieces)
+
+
+def rigid_motions(positions: FloatArray, inertia: sp.csr_matrix) -> FloatArray:
+    """M-orthonormal translations and infinitesimal rotations of points that are not all on one line.
+
+    *Shape:* ``(N, 3), (3N, 3N) -> (3N, 6)``, with the mass matrix of coordinates.
+    """
+    centered = positions - positions.mean(axis=0)
+    # Scaled to order 1 like the translations, for a well-conditioned factorisation.
+    centered = centered / np.sqrt((centered**2).sum(axis=1).mean())
+    motions = np.zeros((len(positions), 3, N_RIGID))
+    motions[:, :, :3] = np.eye(3)
+    for axis in range(3):
+        motions[:, :, 3 + axis] = np.cross(np.eye(3)[axis], centered)
+    return _orthonormal(motions.reshape(-1, N_RIGID), inertia)
+
+
+def _component_modes(
+    k: sp.csc_matrix, inertia: sp.csr_matrix, positions: FloatArray, n_modes: int, shift: float, largest_residual: float
+) -> ElasticModes:
+    """Lowest elastic modes of a connected component, with checks."""
+    rigid = rigid_motions(positions, inertia)
+    momentum = inertia @ rigid
+    if k.shape[0] < DENSE_BELOW or 2 * n_modes > k.shape[0]:
+        complement = scipy.linalg.qr(momentum)[0][:, N_RIGID:]
+        matrices = (complement.T @ (matrix @ complement) for matrix in (k, inertia))
+        span = complement @ scipy.linalg.eigh(*matrices, subset_by_index=(0, n_modes - 1))[1]
+    else:
+        span = _lanczos(k, inertia, rigid, momentum, n_modes, shift)
+
+    # Rayleigh-Ritz, after which modes are orthonormal up to rounding.
+    span = _orthonormal(span - rigid @ (momentum.T @ span), inertia)
+    forces = k @ span
+    restricted = span.T @ forces
+    eigenvalues, rotation = np.linalg.eigh((restricted + restricted.T) / 2)
+    modes, forces = span @ rotation, forces @ rotation
+    rigid_eigenvalues = np.linalg.eigvalsh(rigid.T @ (k @ rigid))
+
+    n_zero = int((eigenvalues < ZERO * shift).sum())
+    if eigenvalues[0] < -ZERO * shift:
+        raise ModalAnalysisError(
+            f"the stiffness is indefinite: its lowest eigenvalue is {eigenvalues[0]:.2e}; the mesh is likely degenerate"
+        )
+    if n_zero == n_modes:
+        raise ModalAnalysisError(
+            f"all of the lowest {n_zero} modes are motions without deformation: the mesh consists of parts that hang "
+            "together on vertices or edges; join them, or request more modes"
+        )
+    first_elastic, not_rigid = eigenvalues[n_zero], np.abs(rigid_eigenvalues).max()
+    if not not_rigid < RIGID_TOLERANCE * first_elastic:
+        raise ModalAnalysisError(
+            f"the six rigid motions have eigenvalues up to {not_rigid:.2e}, which is not zero beside the first elastic "
+            f"one, {first_elastic:.2e}; the mesh is degenerate"
+        )
+    impulses = inertia @ modes
+    residuals = np.linalg.norm(forces - impulses * eigenvalues, axis=0)
+    residual = (residuals / (np.maximum(eigenvalues, first_elastic) * np.linalg.norm(impulses, axis=0))).max()
+    if not residual < largest_residual:
+        raise ModalAnalysisError(
+            f"the modes leave a relative residual of {residual:.2e} (allowed: {largest_residual:g}); the mesh is "
+            "likely degenerate"
+        )
+    # Zero eigenvalues of hinges may be -1e-13; their roots must exist.
+    return ElasticModes(
+        np.maximum(eigenvalues, 0.0), modes * _signs(modes), rigid_eigenvalues, N_RIGID + n_zero, n_pieces=1
+    )
+
+
+def _lanczos(
+    k: sp.csc_matrix, inertia: sp.csr_matrix, rigid: FloatArray, momentum: FloatArray, n_modes: int, shift: float
+) -> FloatArray:
+    """Lowest eigenvectors that are M-orthogonal to the rigid motions, by ARPACK. *Shape:* ``(3N, n_modes)``."""
+    n, shifted = k.shape[0], k + shift * inertia
+    # Ordering vertices instead of unknowns gives a third less fill: by minimum degree, from the factorisation of a
+    # well-conditioned matrix with their graph.
+    graph = _vertex_graph(shifted)
+    laplacian = sp.csc_matrix((np.full(graph.nnz, -1.0), graph.indices, graph.indptr), shape=graph.shape)
+    degrees = np.diff(graph.indptr)
+    by_vertex = factorize(laplacian + sp.identity(len(degrees)) * (1.0 + degrees.max()))
+    order = _unknowns(np.argsort(by_vertex.perm_c))
+    # The transpose of the symmetric matrix has sorted indices, in a fraction of the time of sorting.
+    factors = factorize(shifted[order][:, order].tocsr().T, "NATURAL")
+
+    def elastic_solve(forces: FloatArray) -> FloatArray:
+        found = np.empty(n)
+        found[order] = factors.solve(forces.reshape(-1)[order])
+        return found - rigid @ (momentum.T @ found)
+
+    # A fixed start makes modes reproducible. Full accuracy: a looser tolerance misses copies of equal eigenvalues.
+    start = elastic_solve(np.random.default_rng(0).standard_normal(n))
+    inverse = LinearOperator((n, n), matvec=elastic_solve, dtype=np.float64)
+    n_vectors = min(n_modes + MORE_VECTORS, n)
+    vectors: FloatArray = eigsh(k, n_modes, inertia, sigma=-shift, OPinv=inverse, v0=start, ncv=n_vectors, tol=0)[1]
+    return vectors
+
+
+def _unknowns(vertices: IntArray) -> IntArray:
+    """Indices of the unknowns of vertices. *Shape:* ``(N,) -> (3N,)``."""
+    return (3 * vertices[:, None] + np.arange(3)).reshape(-1)
+
+
+def _vertex_graph(k: sp.csc_matrix) -> sp.csc_matrix:
+    """Vertex adjacency from the block structure of a matrix. *Shape:* ``(3N, 3N) -> (N, N)``."""
+    blocks = k.T.tobsr((3, 3))
+    n = k.shape[0] // 3
+    return sp.csc_matrix((np.ones(len(blocks.indices)), blocks.indices, blocks.indptr), shape=(n, n))
+
+
+def _orthonormal(columns: FloatArray, inertia: sp.csr_matrix) -> FloatArray:
+    """M-orthonormal basis of the span of independent columns. *Shape:* ``(3N, k) -> (3N, k)``."""
+    root = np.sqrt(np.asarray(inertia.sum(axis=1)))
+    basis = np.linalg.qr(root * columns)[0] / root
+    # Scaled by the lumped masses, the spectrum of M is within [1/5, 1]: the product is well conditioned.
+    upper = scipy.linalg.cholesky(basis.T @ (inertia @ basis))
+    orthonormal: FloatArray = scipy.linalg.solve_triangular(upper, basis.T, trans="T").T
+    return orthonormal
+
+
+def _signs(modes: FloatArray) -> FloatArray:
+    """Signs that make the first of the largest components positive. *Shape:* ``(k,)``."""
+    magnitude = np.abs(modes)
+    # Within a thousandth: rounding must not choose between equal magnitudes of symmetric shapes.
+    first = (magnitude >= 0.999 * magnitude.max(axis=0)).argmax(axis=0)
+    return np.where(np.take_along_axis(modes, first[None], axis=0)[0] < 0, -1.0, 1.0)

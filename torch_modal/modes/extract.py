@@ -1,0 +1,341 @@
+"""Modal bases of key-frames: from meshes to the modes of their vertices."""
+
+import contextlib
+import functools
+import threading
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+import torch
+
+from torch_modal.arrays import FloatArray, IntArray
+from torch_modal.errors import MeshError, MeshWarning
+from torch_modal.geometry.connectivity import Connectivity, connected_pieces
+from torch_modal.geometry.inspect import OPEN, open_part
+from torch_modal.io.cache import Arrays, Cache
+from torch_modal.keyframes.check import check_keyframes
+from torch_modal.modes.basis import ModalBasis
+from torch_modal.modes.carrying import Carrier
+from torch_modal.modes.eigen import N_RIGID, ElasticBody, ModalAnalysisError, lowest_modes
+from torch_modal.modes.lattice import Lattice
+from torch_modal.modes.parallel import StoppedError, one_blas_thread, run_all
+from torch_modal.modes.sheet import n_coarse_faces, sheet_body
+from torch_modal.modes.solid import Solid
+from torch_modal.modes.stiffness import HESSIAN_FORMS, HessianForm
+from torch_modal.modes.surface import CanonicalSurface, self_proximity
+from torch_modal.modes.tetrahedra import Mesher, TetrahedralizationError
+from torch_modal.modes.tetwild import TetWild
+from torch_modal.progress import Progress, ProgressReport, logger
+
+Method = Literal["auto", "solid", "shell"]
+METHODS: tuple[Method, ...] = ("auto", "solid", "shell")
+MESHERS: dict[str, Callable[[], Mesher]] = {"lattice": Lattice, "tetwild": TetWild}
+"""Constructors of meshers by name."""
+
+THIN = 0.01
+"""Mean thickness, in roots of the area, below which the shell is taken."""
+VERTICES_AT_ONCE = 30_000
+"""Total size of concurrent eigenproblems: about 2 GiB."""
+DEFORMS = 1e-6
+"""Norm of the non-rigid part of a motion, relative to the motion, above which it is a deformation."""
+
+
+def extract_modes(vertices: Any, faces: Any, n_modes: int = 30, **options: Any) -> ModalBasis:
+    """Lowest vibration modes of one shape: `extract_bases` for a single key-frame, with the same errors and warnings.
+
+    Args:
+        vertices: Positions, tensor or array, any units. *Shape:* ``(V, 3)``.
+        faces: Vertex indices. *Shape:* ``(F, 3)``.
+        n_modes: Number of elastic modes, k.
+        options: Those of :func:`extract_bases`; no bar is shown unless ``progress`` is given.
+
+    Returns:
+        The basis: float64, on the CPU, without gradient.
+    """
+    return extract_bases([vertices], faces, n_modes, **{"progress": False, **options})[0]
+
+
+def extract_bases(
+    keyframes: Any,
+    faces: Any,
+    n_modes: int = 30,
+    *,
+    method: Method = "auto",
+    form: HessianForm = "edge",
+    mesher: Mesher | str = "lattice",
+    cache_dir: str | None = None,
+    cache: bool = True,
+    progress: Progress = None,
+) -> list[ModalBasis]:
+    """Lowest vibration modes of each key-frame.
+
+    They are the lowest elastic solutions of ``K phi = lambda M phi``, of the solid inside the surface or of the surface
+    itself. For the solid, the key-frame of least self-proximity is filled with tetrahedra, which are carried to the
+    others; ``K`` is the as-rigid-as-possible stiffness and the density 1. For the surface, ``K`` is the Gauss-Newton
+    Hessian of edge lengths and dihedral angles in Eq. 5 at rest, and ``M`` the mass of a sheet whose thickness is a
+    hundredth of its size (:func:`~torch_modal.geometry.canonical.size`) at a density of 1. Small loose pieces follow
+    the nearest part of the body. Modes contain no relative rigid motions of larger pieces: these have no energy, and
+    in-betweens take them from the interpolation of the key-frames. Nothing is differentiated.
+
+    Args:
+        keyframes: Positions, tensor or array, any units. *Shape:* ``(K, V, 3)``.
+        faces: Vertex indices. *Shape:* ``(F, 3)``.
+        n_modes: Number of elastic modes of each, k.
+        method: ``"solid"``; ``"shell"``, for the surface itself, which may be open, flat or not manifold; or
+            ``"auto"``: the solid, but the shell where a key-frame is open or thin or the solid fails
+            (:func:`why_shell`), which a line of the log says. All key-frames have the same.
+        form: Form of the solid's Hessian: ``"edge"``, or ``"vertex"``, the paper's
+            (:func:`~torch_modal.modes.stiffness.arap_hessian`).
+        mesher: Fills the surface with tetrahedra: ``"lattice"``, which is deterministic, finer where the body is thin,
+            and accepts every surface; ``"tetwild"``, fTetWild in a child process; or an object with settings,
+            :class:`~torch_modal.modes.lattice.Lattice`, :class:`~torch_modal.modes.tetwild.TetWild` or
+            another :class:`~torch_modal.modes.tetrahedra.Mesher`.
+        cache_dir: Folder of the cache; by default ``TORCH_MODAL_CACHE`` or the user's cache folder.
+        cache: Whether results are kept on disk and found there.
+        progress: A bar with key-frame and stage: see :data:`torch_modal.progress.Progress`.
+
+    Returns:
+        One basis for each key-frame: float64, on the CPU, without gradient.
+
+    Raises:
+        MeshError: A mesh cannot work.
+        ValueError: ``n_modes`` is more than the shape has, or a setting is out of range.
+        TetrahedralizationError: The mesher failed or took too long.
+        ModalAnalysisError: The modes failed a check.
+
+    Warns:
+        MeshWarning: The warnings of `check_keyframes`; a shape of several loose pieces.
+    """
+    store = Cache.at(cache_dir, enabled=cache)
+    return bases_of_checked(*check_keyframes(keyframes, faces), n_modes, method, form, mesher, store, progress)
+
+
+def bases_of_checked(
+    keyframes: torch.Tensor,
+    faces: torch.Tensor,
+    n_modes: int,
+    method: Method = "auto",
+    form: HessianForm = "edge",
+    mesher: Mesher | str = "lattice",
+    cache: Cache | None = None,
+    progress: Progress = None,
+) -> list[ModalBasis]:
+    """`extract_bases` for the output of :func:`~torch_modal.keyframes.check.check_keyframes`."""
+    if method not in METHODS:
+        raise ValueError(f"the method is {method!r}; give one of {METHODS}")
+    if form not in HESSIAN_FORMS:
+        raise ValueError(f"the Hessian form is {form!r}; give one of {HESSIAN_FORMS}")
+    if isinstance(mesher, str):
+        if mesher not in MESHERS:
+            raise ValueError(f"the mesher is {mesher!r}; give a Mesher or one of {tuple(MESHERS)}")
+        mesher = MESHERS[mesher]()
+    if isinstance(n_modes, bool) or not isinstance(n_modes, (int, np.integer)) or n_modes < 1:
+        raise ValueError(f"n_modes is {n_modes!r}; give a whole number of at least 1")
+    shapes, triangles = keyframes.detach().cpu().double().numpy(), faces.cpu().numpy()
+    n_used = len(np.unique(triangles))
+    possible = 3 * n_used - N_RIGID
+    if n_modes > possible:
+        raise ValueError(
+            f"{n_modes} modes requested, but a surface of {n_used} vertices has at most {possible} ways to "
+            f"deform; give 1 to {possible}"
+        )
+    with one_blas_thread(), ProgressReport(len(shapes), "vibration modes", progress) as bar:
+        extraction = _Extraction(len(shapes), int(n_modes), form, mesher, cache or Cache.at(None), bar)
+        for index, shape in enumerate(shapes):
+            with extraction.stage(index, "checks"):
+                extraction.surfaces.append(CanonicalSurface.of(shape, triangles))
+        found = extraction.by(method)
+    if loose := [one for one in found if one["n_zero"][0] > N_RIGID]:
+        warnings.warn(
+            f"the shape has {max(int(one['n_pieces'][0]) for one in loose)} loose pieces, or parts hung on an edge or "
+            "a vertex: modes deform each of them, and how they move against each other is left to the interpolation of "
+            "the key-frames; join them if they belong together",
+            MeshWarning,
+            stacklevel=3,
+        )
+    bases = []
+    for shape, surface, one in zip(shapes, extraction.surfaces, found, strict=True):
+        # lambda ~ 1 / length², and phi ~ length^(-3/2) since phi' M phi = 1 with a mass ~ length³.
+        modes = np.zeros((n_modes, *shape.shape))
+        modes[:, surface.used] = one["modes"] @ surface.axes * surface.scale**1.5
+        values = (one[name] * surface.scale**2 for name in ("eigenvalues", "rigid_eigenvalues"))
+        eigenvalues, rigid_eigenvalues = map(torch.from_numpy, values)
+        bases.append(
+            ModalBasis(torch.from_numpy(shape.copy()), eigenvalues, torch.from_numpy(modes), rigid_eigenvalues)
+        )
+    return bases
+
+
+def why_shell(surfaces: list[CanonicalSurface]) -> str:
+    """Reason for which a set of key-frames has modes of the surface itself; empty if of the solid."""
+    for index, surface in enumerate(surfaces):
+        holes = open_part(surface.points, Connectivity(surface.faces, len(surface.points)))
+        thickness = surface.thickness / surface.area**0.5
+        what = f"key-frame {index} is" if len(surfaces) > 1 else "the shape is"
+        if holes > OPEN:
+            return f"{what} open: a round hole with its boundary would have {holes:.2g} times its area"
+        if thickness < THIN:
+            return f"{what} thin: its mean thickness is {thickness:.2g} times the root of its area"
+    return ""
+
+
+@dataclass
+class _Extraction:
+    """Modes of all key-frames of a set, as arrays in canonical units; ``stop`` cancels the work."""
+
+    n_keyframes: int
+    n_modes: int
+    form: HessianForm
+    mesher: Mesher
+    cache: Cache
+    bar: ProgressReport
+    surfaces: list[CanonicalSurface] = field(default_factory=list)
+    stop: threading.Event = field(default_factory=threading.Event)
+
+    def by(self, method: Method) -> list[Arrays]:
+        """Modes by a method; where that was chosen here and fails because of the surface, by the other."""
+        if method != "auto":
+            return self.solids() if method == "solid" else self.shells()
+        reason = why_shell(self.surfaces)
+        if reason:
+            logger.info("modes of the surface itself, not of a solid: %s", reason)
+        first, second = (self.shells, self.solids) if reason else (self.solids, self.shells)
+        try:
+            return first()
+        except (TetrahedralizationError, ModalAnalysisError) as error:
+            if isinstance(error, TetrahedralizationError) and not error.lasting:
+                raise  # another attempt may succeed, and the same call should give the same modes
+            self.stop.clear()
+            logger.info("modes of %s: %s", "a solid" if reason else "the surface itself, not of a solid", error)
+            self.bar.expect(len(self.surfaces))
+            try:
+                return second()
+            except (MeshError, TetrahedralizationError, ModalAnalysisError):
+                raise error from None
+
+    def shells(self) -> list[Arrays]:
+        """Modes of all surfaces themselves."""
+        return self._all(
+            lambda index: self._modes_of(index, lambda: sheet_body(self.surfaces[index], self.n_modes)),
+            {},
+            {"form": "shell"},
+            n_coarse_faces(self.n_modes) // 2,
+        )
+
+    def solids(self) -> list[Arrays]:
+        """Modes of all solids inside.
+
+        The key-frame of least self-proximity is meshed, as tetrahedra join parts in contact, and its tetrahedra are
+        carried to the others. Those that they cannot follow are meshed, too.
+        """
+        for index, surface in enumerate(self.surfaces):
+            with self.stage(index, "checks"):
+                surface.require_solid()
+        first = min(range(len(self.surfaces)), key=lambda index: self_proximity(self.surfaces[index]))
+        solid, lock = self._mesh(first), threading.Lock()
+        make_carrier = functools.cache(lambda: Carrier(solid))
+
+        def compute(index: int) -> Arrays:
+            if index == first:
+                return self._modes_of(index, lambda: solid.body(self.form))
+            carried = None
+            with self.stage(index, "carrying tetrahedra"), contextlib.suppress(RuntimeError, np.linalg.LinAlgError):
+                with lock:  # all key-frames share one factorisation
+                    carrier = make_carrier()
+                carried = carrier.carry(self.surfaces[index])
+            if carried is not None:
+                with contextlib.suppress(ModalAnalysisError):  # too distorted
+                    return self._modes_of(index, lambda: carried.body(self.form))
+            own = self._mesh(index)
+            return self._modes_of(index, lambda: own.body(self.form))
+
+        inputs = {"points": solid.surface.points, **solid.tetrahedra.arrays()}
+        inputs = {f"rest_{name}": array for name, array in inputs.items()}
+        return self._all(compute, inputs, {"form": self.form, **self.mesher.key()}, len(solid.tetrahedra.vertices))
+
+    def _all(
+        self, compute: Callable[[int], Arrays], inputs: Arrays, parameters: dict[str, Any], n_vertices: int
+    ) -> list[Arrays]:
+        """Modes of all key-frames, from the cache or computed in as many threads as fit into memory."""
+
+        def modes(index: int) -> Arrays:
+            surface = self.surfaces[index]
+            arrays = {"points": surface.points, "faces": surface.faces, **inputs}
+            found = self.cache.get("modes", arrays, {"n_modes": self.n_modes, **parameters}, lambda: compute(index))
+            self.bar.update()
+            return found
+
+        return run_all(modes, len(self.surfaces), self.stop, VERTICES_AT_ONCE // n_vertices)
+
+    def _mesh(self, index: int) -> Solid:
+        with self.stage(index, "tetrahedra"):
+            return Solid.filling(self.surfaces[index], self.mesher, self.cache, self.stop)
+
+    def _modes_of(self, index: int, make_body: Callable[[], ElasticBody]) -> Arrays:
+        """Modes of a body, at the points of its surface. *Shape:* ``modes (k, U, 3)``."""
+        surface = self.surfaces[index]
+        with self.stage(index, "modes"):
+            try:
+                body = make_body()
+                found = lowest_modes(body, min(self.n_modes, body.points.size - N_RIGID))
+                modes = body.to_surface(found.modes.reshape(len(body.points), 3, -1))
+            except ModalAnalysisError:
+                raise
+            except (RuntimeError, np.linalg.LinAlgError) as error:
+                raise ModalAnalysisError(
+                    f"the modes cannot be computed: {error}; the mesh is likely degenerate: check the surface, or try "
+                    "another method or mesher"
+                ) from error
+            modes = np.ascontiguousarray(modes.transpose(2, 0, 1))
+            n_zero = found.n_zero - N_RIGID
+            modes = np.concatenate([_deforming(modes[:n_zero], surface.points, surface.faces), modes[n_zero:]])
+            if len(modes) < self.n_modes:
+                raise ModalAnalysisError(
+                    f"only {len(modes)} modes deform the {found.n_pieces} loose pieces, {self.n_modes} are requested; "
+                    "request fewer, or give a finer mesher"
+                )
+        return {
+            "eigenvalues": found.eigenvalues[len(found.eigenvalues) - len(modes) :][: self.n_modes],
+            "modes": modes[: self.n_modes],
+            "rigid_eigenvalues": found.rigid_eigenvalues,
+            "n_zero": np.array([found.n_zero]),
+            "n_pieces": np.array([found.n_pieces]),
+        }
+
+    @contextlib.contextmanager
+    def stage(self, index: int, what: str) -> Iterator[None]:
+        """Report a stage of a key-frame, unless the work was cancelled; errors name the key-frame if it has others."""
+        if self.stop.is_set():
+            raise StoppedError
+        self.bar.describe(f"key-frame {index + 1}/{self.n_keyframes}: {what}")
+        try:
+            yield
+        except (MeshError, TetrahedralizationError, ModalAnalysisError) as error:
+            if self.n_keyframes == 1:
+                raise
+            named = type(error)(f"key-frame {index}: {error}")
+            named.__dict__.update(error.__dict__)  # whether a failure lasts
+            raise named from error
+
+
+def _deforming(motions: FloatArray, points: FloatArray, faces: IntArray) -> FloatArray:
+    """Combinations of motions without energy that deform a surface, as where a piece spans several of tetrahedra.
+
+    Rigid motions of pieces are left to the interpolation of the key-frames. *Shape:* ``(k, U, 3) -> (m, U, 3)``.
+    """
+    if len(motions) == 0:
+        return motions
+    piece = connected_pieces(np.concatenate([faces[:, :2], faces[:, 1:]]), len(points))
+    left = motions.copy()
+    for own in (np.flatnonzero(piece == index) for index in range(piece.max() + 1)):
+        arms = points[own] - points[own].mean(axis=0)
+        turns = np.cross(np.eye(3)[:, None], arms[None])
+        rigid = np.concatenate([np.broadcast_to(np.eye(3)[:, None], turns.shape), turns]).reshape(2 * 3, -1)
+        flat = motions[:, own].reshape(len(motions), -1)
+        left[:, own] = (flat - flat @ np.linalg.pinv(rigid) @ rigid).reshape(len(motions), -1, 3)
+    size = np.linalg.norm(motions)
+    mixes, sizes, _ = np.linalg.svd(left.reshape(len(motions), -1), full_matrices=False)
+    return np.tensordot(mixes[:, sizes > DEFORMS * size].T, motions, 1)

@@ -1,0 +1,148 @@
+"""Vibration modes of a surface itself: those of Eq. 5 at rest, without tetrahedra.
+
+The stiffness is the Gauss-Newton Hessian of edge lengths and dihedral angles at rest, the mass that of a sheet. Sheets,
+thin and open bodies have such modes, as all surfaces do. The enclosed volume is left out: it hardly
+changes in-betweens (docs/precompute.md).
+"""
+
+import numpy as np
+import scipy.sparse as sp
+from scipy.spatial import cKDTree
+
+from torch_modal.arrays import FloatArray, IntArray
+from torch_modal.energy.rest_hessian import rest_hessian
+from torch_modal.energy.shell import BETA
+from torch_modal.geometry.canonical import CANONICAL_SIZE
+from torch_modal.geometry.connectivity import Connectivity, double_areas, vertex_areas
+from torch_modal.modes.coarsening import collapsed, joined
+from torch_modal.modes.eigen import ElasticBody
+from torch_modal.modes.surface import CanonicalSurface
+from torch_modal.modes.tetrahedra import small_pieces
+
+THICKNESS = 0.01
+"""Thickness of the sheet whose mass the modes have, in sizes of the surface."""
+COARSE_FACES = 4000
+"""Faces of the mesh that modes are computed on: with 2,000 or 8,000, in-betweens are as good."""
+FACES_PER_MODE = 50
+"""Where many modes are asked for, there are more faces."""
+SHORTEST = 1e-6
+"""Length of an edge over the mean up to which its ends are one vertex: it would have no stiffness."""
+LEAST_MASS = 1e-3
+"""Smallest mass of a vertex over the mean."""
+LARGEST_RESIDUAL = 0.1
+"""Largest residual of a mode: rounding of ``K phi`` at slivers, which are stiffer than the rest by many orders."""
+SHIFT = 50 * 100 * 2 * BETA / (CANONICAL_SIZE**4 * THICKNESS * CANONICAL_SIZE)
+"""Shift of the eigenproblem: 50 times the lowest eigenvalue of a flat sheet."""
+SPREAD = 1.5
+"""Averages over neighbours that carry displacements from clusters to vertices, per radius of a cluster in edges."""
+
+
+def n_coarse_faces(n_modes: int) -> int:
+    """Faces of the mesh that a number of modes is computed on."""
+    return max(COARSE_FACES, FACES_PER_MODE * n_modes)
+
+
+def sheet_body(surface: CanonicalSurface, n_modes: int) -> ElasticBody:
+    """A surface as a thin elastic sheet.
+
+    Vertices are clustered by edge collapses, and modes are computed on the mesh of the clusters, with stretching as
+    stiff as that of the fine mesh: in Eq. 5 it grows as edges become shorter. Small loose pieces follow the rest.
+    """
+    fine = Connectivity(surface.faces, len(surface.points))
+    piece = fine.vertex_pieces[surface.faces[:, 0]]
+    amounts = np.bincount(piece, double_areas(surface.points, surface.faces))
+    large = surface.faces[~small_pieces(amounts, surface.points[surface.faces], piece)[piece]]
+    # Modes do not mind needles, for which `coarsen` would collapse several times.
+    coarsening = collapsed(surface.points, large, n_coarse_faces(n_modes))
+    coarsening = joined(surface.points, large, coarsening, SHORTEST)
+    points, mesh = coarsening.restrict(surface.points), Connectivity(coarsening.faces, coarsening.n_vertices)
+
+    coarser = _mean_length(points, mesh) / _mean_length(surface.points, fine)
+    first, second = mesh.adjacent_sides.T
+    # Also at edges of three faces and more, which would be free to turn.
+    hinges = [mesh.start[first], mesh.end[first], mesh.opposite[first], mesh.opposite[second]]
+    stiffness = rest_hessian(points, mesh.edges, np.stack(hinges, axis=1), coarser)
+    areas = vertex_areas(points, mesh.faces)
+    mass = sp.diags(THICKNESS * CANONICAL_SIZE * np.maximum(areas, LEAST_MASS * areas.mean()), format="csr")
+
+    def to_surface(motions: FloatArray) -> FloatArray:
+        # Each cluster moves the vertices around it by its displacement and its gradient, blended by a smooth partition
+        # of unity; rigid motions and uniform strains are exact.
+        if np.array_equal(coarsening.clusters, np.arange(len(surface.points))):
+            return motions
+        weights = _cluster_weights(coarsening.clusters, surface, fine, points, mesh)
+        n = len(points)
+        arms = surface.points[weights.row] - points[weights.col]
+        blend = sp.csr_matrix(
+            (
+                np.concatenate([weights.data, *(weights.data * arms.T)]),
+                (np.tile(weights.row, 4), np.concatenate([weights.col + part * n for part in range(4)])),
+            ),
+            shape=(len(surface.points), 4 * n),
+        )
+        local = np.concatenate([motions[None], _vertex_gradients(motions, points, mesh.faces)]).reshape(4 * n, -1)
+        return (blend @ local).reshape(-1, *motions.shape[1:])
+
+    return ElasticBody(points, stiffness, mass, to_surface, SHIFT, LARGEST_RESIDUAL)
+
+
+def _cluster_weights(
+    clusters: IntArray, surface: CanonicalSurface, fine: Connectivity, points: FloatArray, mesh: Connectivity
+) -> sp.coo_matrix:
+    """Weights of the clusters that move each vertex, membership averaged over neighbours. *Shape:* ``(U, N)``."""
+    n_fine, n = len(surface.points), len(points)
+    own = np.flatnonzero(clusters >= 0)
+    weights = sp.csr_matrix((np.ones(len(own)), (own, clusters[own])), shape=(n_fine, n))
+    averages = _averages(fine)
+    for _ in range(round(SPREAD * (len(own) / n) ** 0.5)):
+        weights = averages @ weights
+    total = np.asarray(weights.sum(axis=1)).reshape(-1)
+    weights = sp.diags(1 / np.where(total > 0, total, 1)) @ weights
+    rows = np.flatnonzero(total == 0)
+    if len(rows):  # pieces that no cluster reaches follow those around the nearest one
+        tree, piece = cKDTree(points), fine.vertex_pieces[rows]
+        nearest = np.zeros(len(rows), dtype=np.int64)
+        for index in np.unique(piece):
+            nearest[piece == index] = tree.query(surface.points[rows[piece == index]].mean(axis=0))[1]
+        follows = sp.csr_matrix((np.ones(len(rows)), (rows, nearest)), shape=(n_fine, n))
+        weights = weights + follows @ _averages(mesh)
+    return sp.coo_matrix(weights)
+
+
+def _mean_length(points: FloatArray, mesh: Connectivity) -> float:
+    return float(np.linalg.norm(points[mesh.edges[:, 1]] - points[mesh.edges[:, 0]], axis=1).mean())
+
+
+def _averages(mesh: Connectivity) -> sp.csr_matrix:
+    """Means over a vertex and its neighbours. *Shape:* ``(V, V)``."""
+    n = mesh.n_vertices
+    ends = mesh.edges.T.reshape(-1), mesh.edges[:, ::-1].T.reshape(-1)
+    around = sp.csr_matrix((np.ones(len(ends[0])), ends), shape=(n, n)) + sp.identity(n)
+    return sp.diags(1 / np.asarray(around.sum(axis=1)).reshape(-1)) @ around
+
+
+def _vertex_gradients(motions: FloatArray, points: FloatArray, faces: IntArray) -> FloatArray:
+    """Gradient of displacements at vertices, a mean of their faces by area. *Shape:* ``(N, 3, k) -> (3, N, 3, k)``."""
+    corners = points[faces]
+    one, other = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    normals = np.cross(one, other)
+    doubled = np.linalg.norm(normals, axis=1)
+    areas = np.maximum(doubled, 1e-9 * doubled.max())[:, None]
+    normals /= areas
+    hats = np.cross(other, normals) / areas, np.cross(normals, one) / areas
+    n, k = len(points), motions.shape[2]
+    share = sp.csr_matrix(
+        (np.repeat(areas[:, 0], 3), faces.reshape(-1), np.arange(0, faces.size + 1, 3)), (len(faces), n)
+    )
+    total = np.asarray(share.sum(axis=0)).reshape(-1, 1)
+    moves = [motions[faces[:, corner]] - motions[faces[:, 0]] for corner in (1, 2)]
+    # How the normal turns, in the directions of the plane.
+    lifts = [np.einsum("fck,fc->fk", move, normals) for move in moves]
+    turned = -sum(hat[:, :, None] * lift[:, None] for hat, lift in zip(hats, lifts, strict=True))
+    parts = [*moves, turned]
+    found = np.empty((3, n, 3, k))
+    for axis in range(3):
+        along = (*(hat[:, axis] for hat in hats), normals[:, axis])
+        gradient = sum(part * slope[:, None, None] for part, slope in zip(parts, along, strict=True))
+        found[axis] = ((share.T @ gradient.reshape(len(faces), -1)) / total).reshape(n, 3, k)
+    return found

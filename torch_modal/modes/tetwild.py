@@ -1,0 +1,174 @@
+"""fTetWild in a child process: conforming tetrahedra inside a surface."""
+
+import contextlib
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+import zipfile
+from dataclasses import asdict, dataclass, replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from torch_modal.arrays import FloatArray, IntArray
+from torch_modal.modes.parallel import StoppedError
+from torch_modal.modes.processes import describe_exit, end_process, last_line
+from torch_modal.modes.surface import CanonicalSurface
+from torch_modal.modes.tetrahedra import Tetrahedra, TetrahedralizationError, oriented, without_debris
+
+WORKER = Path(__file__).resolve().with_name("_tetwild_worker.py")
+BOX_DIAGONAL = 100.0
+"""Bounding-box diagonal of the surfaces that fTetWild gets."""
+EDGES_PER_THICKNESS = 0.65
+EDGE_RANGE = (0.018, 0.04)
+"""Range of default edge lengths: one tetrahedron across a limb is far too stiff, bulky bodies need no finer ones."""
+
+MESHER_RAISED = 3
+"""Exit code of the worker if the mesher itself raised an exception."""
+_OWN_FAILURES = {MESHER_RAISED, *(-getattr(signal, name, 0) for name in ("SIGSEGV", "SIGFPE"))}
+"""Exit codes that the surface causes. Others may not recur: SIGKILL comes from outside, and C++ raises SIGABRT when
+memory or threads run out."""
+
+
+@dataclass(frozen=True)
+class TetWild:
+    """The mesher ``"tetwild"``: fTetWild in a child process. The defaults take about 2 s on meshes of 3k to 27k faces.
+
+    fTetWild remeshes the surface within its tolerance, and is not deterministic. In a process of its own, crashes and
+    hangs become exceptions, and threads and data-loader workers may use it.
+
+    Attributes:
+        edge_length_fac: Ideal edge length as a fraction of the bounding-box diagonal; None takes about two
+            thirds of the mean thickness (twice the volume over the area), from 0.018 to 0.04.
+        epsilon: Largest distance of the tetrahedra's surface from the input, as a fraction of the diagonal.
+        stop_energy: Quality at which fTetWild stops improving; lower is better and slower (its own default is 10).
+        max_surface_faces: The surface is decimated to about this many faces first.
+        timeout: Seconds for a key-frame, after which the child process is killed.
+
+    Raises:
+        ValueError: A number is out of range (fTetWild hangs on an ``epsilon`` of zero, for example).
+    """
+
+    edge_length_fac: float | None = None
+    epsilon: float = 4e-3
+    stop_energy: float = 200.0
+    max_surface_faces: int = 1500
+    timeout: float = 600.0
+
+    def __post_init__(self) -> None:
+        for name, low, high in (
+            ("edge_length_fac", 2e-3, 1.0),
+            ("epsilon", 1e-5, 0.1),
+            ("stop_energy", 4.0, 1e6),
+            ("max_surface_faces", 100, 10**8),
+            ("timeout", 0.0, np.inf),
+        ):
+            value = getattr(self, name)
+            if value is not None and not low <= value <= high:
+                raise ValueError(f"{name} is {value}; give a number from {low:g} to {high:g}")
+
+    def key(self) -> dict[str, Any]:
+        """Settings, and the versions of the packages."""
+        settings = {name: value for name, value in asdict(self).items() if name != "timeout"}
+        versions = {name: version(name) for name in ("pytetwild", "fast-simplification")}
+        return {"mesher": "tetwild", **settings, **versions}
+
+    def fill(self, surface: CanonicalSurface, stop: threading.Event) -> Tetrahedra:
+        """Fill a closed surface with tetrahedra of positive volume.
+
+        Raises:
+            TetrahedralizationError: The child process crashed, took longer than the timeout, or gave no tetrahedra or
+                ones that do not fill the surface.
+            StoppedError: ``stop`` was set, and the child process killed.
+        """
+        low, high = surface.points.min(axis=0), surface.points.max(axis=0)
+        center, scale = (low + high) / 2, BOX_DIAGONAL / np.linalg.norm(high - low)
+        points = (surface.points - center) * scale
+        edge_length_fac = self.edge_length_fac
+        if edge_length_fac is None:
+            edges = EDGES_PER_THICKNESS * surface.thickness / np.linalg.norm(high - low)
+            edge_length_fac = float(np.clip(edges, *EDGE_RANGE))
+        settings = replace(self, edge_length_fac=edge_length_fac)
+        try:
+            tetrahedra = without_debris(oriented(_run_worker(points, surface.faces, settings, stop)))
+            _check_fills(tetrahedra, points, edge_length_fac, self.epsilon)
+        except TetrahedralizationError as error:
+            mesh = f"a mesh of {len(points)} vertices and {len(surface.faces)} faces"
+            raise TetrahedralizationError(f"cannot fill {mesh} with tetrahedra: {error}", error.lasting) from error
+        return Tetrahedra(tetrahedra.vertices / scale + center, tetrahedra.tets)
+
+
+def _run_worker(points: FloatArray, faces: IntArray, settings: TetWild, stop: threading.Event) -> Tetrahedra:
+    """Run the worker process on a surface with a bounding-box diagonal of 100 and read its result."""
+    if not sys.executable:
+        raise TetrahedralizationError(
+            "sys.executable is empty, so no worker process can be started. Run in a normal interpreter"
+        )
+    with tempfile.TemporaryDirectory(prefix="torch_modal-", ignore_cleanup_errors=True) as folder:
+        job, result, log = (Path(folder) / name for name in ("job.npz", "result.npz", "log.txt"))
+        np.savez(job, vertices=points, faces=faces, **asdict(settings))
+        # Output goes to a file: a full pipe would block the child.
+        with log.open("wb") as output:
+            process = subprocess.Popen(
+                [sys.executable, str(WORKER), str(job), str(result)],
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                cwd=folder,  # fTetWild leaves a __tracked_surface.stl where it runs
+                # A separate process group can be killed as a whole, and Ctrl-C reaches only this process.
+                start_new_session=True,
+            )
+        end = time.monotonic() + settings.timeout
+        try:
+            # Polled, as Ctrl-C cannot interrupt a single wait on every platform.
+            while process.poll() is None:
+                if stop.is_set():
+                    raise StoppedError
+                if (left := end - time.monotonic()) <= 0:
+                    raise TetrahedralizationError(
+                        f"no result after the timeout of {settings.timeout:g} s. "
+                        "Give a longer timeout, a larger edge_length_fac, or a surface without self-intersections"
+                    )
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    process.wait(min(left, 0.2))
+        finally:
+            end_process(process)  # also on KeyboardInterrupt
+        if (code := process.returncode) != 0:
+            tail = last_line(log.read_text(errors="replace"))
+            raise TetrahedralizationError(
+                f"the worker process ended with {describe_exit(code)}{f' ({tail})' if tail else ''}. "
+                "Check the surface for self-intersections and degenerate faces, or try other settings",
+                lasting=code in _OWN_FAILURES,
+            )
+        try:
+            with result.open("rb") as file, np.load(file) as arrays:  # np.load leaves damaged files open
+                return Tetrahedra(arrays["vertices"], arrays["tets"])
+        except (OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
+            raise TetrahedralizationError(f"the worker process left no readable result ({error}). Try again") from error
+
+
+def _check_fills(tetrahedra: Tetrahedra, points: FloatArray, edge_length_fac: float, epsilon: float) -> None:
+    """Reject a mesh that is empty, not finite, or does not cover the surface (bounding-box diagonal 100)."""
+    # Vertices on the new surface are about one edge length apart, so no point of the old one is further away.
+    reach = BOX_DIAGONAL * (0.05 + 2 * edge_length_fac)
+    low, high = points.min(axis=0) - reach, points.max(axis=0) + reach
+    if len(tetrahedra.tets) == 0:
+        flaw = "the result is empty"
+    elif not ((tetrahedra.vertices >= low) & (tetrahedra.vertices <= high)).all():
+        flaw = "the result reaches far beyond the surface"
+    elif n_far := int((cKDTree(tetrahedra.vertices).query(points)[0] > reach).sum()):
+        flaw = f"{n_far} of its vertices are further than {reach:g} % of the diagonal from the result"
+    else:
+        return
+    raise TetrahedralizationError(
+        f"{flaw}. Check that the surface is closed, its winding consistent, and no part thinner than "
+        f"{100 * epsilon:g} % of the diagonal; or give a smaller epsilon, or raise max_surface_faces if small parts "
+        "were lost in the decimation",
+        lasting=True,
+    )

@@ -1,0 +1,52 @@
+"""Principal components of a set of shapes."""
+
+import torch
+from torch import Tensor
+
+from torch_modal.autograd import lasting
+from torch_modal.statistics.variation import Variation
+
+
+class Components:
+    """Directions in which the shapes of a set vary most, and coordinates along them.
+
+    They are those of rotations and strains of the triangles, weighted by area: a component bends a leg where one of
+    displacements would shear it. There are at most K - 1.
+    """
+
+    @lasting
+    def __init__(self, variation: Variation, n: int) -> None:
+        self._coordinates, self._average, self._origin = variation.coordinates, variation.average, variation.origin
+        deviations = variation.deviations
+        off = (deviations * variation.coordinates.shares.sqrt()).flatten(1)
+        left, values, _ = torch.linalg.svd(off, full_matrices=False)
+        left, values = left[:, :n], values[:n]
+        # The sign under which the first shape that is not in the middle lies on the positive side.
+        first = left.abs().argmax(0, keepdim=True)
+        left = left * torch.where(left.gather(0, first) < 0, -1, 1)
+        #: Variance along each, in squared radians (or squared strains). *Shape:* ``(n,)``.
+        self.variances = values.square() / (len(variation) - 1)
+        #: Part of the whole variance that each has. *Shape:* ``(n,)``.
+        self.shares = values.square() / off.square().sum().clamp_min(torch.finfo(off.dtype).tiny)
+        #: Directions of root mean square one over the area. *Shape:* ``(n, 6, E)``.
+        self.directions = torch.einsum("kn,kjf->njf", left / values.clamp_min(torch.finfo(off.dtype).tiny), deviations)
+
+    def __len__(self) -> int:
+        return len(self.directions)
+
+    def coordinates(self, shapes: Tensor) -> Tensor:
+        """Coordinates of shapes along the components. *Shape:* ``(..., V, 3) -> (..., n)``."""
+        flat = shapes.reshape(shapes.shape[:-2].numel(), *shapes.shape[-2:]).to(self.directions)
+        off = (self._coordinates.of(flat) - self._average) * self._coordinates.shares
+        found = torch.einsum("bjf,njf->bn", off, self.directions)
+        return found.view(*shapes.shape[:-2], len(self)).to(shapes)
+
+    def shapes(self, coordinates: Tensor) -> Tensor:
+        """The shapes of coordinates, in the pose of the mean; zeros give the average of rotations and strains.
+
+        *Shape:* ``(..., n) -> (..., V, 3)``.
+        """
+        flat = coordinates.reshape(coordinates.shape[:-1].numel(), coordinates.shape[-1]).to(self.directions)
+        bending = self._average + torch.einsum("bn,njf->bjf", flat, self.directions[: flat.shape[1]])
+        found = self._coordinates.shapes(bending) + self._origin
+        return found.view(*coordinates.shape[:-1], *found.shape[1:]).to(coordinates)

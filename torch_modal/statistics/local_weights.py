@@ -1,0 +1,202 @@
+"""Local weights of a set's shapes, and the rigid motion, that bring them closest to a few observed points."""
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torch_modal.autograd import recorded
+from torch_modal.backends.torch.fine_steps import conjugate_gradients
+from torch_modal.geometry.rigid import RigidMotion, best_fit
+from torch_modal.geometry.triangle_frames import edge_means
+from torch_modal.solve.fitting import levenberg_marquardt
+from torch_modal.statistics.variation import Variation
+
+# Standard deviation of observed points, in sizes of the shape, beside local weights of a standard deviation of one; and
+# larger ones that come first, relative to it: far from the points there are other minima, which a more certain prior
+# does not have.
+NOISE, COARSE_NOISE = 0.01, (10.0, 3.0)
+
+# Gauss-Newton steps for the weights, with coarse noise or changing weights and at last, and the part of the cost that
+# ends them; rounds of weights of the observations; Newton steps that follow, and products in each.
+FEW_STEPS, MOST_STEPS, TOLERANCE, ROBUST_ROUNDS, LAST_STEPS, PRODUCTS = 5, 30, 1e-6, 8, 2, 20
+
+# Rows of the Jacobian that are computed together.
+CHUNK = 32
+
+
+class Observations(NamedTuple):
+    """Points with the vertices that should be there, and weights. *Shape:* ``(n, 3), (n,), (n,)``."""
+
+    points: Tensor
+    vertices: Tensor
+    weights: Tensor
+
+    def pose(self, x: Tensor) -> RigidMotion:
+        """Rigid motion of a shape on to the points. *Shape:* ``(V, 3)``."""
+        return best_fit(x[self.vertices], self.points, self.weights)
+
+    def missed(self, x: Tensor) -> Tensor:
+        """Distances of the points from their vertices. *Shape:* ``(V, 3) -> (n,)``."""
+        return (x[self.vertices] - self.points).norm(dim=-1)
+
+    def missed_at_best(self, x: Tensor) -> Tensor:
+        """Distances after the best rigid motion. *Shape:* ``(V, 3) -> (n,)``."""
+        return self.missed(self.pose(x).apply(x))
+
+
+class LocalWeights:
+    r"""Local weights and the rigid motion of least cost.
+
+    The cost of factors ``z`` of the weights' fields is that of their logarithmic posterior density,
+    :math:`\sum_i |x_i(z) - p_i|^2 / s^2 + |z|^2`. The most likely weights are ``about``, *shape* ``(K,)``.
+    """
+
+    def __init__(self, variation: Variation, to: Observations, about: Tensor) -> None:
+        self.variation, self.about, self.noise = variation, about, NOISE * variation.size
+        self.given, self.to = to, to._replace(points=to.points.detach())
+        self.influence = self._influence()
+
+    def shape(self, factors: Tensor) -> Tensor:
+        """*Shape:* ``(K n,) -> (V, 3)``."""
+        return self.variation.assembled(self.weights(factors))
+
+    def weights(self, factors: Tensor) -> Tensor:
+        """Local weights, which add up to one at each vertex. *Shape:* ``(K n,) -> (K, V)``."""
+        own = factors.view(len(self.about), -1)
+        return self.about[:, None] + (own - own.mean(0)) @ self.variation.fields
+
+    def cost(self, factors: Tensor, to: Observations, noise: float) -> Tensor:
+        """*Shape:* ``(K n,) -> ()``."""
+        missed = to.missed_at_best(self.shape(factors)).square()
+        return (to.weights * missed).sum() / noise**2 + factors.square().sum()
+
+    def solved(self, robust: bool) -> tuple[Tensor, Observations]:
+        """Factors of least cost as a function of the points, ``(K n,)``, and the observations with their weights."""
+        factors, trust = self._least(robust)
+        to = self.given._replace(weights=trust)
+        if torch.is_grad_enabled() and to.points.requires_grad:
+            factors = _FactorsOfPoints.apply(factors, to.points, self, to)
+        return factors, to
+
+    @torch.no_grad()
+    def _least(self, robust: bool) -> tuple[Tensor, Tensor]:
+        to, factors = self.to, self.about.new_zeros(len(self.about) * len(self.variation.fields))
+
+        def descended(noise: float, n_steps: int) -> Tensor:
+            cost, linearise = partial(self.cost, to=to, noise=noise), partial(self.linearised, to=to, noise=noise)
+            return levenberg_marquardt(factors, cost, linearise, n_steps, TOLERANCE)
+
+        for noise in COARSE_NOISE:
+            factors = descended(noise * self.noise, FEW_STEPS)
+        for _ in range(ROBUST_ROUNDS if robust else 0):
+            # Observations that are missed by more than most have less weight (Geman and McClure).
+            missed = to.missed_at_best(self.shape(factors))
+            usual = (3 * missed.median()).clamp_min(self.noise)
+            to = to._replace(weights=self.to.weights / (1 + (missed / usual) ** 2) ** 2)
+            factors = descended(self.noise, FEW_STEPS)
+        factors = descended(self.noise, MOST_STEPS)
+        for _ in range(LAST_STEPS):
+            slope = torch.func.grad(self.cost)(factors, to, self.noise)
+            tried = factors - self.newton(factors, to, 0.5 * slope)
+            if not self.cost(tried, to, self.noise) <= self.cost(factors, to, self.noise):  # an indefinite Hessian
+                break
+            factors = tried
+        return factors, to.weights
+
+    def linearised(self, factors: Tensor, to: Observations, noise: float) -> tuple[Tensor, Tensor]:
+        """Gauss-Newton matrix without the rigid motion, and half the negative gradient. *Shape:* ``(K n,)``."""
+        seen = self.shape(factors)[to.vertices]
+        off = best_fit(seen, to.points, to.weights).inverse().apply(to.points) - seen
+        arms = seen - (to.weights @ seen) / to.weights.sum()
+        eye = torch.eye(3).to(seen).expand(len(arms), 3, 3)
+        turns = torch.linalg.cross(eye, arms[:, None].expand(-1, 3, -1)).mT
+        rigid = torch.cat([turns, eye], -1).flatten(0, 1)
+        root = (to.weights.sqrt() / noise).repeat_interleave(3)[:, None]
+        q = torch.linalg.qr(root * rigid)[0]
+        rows = root * self.jacobian(factors)
+        rows = rows - q @ (q.mT @ rows)
+        matrix = rows.mT @ rows
+        matrix.diagonal().add_(1)
+        return matrix, rows.mT @ (root[:, 0] * off.flatten()) - factors
+
+    def jacobian(self, factors: Tensor) -> Tensor:
+        """Derivatives of the observed vertices, without loose pieces' rotations. *Shape:* ``(K n,) -> (3m, K n)``."""
+        own = self.variation
+        bending = own.bending(self.weights(factors))
+        # Each side depends on its triangle alone. By columns, forward mode would take five times as long.
+        with torch.enable_grad():
+            leaf = bending.detach().requires_grad_()
+            ends = torch.cat(own.coordinates.sides(leaf[None]))[:, 0]
+            slopes = torch.stack([torch.autograd.grad(row.sum(), leaf, retain_graph=True)[0] for row in ends])
+        one, other = slopes[..., : len(own.faces)].split(3)  # (3, 6, F) each
+        fields = own.coordinates.spread(own.fields)
+        moves = own.coordinates.size * torch.eye(3, 6).to(bending)[..., None]
+        carries = own.coordinates.carries(self.to.vertices).to(bending)
+        rows = []
+        for first, second, carried in zip(*(part.split(CHUNK) for part in (*self.influence, carries)), strict=True):
+            at_faces = first[:, None, None] * one + second[:, None, None] * other
+            at = torch.cat([at_faces, carried[:, None, None] * moves], -1)  # (n, 3, 6, E)
+            parts = [(at * deviation).sum(2) @ fields.mT for deviation in own.deviations]
+            rows.append(torch.stack(parts, 2).flatten(2))
+        return torch.cat(rows).flatten(0, 1)
+
+    def newton(self, factors: Tensor, to: Observations, right: Tensor) -> Tensor:
+        """Inverse of half the Hessian, times a vector, by conjugate gradients. *Shape:* ``(K n,)``."""
+        matrix = self.linearised(factors, to, self.noise)[0]
+        matrix.diagonal().add_(len(matrix) * torch.finfo(matrix.dtype).eps * matrix.diagonal().max())  # its rounding
+        factor = torch.linalg.cholesky_ex(matrix).L
+        with torch.enable_grad():
+            own = factors.detach().requires_grad_()
+            slope = torch.autograd.grad(0.5 * self.cost(own, to, self.noise), own, create_graph=True)[0]
+
+        return conjugate_gradients(
+            lambda x: torch.autograd.grad(slope, own, x, retain_graph=True)[0],
+            lambda x: torch.cholesky_solve(x[:, None], factor)[:, 0],
+            torch.dot,
+            right,
+            PRODUCTS,
+        )
+
+    def _influence(self) -> tuple[Tensor, Tensor]:
+        """Part of both sides of each triangle in each observed place. *Shape:* ``(n, F)`` each."""
+        own, to = self.variation, self.to
+        n, v = len(to.points), len(own.coordinates.mean)
+        parts = to.weights.new_zeros(n, v).scatter(1, to.vertices[:, None], 1)
+        reconstruction = own.coordinates.reconstruction
+        for piece, anchors in reconstruction.loose:
+            # A loose piece goes where the vertices go that it follows.
+            parts[:, anchors] += parts[:, piece].sum(1, keepdim=True) / len(anchors)
+        first, second = (parts.new_zeros(1, n, len(own.faces)).requires_grad_() for _ in range(2))
+        with torch.enable_grad():
+            weights, signs = reconstruction.weights, reconstruction.signs
+            edges = edge_means((first, second), weights, reconstruction.sides, signs, len(reconstruction.edges))
+            found = reconstruction.poisson(edges, parts.new_zeros(1, n, v))
+            of_first, of_second = torch.autograd.grad((found[0] * parts).sum(), (first, second))
+        return of_first[0], of_second[0]
+
+
+class _FactorsOfPoints(torch.autograd.Function):
+    """Factors of least cost, with their derivatives in the observed points by the implicit function theorem."""
+
+    @staticmethod
+    def forward(ctx: Any, factors: Tensor, points: Tensor, given: LocalWeights, to: Observations) -> Tensor:
+        ctx.given, ctx.to = given, to._replace(points=points.detach())
+        ctx.save_for_backward(factors, points)
+        return factors.clone()
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        if recorded(grad):
+            raise RuntimeError(
+                "fits have first derivatives only: second ones would lack the elastic steps, which are constants of "
+                "the graph; take the gradient without create_graph"
+            )
+        factors, points = ctx.saved_tensors
+        turned = ctx.given.newton(factors, ctx.to, grad)
+        with torch.enable_grad():
+            own, to_points = factors.detach().requires_grad_(), points.detach().requires_grad_()
+            cost = 0.5 * ctx.given.cost(own, ctx.to._replace(points=to_points), ctx.given.noise)
+            slope = torch.autograd.grad(cost, own, create_graph=True)[0]
+            return None, -torch.autograd.grad(slope, to_points, turned)[0], None, None
