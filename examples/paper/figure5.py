@@ -28,7 +28,6 @@ FloatArray = NDArray[np.float64]
 
 PAIR = 2
 """The key-frame of the gallop before, at which the legs begin to be drawn in."""
-N_MODES = 50
 REGION_COLOR = (0.78, 0.22, 0.20)
 
 
@@ -38,15 +37,14 @@ def main(out: Path, overwrite: bool = True) -> list[str]:
     faces = sample.faces
     x_a, x_b = ends = sample.keyframes[PAIR : PAIR + 2]
     truth = sample.truth[PAIR]
-    bases = tm.extract_bases(ends, faces, N_MODES, mesher="lattice", progress=False)
+    bases = tm.extract_bases(ends, faces, mesher="lattice", progress=False)
     layer = tm.MidShape(bases, faces, preset="paper")
     core, space = layer.in_between.core, layer.space
     clusters = space.first.coarse.clusters.numpy()
     # The bounding box of a shape in the frame of a layer is about this large.
     error = fitting_error(space, core.alignment.references)[clusters] / CANONICAL_SIZE
     segment = segments(space, core.alignment.references)[clusters]
-    region = np.zeros(len(x_a), dtype=bool)
-    region[core.local.used[core.local.free].numpy()] = True
+    region = core.local.region.numpy()
     with torch.no_grad():
         shapes = {
             "Eq. 4": tm.MidShape(bases, faces, preset="paper", regions=0)(x_a, x_b),

@@ -9,7 +9,7 @@ from shapes import edge_error, largest
 from torch import Tensor
 
 from torch_modal.energy.bend import SquaredBend
-from torch_modal.energy.energy import Energy
+from torch_modal.energy.energy import Energy, RestShapes
 from torch_modal.energy.shell import ShellEnergy
 from torch_modal.energy.stretch import Stretch
 from torch_modal.energy.term import Mesh
@@ -27,10 +27,7 @@ def layer(bars: Shapes) -> MidShape:
 
 def inner(layer: MidShape) -> Tensor:
     """Vertices of the regions. *Shape:* ``(V,)``, bool."""
-    local = layer.in_between.core.local
-    found = torch.zeros(len(layer.in_between.core.alignment.weights), dtype=torch.bool)
-    found[local.used[local.free]] = True
-    return found
+    return layer.in_between.core.local.region  # type: ignore[union-attr, no-any-return]
 
 
 def test_segments_are_connected_and_regions_are_the_worst_of_them(layer: MidShape) -> None:
@@ -44,7 +41,9 @@ def test_segments_are_connected_and_regions_are_the_worst_of_them(layer: MidShap
     regions = [worst_regions(space, references, n) for n in (0, 1, 3)]
     assert not regions[0].any() and bool((regions[2] | ~regions[1]).all()) and regions[1].sum() < regions[2].sum()
     assert error[regions[1]].mean() > error[regions[2]].mean() > 2 * error[~regions[2]].mean()
-    assert torch.equal(inner(layer), regions[2])
+    faces = layer.in_between.core.mesh.faces
+    grown = regions[2].index_fill(0, faces[regions[2][faces].any(1)].flatten(), True)
+    assert torch.equal(inner(layer), grown) and grown.sum() > regions[2].sum()
 
 
 def test_minimises_eq_5_against_measures_half_way_and_moves_nothing_else(
@@ -53,14 +52,17 @@ def test_minimises_eq_5_against_measures_half_way_and_moves_nothing_else(
     """Each edge and hinge has a stiffness of its own; the gradient is that of the whole mesh, by autograd."""
     x, other = (12 * bars.keyframes[1:]).unbind()  # the bars are 4 long
     mesh, region = Mesh.of(bars.faces, len(x)), x[:, 0] > 12
+    free = region.index_fill(0, bars.faces[region[bars.faces].any(1)].flatten(), True)
     sizes = len(mesh.edges), len(mesh.hinges)
     alpha, beta = (1 + 99 * torch.rand(1, n, dtype=torch.float64, generator=generator) for n in sizes)
     energy = Energy(mesh, [Stretch(), SquaredBend(), Volume()])
-    start = x + 0.3 * region[:, None] * torch.randn(x.shape, dtype=torch.float64, generator=generator)
-    none = torch.zeros(1, 1, dtype=torch.float64)
-    found = LocalInterpolation(mesh, energy, region)(start[None], other[None], [alpha, beta, none])[0]
-    assert torch.equal(found[~region], start[~region])
-    rests = [energy.rest_of(y[None]) for y in (start, other)]
+    starts = [
+        y + 0.3 * free[:, None] * torch.randn(x.shape, dtype=torch.float64, generator=generator) for y in (x, other)
+    ]
+    none, half = torch.zeros(1, 1, dtype=torch.float64), torch.full((1, 2), 0.5, dtype=torch.float64)
+    given = RestShapes(torch.stack([x, other])[None], half, [alpha, beta, none])
+    ends = [y[0] for y in LocalInterpolation(mesh, energy, region)([y[None] for y in starts], given)]
+    rests = [energy.rest_of(y[None]) for y in (x, other)]
 
     def gradient(y: Tensor) -> Tensor:
         y = y.clone().requires_grad_()
@@ -70,9 +72,11 @@ def test_minimises_eq_5_against_measures_half_way_and_moves_nothing_else(
             off = now.measures[i] - (a + energy.parts[i].term.difference(b, a) / 2)
             off = off if i == 0 else torch.remainder(off + torch.pi, 2 * torch.pi) - torch.pi
             total = total + (stiffness * (rests[0].weights[i] + rests[1].weights[i]) / 2 * off**2).sum()
-        return torch.autograd.grad(total, y)[0][region]
+        return torch.autograd.grad(total, y)[0][free]
 
-    assert largest(gradient(found)) < 1e-3 * largest(gradient(start))
+    for found, start in zip(ends, starts, strict=True):
+        assert torch.equal(found[~free], start[~free])
+        assert largest(gradient(found)) < 1e-5 * largest(gradient(start))
 
 
 def test_result_has_both_shapes_and_energies(layer: MidShape, bars: Shapes) -> None:
@@ -126,7 +130,7 @@ def test_mu_and_regions_are_of_the_paired_space(bars: Shapes) -> None:
 
 @pytest.mark.parametrize(("ends", "truth"), [((0, 2), 1), ((0, 4), 2)], ids=["0-4", "0-8"])
 def test_hand(ends: tuple[int, int], truth: int, hands: Shapes) -> None:
-    """Measured: 0.16 and 0.45 of linear's edge error; in the regions, 0.44 and 0.64 of that without; 5 and 7 steps."""
+    """Measured with 30 modes: 0.16 and 0.38 of linear's edge error; in the regions, 0.30 and 0.48 of that without."""
     pair, wanted = hands.pick(*ends), hands.keyframes[truth]
     whole, plain = (MidShape(pair.bases, pair.faces, preset="paper", **more) for more in ({}, {"regions": 0}))
     result = whole.solve(*pair.keyframes)
@@ -135,7 +139,7 @@ def test_hand(ends: tuple[int, int], truth: int, hands: Shapes) -> None:
     placed, pose, _ = core.alignment(pair.keyframes[None], half)
     linear = core.alignment.restore(placed.mean(1), pose)[0]
     errors = [edge_error(x, wanted, pair.faces) for x in (result.shapes, linear)]
-    assert errors[0] < 0.6 * errors[1]
+    assert errors[0] < 0.5 * errors[1]
     inside = pair.faces[inner(whole)[pair.faces].all(1)]
     errors = [edge_error(x, wanted, inside) for x in (result.shapes, plain(*pair.keyframes))]
-    assert errors[0] < 0.75 * errors[1]
+    assert errors[0] < 0.6 * errors[1]

@@ -31,24 +31,22 @@ class PairedSpace(nn.Module):
 
     .. math:: d(\bar x_1, x_1) + \mu \|x_1 - x_2\|^2 + d(\bar x_2, x_2)
 
-    The two spaces barely meet, so that a small ``mu`` returns the linear mean and a large one distorts: this is the
-    paper's method, a baseline that nothing replaces; the joint space is the better choice.
+    The similarity is taken over the coarse vertices, like the distances: ``mu`` does not depend on the resolution. The
+    two spaces barely meet, so that a small ``mu`` returns the linear mean and a large one distorts: this is the paper's
+    method, a baseline that nothing replaces; the joint space is the better choice.
 
     Args:
         first: The space of the first shape.
         second: The space of the second.
-        used: The vertices of faces, which the similarity is taken over. *Shape:* ``(V,)``, bool.
     """
 
-    used: Tensor
     gap: Tensor
     gap_gram: Tensor
 
-    def __init__(self, first: JointSpace, second: JointSpace, used: Tensor) -> None:
+    def __init__(self, first: JointSpace, second: JointSpace) -> None:
         super().__init__()
         self.first, self.second = first, second
-        gap = (torch.cat([first.basis.fine, -second.basis.fine]) * used[:, None]).flatten(1)
-        self.register_buffer("used", used, persistent=False)
+        gap = torch.cat([first.basis.coarse, -second.basis.coarse]).flatten(1)
         self.register_buffer("gap", gap, persistent=False)
         self.register_buffer("gap_gram", gap @ gap.mT, persistent=False)
 
@@ -64,7 +62,7 @@ class PairedSpace(nn.Module):
         for k, space in enumerate((self.first, self.second)):
             own = rests._replace(shapes=rests.shapes[:, k : k + 1], weights=torch.ones_like(rests.weights[:, :1]))
             placed.append(tuple(space.place(rests.shapes[:, k], own, soften=False)))
-        difference = ((rests.shapes[:, 0] - rests.shapes[:, 1]) * self.used[:, None]).flatten(1)
+        difference = self.first.coarse.restrict(rests.shapes[:, 0] - rests.shapes[:, 1]).flatten(1)
         return PairedPlacement(placed[0], placed[1], difference @ self.gap.mT, (difference**2).sum(-1), mu)
 
     def lift(self, a: Tensor, keyframes: Tensor) -> tuple[Tensor, Tensor]:

@@ -4,19 +4,25 @@
   fitted to that;
 - *segments* are parts that move nearly rigidly in all modes (Huang et al. 2009);
 - the *regions*, the segments of the largest mean error, are interpolated by examples (Froehlich and Botsch 2011): their
-  lengths, angles and volume are half-way between those of two shapes, and all else is fixed.
+  lengths, angles and volume are half-way between those of the key-frames, and all else is fixed.
+
+The paper's examples are ``x1*`` and the second key-frame, and ``x2*`` and the first. But both shapes are a part of the
+way there already: half-way on the rest of it, their regions have passed each other, and the mean is too short.
 """
 
 import heapq
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 import torch
 from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint
 
 from torch_modal.arrays import FloatArray, IntArray
+from torch_modal.autograd import traced, transformed
 from torch_modal.backends.torch.fine_steps import relax
-from torch_modal.energy.energy import Energy, Rest
+from torch_modal.energy.energy import Energy, Rest, RestShapes
 from torch_modal.energy.shell import N_SHELL_TERMS
 from torch_modal.energy.term import Mesh
 from torch_modal.geometry.canonical import CANONICAL_SIZE
@@ -32,11 +38,11 @@ NO_ERROR = 1e-6
 # Added to the stretching stiffness of modes, relative to its mean, for the bending that it leaves out.
 RIDGE = 1e-3
 
-# Rings of faces around the regions: a hinge has vertices of two faces.
-RINGS = 2
+# Rings of faces around the regions: one that is free, where the modes end; two for hinges, of two faces each.
+RINGS = 3
 
 # Newton steps, and products with the Hessian in each.
-N_STEPS, N_PRODUCTS = 10, 50
+N_STEPS, N_PRODUCTS = 10, 100
 
 
 def fitting_error(space: PairedSpace, references: Tensor) -> FloatArray:
@@ -138,55 +144,62 @@ def worst_regions(space: PairedSpace, references: Tensor, n: int) -> Tensor:
 
 
 class LocalInterpolation(nn.Module):
-    """Regions half-way from one shape to another by Eq. 5 against interpolated measures, with all else fixed.
+    """Regions half-way between two key-frames by Eq. 5 against interpolated measures, with all else fixed.
 
     Args:
         mesh: The caller's mesh.
         fine: The terms on it; further ones than those of Eq. 5 play no part.
-        region: True for vertices of the regions. *Shape:* ``(V,)``, bool.
+        region: True for vertices of the regions, which the next ring of faces joins. *Shape:* ``(V,)``, bool.
     """
 
     used: Tensor
-    free: Tensor
+    region: Tensor
 
     def __init__(self, mesh: Mesh, fine: Energy, region: Tensor) -> None:
         super().__init__()
-        faces, around = mesh.faces, region.clone()
+        faces, rings = mesh.faces, [region]
         for _ in range(RINGS):
-            around[faces[around[faces].any(1)]] = True
-        used, numbered = faces[around[faces].all(1)].unique(return_inverse=True)
+            rings.append(rings[-1].index_fill(0, faces[rings[-1][faces].any(1)].flatten(), True))
+        used, numbered = faces[rings[-1][faces].all(1)].unique(return_inverse=True)
         self.energy = Energy(Mesh.of(numbered.view(-1, 3), len(used)), [p.term for p in fine.parts[:N_SHELL_TERMS]])
         self.register_buffer("used", used, persistent=False)
-        self.register_buffer("free", region[used], persistent=False)
+        #: True for the vertices that move. *Shape:* ``(V,)``, bool.
+        self.register_buffer("region", rings[1], persistent=False)
         #: The elements of the regions among those of the mesh.
         self.elements: list[Tensor | None] = []
         for part, own in zip(fine.parts, self.energy.parts, strict=False):
             self.elements.append(None if own.term.total else _places(used[own.corners], part.corners))
 
-    def forward(self, x: Tensor, other: Tensor, stiffness: Sequence[Tensor]) -> Tensor:
+    def forward(self, ends: Sequence[Tensor], rests: RestShapes) -> list[Tensor]:
         """Interpolate.
 
         Args:
-            x: Shapes. *Shape:* ``(B, V, 3)``.
-            other: Shapes whose measures the regions go half the way to. *Shape:* ``(B, V, 3)``.
-            stiffness: Of each term. *Shape of each:* ``(B, M)`` or ``(B, 1)``.
+            ends: Shapes that are fixed beside the regions. *Shape of each:* ``(B, V, 3)``.
+            rests: The key-frames. *Shape:* ``(B, 2, V, 3)``.
         """
-        energy, own = self.energy, x[:, self.used]
-        first, second = energy.rest_of(own), energy.rest_of(other[:, self.used])
-        measures, values = [], []
-        for part, a, b, some, value in zip(
-            energy.parts, first.measures, second.measures, self.elements, stiffness, strict=False
-        ):
-            measures.append(a + 0.5 * part.term.difference(b, a))
-            values.append(value if some is None or value.shape[-1] == 1 else value[:, some.to(value.device)])
-        weights = tuple(torch.lerp(a, b, 0.5) for a, b in zip(first.weights, second.weights, strict=True))
-        reference = energy.against(Rest(tuple(measures), weights), values)
-        found = relax(energy, own, reference, N_STEPS, N_PRODUCTS, free=self.free)
-        return x.index_copy(1, self.used, found)
+        energy, rest = self.energy, self.energy.rest_of(rests.shapes[:, :, self.used])
+        measures, stiffness = [], []
+        for part, q, some, value in zip(energy.parts, rest.measures, self.elements, rests.stiffness, strict=False):
+            measures.append(q[:, 0] + 0.5 * part.term.difference(q[:, 1], q[:, 0]))
+            stiffness.append(value if some is None or value.shape[-1] == 1 else value[:, some.to(value.device)])
+        reference = energy.against(Rest(tuple(measures), tuple(w.mean(1) for w in rest.weights)), stiffness)
+        step = partial(
+            relax, energy, reference=reference, n_steps=1, n_products=N_PRODUCTS, free=self.region[self.used]
+        )
+        # Where gradients are recorded, steps are computed twice: they would take ten times the memory.
+        again = torch.is_grad_enabled() and not (traced(ends[0]) or transformed(ends[0]))
+        found = []
+        for x in ends:
+            own = x[:, self.used]
+            for _ in range(N_STEPS):
+                own = checkpoint(step, own, use_reentrant=False) if again else step(own)
+            found.append(x.index_copy(1, self.used, own))
+        return found
 
 
 def _places(some: Tensor, corners: Tensor) -> Tensor:
     """Columns of some elements among all. *Shape:* ``(n, m), (n, M) -> (m,)``."""
     keys = ([(frozenset(c[:2]), frozenset(c[2:])) for c in each.T.tolist()] for each in (corners, some))
     numbers = {key: i for i, key in enumerate(next(keys))}
-    return torch.tensor([numbers[key] for key in next(keys)], dtype=torch.int64)
+    # Where more than two faces share an edge, the rim has hinges of its own: nothing of them moves.
+    return torch.tensor([numbers.get(key, 0) for key in next(keys)], dtype=torch.int64)

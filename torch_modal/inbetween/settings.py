@@ -35,8 +35,8 @@ class Objective:
             or is 1, and whose others broadcast against the samples. *Shape:* ``()``, ``(..., E)`` or ``(..., 1)``.
         beta: Bending stiffness, likewise with the hinges. *Shape:* ``()``, ``(..., H)`` or ``(..., 1)``.
         gamma: Volume stiffness; of no effect on open surfaces, such as sheets. *Shape:* ``()`` or ``(..., 1)``.
-        mu: Weight of the similarity of Eq. 4, of no effect in the joint space: a number, or a tensor or parameter that
-            broadcasts against the samples. *Shape:* ``(...)``.
+        mu: Weight of the similarity of Eq. 4 on the coarse mesh, of no effect in the joint space: a number, or a tensor
+            or parameter that broadcasts against the samples. *Shape:* ``(...)``.
         terms: Further terms of the energy.
         anchor: ``rho``, the weight of the mean squared distance of the shape from the blend by local rotations, at a
             size of 100, in the joint space. Without it there are many minima of almost the same energy, between which
@@ -53,7 +53,7 @@ class Objective:
     alpha: float | Tensor = ALPHA
     beta: float | Tensor = BETA
     gamma: float | Tensor = GAMMA
-    mu: float | Tensor = 0.3  # of nine pairs of hands and a gallop, 0.1 and 1 are no better; it depends on the mesh
+    mu: float | Tensor = 1.0
     terms: tuple[Term, ...] = ()
     anchor: float = 3000.0
     coarse_faces: int = 1000
@@ -93,8 +93,8 @@ class Solver:
             reach: fingertips, hooves, creases. Gradients go through them; they cost memory in proportion to V.
         polish: Further steps on the fine mesh, each four times as long; two come within 2 % of the optimum.
         regions: In the paired space, the segments that are interpolated once more on the fine mesh, the rest fixed:
-            of 24, the worst reached by the modes (section 3.2 of the paper). They are chosen by the references of the
-            bases, so that gradients go through them as through all else; two bases of one reference have none.
+            of 24, the worst reached by the modes (section 3.2 of the paper). They are chosen once, by the references of
+            the bases: no gradient goes through the choice. Two bases of one reference have none.
         backend: ``"warp"`` (kernels of NVIDIA Warp for the local rotations, the modal energy and the local steps),
             ``"torch"``, ``"auto"`` (kernels where Warp is installed), or one that was registered (docs/extending.md).
             Kernels compute in float64. Terms beyond Eq. 5 are computed by torch.

@@ -81,7 +81,7 @@ class InBetweenSolver(nn.Module):
         if objective.space == "joint":
             return JointSpace(*given, elastic_subspace(turned, alignment, coarse), objective.anchor)
         first, second = (JointSpace(*given, elastic_subspace([own], alignment, coarse)) for own in turned)
-        return PairedSpace(first, second, alignment.weights > 0)
+        return PairedSpace(first, second)
 
     def forward(self, samples: Samples) -> InBetweenResult:
         """Solve.
@@ -112,9 +112,7 @@ class InBetweenSolver(nn.Module):
     def paired(self, straight: Tensor, rests: RestShapes, solution: Solution, pose: Pose) -> InBetweenResult:
         """The two shapes of Eq. 4, interpolated locally, and their mean: the paper's, with nothing in its place."""
         ends = self.space.lift(solution.amplitudes, rests.shapes)
-        if self.local is not None:
-            others = rests.shapes.flip(1).unbind(1)
-            ends = [self.local(x, other, rests.stiffness) for x, other in zip(ends, others, strict=True)]
+        ends = ends if self.local is None else self.local(ends, rests)
         x = self.relaxed((ends[0] + ends[1]) / 2, rests)
         energies = [self.mean_energy(shape.detach(), rests) for shape in (x, straight)]
         valid = (solution.status != Status.INVALID)[:, None, None]

@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
@@ -187,8 +188,8 @@ def _by_recursion(
         layers: dict[tuple[int, int], MidShape] = {}
         for a, b in [(0, 1)] if chosen.objective.space == "joint" else [(0, 1), (0, 0), (1, 1)]:
             own = bases[[ends[a], ends[b]]] if isinstance(bases, Tensor) else [bases[ends[a]], bases[ends[b]]]
-            made = MidShape(own, faces.cpu(), objective=chosen.objective, solver=chosen.solver)
-            layers[a, b] = made.to(keyframes.device)
+            solver = chosen.solver if a < b else replace(chosen.solver, regions=0)
+            layers[a, b] = MidShape(own, faces.cpu(), objective=chosen.objective, solver=solver).to(keyframes.device)
             layers[a, b].in_between.core.local = layers[0, 1].in_between.core.local  # the originals' regions
         shapes = keyframes[list(ends)]
         for _ in range(levels):
