@@ -3,8 +3,8 @@
     python tests/benchmarks/paper.py [--modes 30] [--mu X] [--regions N] [--only TEXT ...]
 
 Errors are the mean relative error of edge lengths: of linear interpolation, of Eq. 4 alone, and of the whole method, on
-the whole mesh and in the regions of local interpolation. *Floor* is that of the mean of both key-frames' lengths, which no
-shape need have. The Gauss-Newton steps are those until one lowers the energy by less than 1e-10 of it.
+the whole mesh and in the regions of local interpolation. *Floor* is that of the mean of both key-frames' lengths, which
+no shape need have. The Gauss-Newton steps are those until one lowers the energy by less than 1e-10 of it.
 """
 
 import argparse

@@ -131,8 +131,7 @@ def newton(
 ) -> Solution:
     """Minimise by :class:`~torch_modal.solve.gauss_newton.GaussNewtonStep`: ten of them, as many as the paper takes.
 
-    They reach its relative decrease of 1e-10 in 6 to 9; without the second-order term it takes 19 and more, and BFGS 22
-    to 39 gradients. Arguments as for :func:`torch_modal.solve.minimise.minimise`.
+    They reach its relative decrease of 1e-10 in 6 or 7. Arguments as for :func:`torch_modal.solve.minimise.minimise`.
     """
     step, n_steps, start = GaussNewtonStep(energy), torch.zeros(len(a), dtype=torch.int64, device=a.device), None
     moving = torch.ones_like(n_steps, dtype=torch.bool)
