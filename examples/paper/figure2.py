@@ -25,7 +25,7 @@ def main(out: Path, overwrite: bool = True, cell: float | None = None, levels: i
     keyframes = truth[[0, last]]
     rows = {
         "linear": tm.linear_sequence(keyframes, [0, last]),
-        "paper, Eq. 4": tm.subdivide(keyframes, faces, levels=levels, preset="paper", progress=False),
+        "the paper": tm.subdivide(keyframes, faces, levels=levels, preset="paper", progress=False),
         "torch_modal": tm.subdivide(keyframes, faces, levels=levels, progress=False),
         "truth": truth,
     }

@@ -1,35 +1,23 @@
 """Figure 5: where the modes fall short, the segments that they suggest, and local interpolation of the worst of them.
 
-The paper finds regions by the method of Huang et al. 2009 and interpolates them once more by that of Froehlich and
-Botsch 2011, the rest held. Here:
-
-- the *local fitting error* of a vertex is what is left of the way from one key-frame to the other, when the modes of
-  the first are fitted to it;
-- *segments* are parts that move nearly rigidly in all modes, each mode as large as it is at a given energy: pairs of
-  neighbours are joined, from the cheapest on, until so many are left;
-- the *regions* are the segments of the largest mean error, up to a part of the surface;
-- of the two shapes that Eq. 4 gives, ``x1`` near the first key-frame and ``x2`` near the second, the regions are put
-  half-way between ``x1`` and the second key-frame, and between ``x2`` and the first. The mid-shape is the mean of both.
+:mod:`torch_modal.inbetween.regions` says what each is; the preset ``"paper"`` does it.
 """
 
-import heapq
 from pathlib import Path
-from typing import NamedTuple
 
 import _paths  # noqa: F401
 import matplotlib
 import numpy as np
 import torch
 from errors import edge_error, lengths, vertex_error
-from full_space import full_space
 from numpy.typing import NDArray
 from torch import Tensor
 
 import torch_modal as tm
 from torch_modal.data.samples import load_sample
-from torch_modal.geometry.connectivity import Connectivity, vertex_areas
-from torch_modal.geometry.rigid import best_fit
-from torch_modal.modes.coarsening import coarsen
+from torch_modal.geometry.canonical import CANONICAL_SIZE
+from torch_modal.geometry.connectivity import Connectivity
+from torch_modal.inbetween.regions import fitting_error, segments
 from torch_modal.view.drawing import Scene, draw
 from torch_modal.view.picture import BETWEEN_COLOR, ERROR_COLORS, KEYFRAME_COLOR, centred, view_rotation
 
@@ -40,117 +28,7 @@ FloatArray = NDArray[np.float64]
 
 PAIR = 2
 """The key-frame of the gallop before, at which the legs begin to be drawn in."""
-N_MODES = 50
-N_SEGMENTS = 24
-WORST = 0.06
-"""The part of the surface that the regions may be."""
 REGION_COLOR = (0.78, 0.22, 0.20)
-
-
-class Halves(NamedTuple):
-    """What Eq. 4 gives, before the mean is taken."""
-
-    first: Tensor
-    """``x1``, near the first key-frame. *Shape:* ``(V, 3)``."""
-    second: Tensor
-    """``x2``. *Shape:* ``(V, 3)``."""
-
-
-def fitting_error(basis: tm.ModalBasis, x: Tensor, weights: Tensor) -> FloatArray:
-    """Distance of a shape from the nearest one that the modes reach. *Shape:* ``(V, 3), (V,) -> (V,)``."""
-    way = best_fit(x, basis.reference, weights).apply(x) - basis.reference
-    root = weights.sqrt()[None, :, None]
-    columns = (basis.modes * root).flatten(1).T
-    amplitudes = torch.linalg.lstsq(columns, (way * root[0]).reshape(-1, 1)).solution[:, 0]
-    return (way - torch.tensordot(amplitudes, basis.modes, 1)).norm(dim=1).numpy()
-
-
-def segments(basis: tm.ModalBasis, faces: Tensor, n_segments: int, n_faces: int = 1200) -> NDArray[np.int64]:
-    """Parts that are nearly rigid in all modes (Huang et al. 2009): the segment of each vertex. *Shape:* ``(V,)``."""
-    rest, triangles = basis.reference.numpy(), faces.numpy()
-    coarsening = coarsen(rest[None], triangles, n_faces)
-    x = coarsening.restrict(rest)
-    modes = coarsening.restrict(basis.modes.numpy() / basis.eigenvalues.numpy()[:, None, None] ** 0.5)
-    area = np.bincount(coarsening.clusters, vertex_areas(rest, triangles), len(x))
-    skew = np.zeros((len(x), 3, 3))
-    skew[:, [0, 1, 2], [1, 2, 0]], skew[:, [1, 2, 0], [0, 1, 2]] = x[:, [2, 0, 1]], -x[:, [2, 0, 1]]
-    rigid = np.concatenate([np.broadcast_to(np.eye(3), skew.shape), skew], axis=2)  # of a turn: w x p
-    normal = np.einsum("v,vci,vcj->vij", area, rigid, rigid)
-    right = np.einsum("v,vci,kvc->vik", area, rigid, modes)
-    whole = np.einsum("v,kvc,kvc->v", area, modes, modes)
-
-    def left(a: FloatArray, b: FloatArray, c: float) -> float:
-        """What no rigid motion explains."""
-        return c - float(np.einsum("ik,ik->", b, np.linalg.pinv(a, hermitian=True) @ b))
-
-    parts = {i: (normal[i], right[i], whole[i], 0.0) for i in range(len(x))}
-    near: dict[int, set[int]] = {i: set() for i in parts}
-    for i, j in Connectivity(coarsening.faces).edges.tolist():
-        near[i].add(j)
-        near[j].add(i)
-    owner = np.arange(len(x))
-    queue: list[tuple[float, int, int]] = []
-
-    def offer(i: int, j: int) -> None:
-        together = [p + q for p, q in zip(parts[i][:3], parts[j][:3], strict=True)]
-        heapq.heappush(queue, (left(*together) - parts[i][3] - parts[j][3], i, j))
-
-    for i, others in near.items():
-        for j in others:
-            if i < j:
-                offer(i, j)
-    new = len(x)
-    while len(parts) > n_segments and queue:
-        _, i, j = heapq.heappop(queue)
-        if i not in parts or j not in parts:
-            continue
-        a, b, c = (p + q for p, q in zip(parts.pop(i)[:3], parts.pop(j)[:3], strict=True))
-        parts[new] = a, b, c, left(a, b, c)
-        near[new] = (near.pop(i) | near.pop(j)) - {i, j}
-        owner[(owner == i) | (owner == j)] = new
-        for other in near[new]:
-            near[other] = (near[other] - {i, j}) | {new}
-            offer(other, new)
-        new += 1
-    return np.unique(owner, return_inverse=True)[1][coarsening.clusters]
-
-
-def regions(error: FloatArray, segment: NDArray[np.int64], areas: FloatArray) -> NDArray[np.bool_]:
-    """The segments of the largest mean error, up to a part of the surface. *Shape:* ``(V,)`` each."""
-    size = np.bincount(segment, areas) / areas.sum()
-    mean = np.bincount(segment, areas * error) / np.bincount(segment, areas)
-    chosen, sum_of_sizes = [], 0.0
-    for number in np.argsort(-mean):
-        if sum_of_sizes + size[number] <= WORST:
-            chosen.append(number)
-            sum_of_sizes += size[number]
-    return np.isin(segment, chosen)
-
-
-def halves(layer: tm.MidShape, x_a: Tensor, x_b: Tensor) -> Halves:
-    """The two shapes of Eq. 4, in the caller's coordinates."""
-    with torch.no_grad():
-        amplitudes = layer.solve(x_a, x_b).solution.amplitudes[None]
-        space, alignment = layer.space, layer.in_between.core.alignment
-        placed, pose, _ = alignment(torch.stack([x_a, x_b])[None], torch.full((1, 2), 0.5, dtype=x_a.dtype))
-        ends = zip((space.first, space.second), space.split(amplitudes), placed.unbind(1), strict=True)
-        return Halves(*(alignment.restore(end.lift(a, x), pose)[0] for end, a, x in ends))
-
-
-def interpolated(x: Tensor, other: Tensor, faces: Tensor, region: NDArray[np.bool_], rings: int = 2) -> Tensor:
-    """A shape whose regions are half-way to another's, the rest held. *Shape:* ``(V, 3), (V, 3) -> (V, 3)``."""
-    inner = torch.from_numpy(region)
-    around = inner.clone()
-    for _ in range(rings):
-        around[faces[around[faces].any(1)]] = True
-    some = faces[around[faces].all(1)]
-    used, numbered = some.unique(return_inverse=True)
-    size = float((x.amax(0) - x.amin(0)).norm())
-    fixed = ~inner[used]
-    found = full_space(
-        x[used], other[used], numbered, start=x[used], example_based=True, fixed=fixed, size=size, max_steps=30
-    )
-    return x.index_copy(0, used, torch.where(fixed[:, None], x[used], found.shape))
 
 
 def main(out: Path, overwrite: bool = True) -> list[str]:
@@ -159,27 +37,25 @@ def main(out: Path, overwrite: bool = True) -> list[str]:
     faces = sample.faces
     x_a, x_b = ends = sample.keyframes[PAIR : PAIR + 2]
     truth = sample.truth[PAIR]
-    bases = tm.extract_bases(ends, faces, N_MODES, mesher="lattice", progress=False)
-    areas = vertex_areas(x_a.numpy(), faces.numpy())
-    error = fitting_error(bases[0], x_b, torch.from_numpy(areas)) / float((x_a.amax(0) - x_a.amin(0)).norm())
-    segment = segments(bases[0], faces, N_SEGMENTS)
-    region = regions(error, segment, areas)
-    near = halves(tm.MidShape(bases, faces, preset="paper"), x_a, x_b)
-    local = Halves(*(interpolated(x, end, faces, region) for x, end in zip(near, (x_b, x_a), strict=True)))
+    bases = tm.extract_bases(ends, faces, mesher="lattice", progress=False)
+    layer = tm.MidShape(bases, faces, preset="paper")
+    core, space = layer.in_between.core, layer.space
+    clusters = space.first.coarse.clusters.numpy()
+    # The bounding box of a shape in the frame of a layer is about this large.
+    error = fitting_error(space, core.alignment.references)[clusters] / CANONICAL_SIZE
+    segment = segments(space, core.alignment.references)[clusters]
+    region = core.local.region.numpy()
     with torch.no_grad():
-        own = tm.MidShape(bases, faces)(x_a, x_b)
-    shapes = {
-        "Eq. 4": (near.first + near.second) / 2,
-        "Eq. 4, local interpolation": (local.first + local.second) / 2,
-        "torch_modal": own,
-        "truth": truth,
-    }
+        shapes = {
+            "Eq. 4": tm.MidShape(bases, faces, preset="paper", regions=0)(x_a, x_b),
+            "Eq. 4, local interpolation": layer(x_a, x_b),
+            "torch_modal": tm.MidShape(bases, faces)(x_a, x_b),
+            "truth": truth,
+        }
     _draw(out / "paper-figure5.png", ends, faces, 100 * error, segment, region, shapes, overwrite)
     inside = torch.from_numpy(region)[faces].all(1)
-    lines = [
-        f"regions: {100 * float(areas[region].sum() / areas.sum()):.0f} % of the surface; edge error, in the regions"
-    ]
-    lines[0] += ", vertex error:"
+    part = float(core.alignment.weights[torch.from_numpy(region)].sum())
+    lines = [f"regions: {100 * part:.0f} % of the surface; edge error, in the regions, vertex error:"]
     for name, x in shapes.items():
         if name != "truth":
             parts = [edge_error(x, truth, f) for f in (faces, faces[inside])]

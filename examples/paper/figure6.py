@@ -25,7 +25,7 @@ def main(out: Path, overwrite: bool = True) -> list[str]:
     truth = torch.stack([first, *hand.truth, last])
     rows = {
         "linear": linear,
-        "paper, Eq. 4": paper,
+        "the paper": paper,
         "torch_modal": own,
         "geodesic\n(Kilian et al. 2007)": geodesic(first, last, hand.faces).frames[::2],
         "truth": truth,

@@ -63,7 +63,7 @@ def main(out: Path, overwrite: bool = True, cell: float | None = None, levels: i
     reduced = ReducedPair(x_a, x_b, faces, 1000)
     rows = {
         THEIRS: torch.stack([x_a, *(froehlich_botsch(reduced, t) for t in times[1:-1]), x_b]),
-        "paper, Eq. 4": tm.subdivide(keyframes, faces, levels=levels, preset="paper", progress=False),
+        "the paper": tm.subdivide(keyframes, faces, levels=levels, preset="paper", progress=False),
         "torch_modal": tm.subdivide(keyframes, faces, levels=levels, progress=False),
         "truth": truth,
     }

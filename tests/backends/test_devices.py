@@ -23,6 +23,7 @@ from torch_modal.backends.torch.fine_steps import ConvexHessian, _solved
 from torch_modal.contact.active import ContactEnergy, Contacts
 from torch_modal.energy.energy import Energy, RestShapes
 from torch_modal.inbetween.alignment import Pose
+from torch_modal.inbetween.paired import PairedSpace
 from torch_modal.inbetween.settings import PRESETS
 
 DOUBLE = torch.float64
@@ -112,14 +113,16 @@ def steps(energy: Energy, x: Tensor, reference: Any) -> None:
     at = energy.linearise(rows, reference)
     right = -energy.fold(energy.gradient(at))
     assert_there([energy.value(rows, reference), energy.value_at(at, reference)])
-    assert_there(_solved(energy, ConvexHessian(energy, at), right, 3, []))
+    assert_there(_solved(energy, ConvexHessian(energy, at), right, 3, [], None))
 
 
 def assert_core_runs(core: Any, x: Tensor, stiffness: list[Tensor]) -> None:
     """An in-between but for its base and its loops: one step, the way back."""
     rests = RestShapes(torch.stack([x, x + 1], 1), blank(2, 2), stiffness)
     placement, a = core.space.place(x, rests, blank(2)), blank(2, core.space.n_amplitudes)
-    pose, shapes = Pose(blank(2, 3, 3), blank(2, 3)), core.space.lift(a, x)
+    paired = isinstance(core.space, PairedSpace)
+    pose = Pose(blank(2, 3, 3), blank(2, 3))
+    shapes = core.space.lift(a, rests.shapes)[0] if paired else core.space.lift(a, x)
     assert_there([placement, core.space.derivatives(a, placement), shapes])
     assert_there([core.alignment.restore(shapes, pose), core.alignment.bring(shapes, pose)])
     reference = rests.reference(core.fine.energy)

@@ -128,8 +128,8 @@ def test_options_arrive(
 
     monkeypatch.setattr(tm, "subdivide", subdivide)
     argv = ["subdivide", *meshes, "--out", str(tmp_path / "a.glb"), "--modes", "6", "--levels", "0"]
-    assert cli.main([*argv, "--preset", "fast", "--contact", "--quiet"]) == 0
-    assert seen["preset"] == "fast" and seen["contact"]
+    assert cli.main([*argv, "--preset", "paper", "--mu", "0.5", "--regions", "4", "--quiet"]) == 0
+    assert (seen["preset"], seen["mu"], seen["regions"]) == ("paper", 0.5, 4)
     assert seen["bases"].keywords["n_modes"] == 6  # type: ignore[attr-defined]
     assert capsys.readouterr() == ("", "")
 

@@ -94,7 +94,7 @@ def test_layer_pushes_fingers_apart(hand: Shapes) -> None:
     with torch.no_grad():
         plain = tm.InBetween(hand.bases, hand.faces)(x_a, x_b, t)
         layer = tm.InBetween(hand.bases, hand.faces, contact=True)
-        shapes, solution = layer.solve(x_a, x_b, t)
+        shapes, solution, *_ = layer.solve(x_a, x_b, t)
     before = far(plain, hand)
     assert int(before[0]) == 0 and int(before[1]) > 20
     assert solution.n_crossing is not None and solution.n_crossing.tolist() == far(shapes, hand).tolist() == [0, 0]
@@ -310,7 +310,7 @@ def test_a_displacement_that_makes_a_shape_worse_is_not_applied(hand: Shapes, mo
 def test_contacts_of_earlier_rounds_stay_active(fists: Shapes) -> None:
     """Without them, six pairs are left: what was pushed out of reach falls back."""
     with torch.no_grad():
-        _, solution = tm.InBetween(fists.bases, fists.faces, contact=True).solve(*fists.keyframes, 0.66)
+        _, solution, *_ = tm.InBetween(fists.bases, fists.faces, contact=True).solve(*fists.keyframes, 0.66)
     assert int(solution.n_crossing) == 0
 
 
@@ -411,7 +411,7 @@ def test_path_takes_any_time(hand: Shapes) -> None:
     path = tm.Path(hand.bases, hand.faces, contact=True)
     t = torch.tensor([0.1, 0.86, 0.9, 1.0], dtype=DOUBLE)
     with torch.no_grad():
-        shapes, solution = path.solve(hand.keyframes, t)
+        shapes, solution, *_ = path.solve(hand.keyframes, t)
         alone = path(hand.keyframes, 0.9)
     assert int(far(shapes, hand).sum()) == 0
     assert int(solution.n_crossing.sum()) == 0

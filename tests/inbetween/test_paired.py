@@ -31,11 +31,11 @@ class Setting:
         self.a = torch.randn(2, self.energy.n_amplitudes, dtype=torch.float64, generator=generator)
 
     def energy_by_hand(self, a: Tensor) -> Tensor:
-        """Eq. 4: d(x_a, x1) + mu |x1 - x2|^2 + d(x_b, x2); d on the coarse mesh, the similarity on the fine one."""
+        """Eq. 4, d(x_a, x1) + mu |x1 - x2|^2 + d(x_b, x2), on the coarse mesh."""
         parts = a.split([len(end) for end in self.ends], -1)
         x1, x2 = (end.added(x, part) for end, x, part in zip(self.ends, self.shapes, parts, strict=True))
         restrict, (x_a, x_b) = self.coarse.restrict, self.shapes
-        similarity = ((x1 - x2) ** 2).sum((-1, -2))
+        similarity = (restrict(x1 - x2) ** 2).sum((-1, -2))
         return self.shell(restrict(x1), restrict(x_a)) + MU * similarity + self.shell(restrict(x2), restrict(x_b))
 
 
@@ -49,7 +49,7 @@ def test_energy_is_eq_4(setting: Setting) -> None:
     torch.testing.assert_close(value, setting.energy_by_hand(setting.a), rtol=1e-10, atol=0)
     zero = torch.zeros_like(setting.a)
     # At rest only the similarity of the key-frames is left.
-    apart = MU * ((setting.shapes[0] - setting.shapes[1]) ** 2).sum((-1, -2))
+    apart = MU * (setting.coarse.restrict(setting.shapes[0] - setting.shapes[1]) ** 2).sum((-1, -2))
     torch.testing.assert_close(setting.energy.value(zero, setting.placement), apart, rtol=1e-10, atol=0)
 
 

@@ -173,6 +173,18 @@ def test_paired_space_borrows_the_nearest_modes(scattered: Shapes) -> None:
         assert largest(frame - MidShape(bases, pair.faces, "paired", **PAIRED)(*shapes)) < 1e-9
 
 
+def test_regions_are_those_of_the_key_frames_in_all_levels(scattered: Shapes) -> None:
+    pair = scattered.pick(0, 1)
+    options: Any = {"preset": "paper", "progress": False}
+    plain, whole = (subdivide(pair.keyframes, pair.faces, 2, bases=pair.bases, **options, regions=n) for n in (0, 2))
+    region = MidShape(pair.bases, pair.faces, preset="paper", regions=2).in_between.core.local.region
+    moved = (edge_lengths(whole, pair.faces) - edge_lengths(plain, pair.faces)).abs() > 1e-6
+    assert moved[1:4].any(1).all() and not moved[[0, 4]].any()
+    assert largest((whole[2] - plain[2])[~region]) < 1e-9 < 1e-3 < largest((whole[2] - plain[2])[region])
+    other = subdivide(pair.keyframes, pair.faces, 1, bases=pair.bases, **options, regions=2, mu=30.0)
+    assert largest(other[1] - whole[2]) > 1e-3
+
+
 def test_makes_bases_where_none_are_given(scattered: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
     pair = scattered.pick(0, 1)
     asked: list[Any] = []
@@ -219,6 +231,8 @@ def test_linear_sequence(scattered: Shapes) -> None:
         ({"levels": 1.5}, "got 1.5"),
         ({"n_frames": 2}, "n_frames=2 leaves no room for 3 key-frames"),
         ({"bases": []}, "got 0 bases for 3 key-frames"),
+        ({"mu": 0.5}, "mu weighs the similarity of the two shapes"),
+        ({"regions": 2}, "the joint space has one"),
     ],
 )
 def test_exception(options: dict[str, Any], message: str, scattered: Shapes) -> None:

@@ -43,8 +43,11 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
         "of more than 100000 vertices)"
     )
     add("--proxy", type=number(int, 0), metavar="N", help=text)
-    text = "accurate; fast, without steps on the fine mesh; paper, its Eq. 4 as it stands (default: %(default)s)"
+    text = "accurate; fast, without steps on the fine mesh; paper, its method whole (default: %(default)s)"
     add("--preset", choices=("accurate", "fast", "paper"), default="accurate", help=text)
+    add("--mu", type=number(float, 0), metavar="X", help="with --preset paper: weight of the similarity")
+    text = "with --preset paper: segments, the worst of 24, that are interpolated locally (default: 8)"
+    add("--regions", type=number(int, 0), metavar="N", help=text)
     text = "of the numbered frames (default: that of the first key-frame, with all that its file carries)"
     add("--format", choices=[suffix[1:] for suffix in MESH_FORMATS], help=text)
     text = "also draw the sequence beside linear interpolation, as .png or .pdf"
@@ -93,6 +96,8 @@ def run(args: argparse.Namespace) -> None:
         args.fail("subdivide needs two key-frames or more")
     if args.contact and args.preset == "paper":
         args.fail("--contact needs one shape for each in-between; --preset paper has two")
+    if args.preset != "paper" and (args.mu is not None or args.regions is not None):
+        args.fail(f"--{'regions' if args.mu is None else 'mu'} is for the two shapes of --preset paper")
     if (args.landmarks or args.across) and not args.register:
         args.fail("--landmarks and --across are for --register")
     if args.cyclic and (args.ping_pong or args.ease):
@@ -129,6 +134,8 @@ def run(args: argparse.Namespace) -> None:
         progress=progress,
         preset=args.preset,
         contact=args.contact,
+        mu=args.mu,
+        regions=args.regions,
         proxy=args.proxy,
     )
     n_proxy = proxy_size(args.proxy, welded.keyframes.shape[1])

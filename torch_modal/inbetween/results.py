@@ -1,6 +1,7 @@
 """Flat batches of in-betweens, their results, and warnings about those that did not converge."""
 
 import warnings
+from collections.abc import Iterable, Iterator
 from functools import partial
 from typing import NamedTuple
 
@@ -24,14 +25,23 @@ class InBetweenResult(NamedTuple):
     """*Shape:* ``(..., V, 3)``; NaN where the status is ``INVALID``."""
     solution: Solution
     """One value per shape: energy, relative gradient norm, number of steps, status."""
+    first: Tensor | None = None
+    """Of the paired space, ``x1*`` near the first key-frame; the shapes are the mean of both. *Shape:* as theirs."""
+    second: Tensor | None = None
+    """Likewise ``x2*``, near the second."""
+    shell_energy: Tensor | None = None
+    """Of the paired space, the mean of Eq. 5 from both key-frames, on the fine mesh. *Shape:* ``(...)``."""
+    linear_energy: Tensor | None = None
+    """The same of linear interpolation."""
 
     def unflattened(self, lead: torch.Size) -> "InBetweenResult":
         """A flat batch with these leading dimensions."""
-        values = (None if value is None else value.reshape(lead + value.shape[1:]) for value in self.solution)
-        return InBetweenResult(
-            self.shapes.reshape(*lead, *self.shapes.shape[1:]),
-            Solution(*values),  # type: ignore[arg-type]
-        )
+
+        def each(values: Iterable[Tensor | None]) -> Iterator[Tensor | None]:
+            return (None if value is None else value.reshape(lead + value.shape[1:]) for value in values)
+
+        shapes, *others = each([self.shapes, *self[2:]])
+        return InBetweenResult(shapes, Solution(*each(self.solution)), *others)  # type: ignore[arg-type]
 
 
 class Samples(NamedTuple):

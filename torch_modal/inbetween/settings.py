@@ -35,8 +35,8 @@ class Objective:
             or is 1, and whose others broadcast against the samples. *Shape:* ``()``, ``(..., E)`` or ``(..., 1)``.
         beta: Bending stiffness, likewise with the hinges. *Shape:* ``()``, ``(..., H)`` or ``(..., 1)``.
         gamma: Volume stiffness; of no effect on open surfaces, such as sheets. *Shape:* ``()`` or ``(..., 1)``.
-        mu: Weight of the similarity of Eq. 4, of no effect in the joint space: a number, or a tensor or parameter that
-            broadcasts against the samples. *Shape:* ``(...)``.
+        mu: Weight of the similarity of Eq. 4 on the coarse mesh, of no effect in the joint space: a number, or a tensor
+            or parameter that broadcasts against the samples. *Shape:* ``(...)``.
         terms: Further terms of the energy.
         anchor: ``rho``, the weight of the mean squared distance of the shape from the blend by local rotations, at a
             size of 100, in the joint space. Without it there are many minima of almost the same energy, between which
@@ -53,7 +53,7 @@ class Objective:
     alpha: float | Tensor = ALPHA
     beta: float | Tensor = BETA
     gamma: float | Tensor = GAMMA
-    mu: float | Tensor = 1.0  # the best of a grid over three spans of a hand; it depends on the mesh
+    mu: float | Tensor = 1.0
     terms: tuple[Term, ...] = ()
     anchor: float = 3000.0
     coarse_faces: int = 1000
@@ -92,6 +92,9 @@ class Solver:
         local_steps: Newton steps of all vertices on the fine mesh after the modal solve, for what the modes cannot
             reach: fingertips, hooves, creases. Gradients go through them; they cost memory in proportion to V.
         polish: Further steps on the fine mesh, each four times as long; two come within 2 % of the optimum.
+        regions: In the paired space, the segments that are interpolated once more on the fine mesh, the rest fixed:
+            of 24, the worst reached by the modes (section 3.2 of the paper). They are chosen once, by the references of
+            the bases: no gradient goes through the choice. Two bases of one reference have none.
         backend: ``"warp"`` (kernels of NVIDIA Warp for the local rotations, the modal energy and the local steps),
             ``"torch"``, ``"auto"`` (kernels where Warp is installed), or one that was registered (docs/extending.md).
             Kernels compute in float64. Terms beyond Eq. 5 are computed by torch.
@@ -106,13 +109,14 @@ class Solver:
     unconverged: Literal["warn", "raise"] = "warn"
     local_steps: int = 2
     polish: int = 0
+    regions: int = 0
     backend: str = "auto"
 
     def __post_init__(self) -> None:
         _choice("gradient", self.gradient, ("implicit", "unroll"))
         _choice("unconverged", self.unconverged, ("warn", "raise"))
         _choice("backend", self.backend, names())
-        for name, lowest in (("max_steps", 0), ("local_steps", 0), ("polish", 0)):
+        for name, lowest in (("max_steps", 0), ("local_steps", 0), ("polish", 0), ("regions", 0)):
             _whole(name, getattr(self, name), lowest)
         if not self.tolerance >= 0:
             raise ValueError(f"tolerance bounds a relative gradient norm and is 0 or more; got {self.tolerance!r}")
@@ -130,28 +134,33 @@ Preset = Literal["accurate", "fast", "paper"]
 PRESETS = {
     "accurate": Settings(Objective(), Solver()),
     "fast": Settings(Objective(anchor=30_000.0, coarse_faces=300), Solver(tolerance=1e-5, local_steps=0)),
-    "paper": Settings(Objective(space="paired"), Solver(local_steps=0)),
+    "paper": Settings(Objective(space="paired"), Solver(max_steps=10, local_steps=0, regions=8)),
 }
 """The presets; docs/layer.md compares them."""
 
 
 def settings(
-    preset: str, objective: Objective | None = None, solver: Solver | None = None, contact: bool | None = None
+    preset: str,
+    objective: Objective | None = None,
+    solver: Solver | None = None,
+    contact: bool | None = None,
+    space: str | None = None,
+    mu: float | Tensor | None = None,
+    regions: int | None = None,
 ) -> Settings:
     """The settings of a preset; given ones replace its own.
 
     Raises:
-        ValueError: There is no such preset.
+        ValueError: There is no such preset, or ``mu`` or regions do not fit the space.
     """
     _choice("preset", preset, tuple(PRESETS))
     chosen = PRESETS[preset]
-    objective = objective or chosen.objective
-    if contact is not None:
-        objective = replace(objective, contact=contact)
-    return Settings(objective, solver or chosen.solver)
-
-
-def with_space(chosen: Settings, space: str | None, mu: float | Tensor | None) -> Settings:
-    """Settings with another space or ``mu``, where they are given."""
-    changes = {name: value for name, value in (("space", space), ("mu", mu)) if value is not None}
-    return chosen._replace(objective=replace(chosen.objective, **changes))  # type: ignore[arg-type]
+    changes = {"contact": contact, "space": space, "mu": mu}
+    changes = {name: value for name, value in changes.items() if value is not None}
+    objective = replace(objective or chosen.objective, **changes)  # type: ignore[arg-type]
+    solver = solver or chosen.solver
+    solver = solver if regions is None else replace(solver, regions=regions)
+    if objective.space == "joint" and (mu is not None or solver.regions):
+        what = "mu weighs the similarity" if mu is not None else f"regions={solver.regions} are interpolated"
+        raise ValueError(f"{what} of the two shapes of Eq. 4; the joint space has one: preset='paper' has two")
+    return Settings(objective, solver)

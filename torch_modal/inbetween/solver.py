@@ -1,6 +1,7 @@
 """The in-between of K key-frames with weights, top to bottom; all layers use it."""
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import torch
@@ -11,12 +12,13 @@ from torch_modal.backends.torch.backend import TorchBackend
 from torch_modal.energy.energy import Energy, RestShapes
 from torch_modal.energy.shell import N_SHELL_TERMS
 from torch_modal.energy.term import Mesh, Term
-from torch_modal.inbetween.alignment import KeyframeAlignment
+from torch_modal.inbetween.alignment import KeyframeAlignment, Pose
 from torch_modal.inbetween.blend import RotationBlend
 from torch_modal.inbetween.coarse import CoarseMesh
 from torch_modal.inbetween.comparison import SLACK, no_worse
 from torch_modal.inbetween.joint import JointSpace
-from torch_modal.inbetween.paired import PairedSpace
+from torch_modal.inbetween.paired import PairedSpace, newton
+from torch_modal.inbetween.regions import LocalInterpolation, worst_regions
 from torch_modal.inbetween.results import InBetweenResult, Samples, unminimised
 from torch_modal.inbetween.settings import Objective, Solver
 from torch_modal.inbetween.subspace import elastic_subspace
@@ -63,6 +65,10 @@ class InBetweenSolver(nn.Module):
         joint = objective.space == "joint"
         self.blend = RotationBlend(mesh.connectivity, self.alignment.references, backend) if joint else None
         self.space: Any = self._space(modes, objective) if any(len(own) for own in modes) else None
+        self.local: LocalInterpolation | None = None
+        if solver.regions and isinstance(self.space, PairedSpace):
+            region = worst_regions(self.space, self.alignment.references, solver.regions)
+            self.local = LocalInterpolation(mesh, self.fine.energy, region) if region.any() else None
 
     def _space(self, modes: Sequence[Tensor], objective: Objective) -> JointSpace | PairedSpace:
         """The space that the modal solve minimises in."""
@@ -75,7 +81,7 @@ class InBetweenSolver(nn.Module):
         if objective.space == "joint":
             return JointSpace(*given, elastic_subspace(turned, alignment, coarse), objective.anchor)
         first, second = (JointSpace(*given, elastic_subspace([own], alignment, coarse)) for own in turned)
-        return PairedSpace(first, second, alignment.weights > 0)
+        return PairedSpace(first, second)
 
     def forward(self, samples: Samples) -> InBetweenResult:
         """Solve.
@@ -91,28 +97,48 @@ class InBetweenSolver(nn.Module):
         rests = RestShapes(shapes, weights, samples.stiffness, anchors)
         straight = torch.bmm(weights[:, None], shapes.flatten(2)).view_as(shapes[:, 0])
         base = straight if self.blend is None else self.blend(shapes, weights, straight)
-        starts = [straight] if self.blend is None else [base, straight]
-        x, solution = self.minimised(base, rests, samples.mu, usable)
+        solution = self.minimised(base, rests, samples.mu, usable)
+        if self.blend is None:
+            return self.paired(straight, rests, solution, pose)
+        x = base if self.space is None else self.space.lift(solution.amplitudes, base)
         x = self.relaxed(x, rests)
         # No shape is better for being far from a key-frame with a weight below zero.
         compared = rests._replace(weights=weights.clamp_min(0))
-        x, solution = no_worse(x, starts, solution, self.distortion, compared, SLACK)
+        x, solution = no_worse(x, [base, straight], solution, self.distortion, compared, SLACK)
         x, solution = self.finished(x, solution, rests)
         valid = (solution.status != Status.INVALID)[:, None, None]
         return InBetweenResult(torch.where(valid, self.alignment.restore(x, pose), torch.nan), solution)
 
-    def minimised(self, base: Tensor, rests: RestShapes, mu: Tensor, usable: Tensor) -> tuple[Tensor, Solution]:
-        """Shapes of least energy in the modal space. *Shape:* ``(B, V, 3)``, of ``mu`` and ``usable`` ``(B,)``."""
+    def paired(self, straight: Tensor, rests: RestShapes, solution: Solution, pose: Pose) -> InBetweenResult:
+        """The two shapes of Eq. 4, interpolated locally, and their mean: the paper's, with nothing in its place."""
+        ends = self.space.lift(solution.amplitudes, rests.shapes)
+        ends = ends if self.local is None else self.local(ends, rests)
+        x = self.relaxed((ends[0] + ends[1]) / 2, rests)
+        energies = [self.mean_energy(shape.detach(), rests) for shape in (x, straight)]
+        valid = (solution.status != Status.INVALID)[:, None, None]
+        first, second, x = (torch.where(valid, self.alignment.restore(y, pose), torch.nan) for y in (*ends, x))
+        return InBetweenResult(x, solution, first, second, *energies)
+
+    def mean_energy(self, x: Tensor, rests: RestShapes) -> Tensor:
+        """Mean of Eq. 5 from two key-frames to shapes, on the fine mesh. *Shape:* ``(B, V, 3) -> (B,)``."""
+        energy, anchors = self.fine.energy, None if rests.anchors is None else rests.anchors.movedim(-1, 0)
+        rows = energy.extend(x.movedim(-1, 0).contiguous(), anchors)
+        each = [energy.against(energy.rest_of(shape.detach()), rests.stiffness) for shape in rests.shapes.unbind(1)]
+        return (energy.value(rows, each[0]) + energy.value(rows, each[1])).detach() / 2
+
+    def minimised(self, base: Tensor, rests: RestShapes, mu: Tensor, usable: Tensor) -> Solution:
+        """Amplitudes of least energy in the modal space. *Shape:* of ``mu`` and ``usable`` ``(B,)``."""
         if self.space is None:
-            return base, unminimised(base, usable)
-        solve = solve_implicit if self.solver.gradient == "implicit" else solve_unrolled
+            return unminimised(base, usable)
+        solve: Any = solve_implicit if self.solver.gradient == "implicit" else solve_unrolled
+        if self.blend is None and solve is solve_implicit:
+            solve = partial(solve_implicit, method=newton)
         placement = self.space.place(base, rests, mu)
         limits = self.solver.max_steps, self.solver.tolerance
         solution = solve(self.space, placement, usable, *limits)
         # Kernels compute in float64, whatever goes in and comes out.
         values = (value.to(base) if value.is_floating_point() else value for value in solution if value is not None)
-        solution = Solution(*values)
-        return self.space.lift(solution.amplitudes, base), solution
+        return Solution(*values)
 
     def finished(self, x: Tensor, solution: Solution, rests: RestShapes) -> tuple[Tensor, Solution]:
         """Shapes and solutions as they are; a solver with contacts goes on from them. *Shape:* ``(B, V, 3)``."""

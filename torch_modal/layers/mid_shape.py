@@ -5,7 +5,7 @@ from typing import Any, Literal
 from torch import Tensor, nn
 
 from torch_modal.inbetween.results import InBetweenResult
-from torch_modal.inbetween.settings import Objective, Preset, Solver, settings, with_space
+from torch_modal.inbetween.settings import Objective, Preset, Solver, settings
 from torch_modal.layers.base import Bases
 from torch_modal.layers.in_between import InBetween
 from torch_modal.modes.basis import ModalBasis
@@ -19,10 +19,11 @@ class MidShape(nn.Module):
         faces: Vertex indices. *Shape:* ``(F, 3)``.
         space: ``"joint"`` (one shape in the sum of both spaces) or ``"paired"`` (Eq. 4 of the paper). Default: the
             objective's.
-        mu: Weight of the similarity of Eq. 4, of no effect in the joint space. Default: the objective's.
-        preset: As for :class:`InBetween`.
+        mu: Weight of the similarity of Eq. 4, in the paired space. Default: the objective's.
+        preset: As for :class:`InBetween`; ``"paper"`` is its method, whole: Eq. 4, local interpolation, the mean.
         objective: What is minimised, in the place of the preset's.
         solver: How it is solved, in the place of the preset's.
+        regions: Segments that local interpolation takes, in the paired space. Default: the solver's.
 
     Raises:
         ValueError: An argument is not usable.
@@ -38,11 +39,12 @@ class MidShape(nn.Module):
         preset: Preset = "accurate",
         objective: Objective | None = None,
         solver: Solver | None = None,
+        regions: int | None = None,
     ) -> None:
         super().__init__()
         if not isinstance(bases, ModalBasis) and len(bases) != 2:
             raise ValueError(f"a mid-shape lies between two bases, got {len(bases)}; pass [basis_a, basis_b]")
-        objective, solver = with_space(settings(preset, objective, solver), space, mu)
+        objective, solver = settings(preset, objective, solver, None, space, mu, regions)
         self.in_between = InBetween(bases, faces, objective=objective, solver=solver)
 
     @property
@@ -51,7 +53,12 @@ class MidShape(nn.Module):
         return self.in_between.core.space
 
     def solve(self, x_a: Tensor, x_b: Tensor) -> InBetweenResult:
-        """The mid-shapes, and how each minimisation went, without a warning. Arguments as for :meth:`forward`."""
+        """The mid-shapes, and how each minimisation went, without a warning. Arguments as for :meth:`forward`.
+
+        In the paired space the result has ``first`` and ``second``, the paper's ``x1*`` and ``x2*``, too, and the
+        energies of the mid-shape and of linear interpolation. There, a shape is what the method gives, whatever its
+        status: nothing replaces it by a better one.
+        """
         return self.in_between.solve(x_a, x_b, 0.5)
 
     def forward(self, x_a: Tensor, x_b: Tensor) -> Tensor:

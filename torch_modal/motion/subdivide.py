@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
@@ -43,6 +44,8 @@ def subdivide(
     objective: Objective | None = None,
     solver: Solver | None = None,
     contact: bool | None = None,
+    mu: float | None = None,
+    regions: int | None = None,
     proxy: int | None = None,
     progress: Progress = None,
 ) -> Tensor:
@@ -75,6 +78,9 @@ def subdivide(
         contact: True to keep parts from passing through each other, in the place of what the objective says
             (docs/contact.md; extra ``contact``). The shapes between two key-frames are pushed apart together, by a
             displacement that is smooth in time.
+        mu: Weight of the similarity of Eq. 4, with ``preset="paper"``. Default: the objective's.
+        regions: Segments that local interpolation takes, likewise: those that the modes of the two key-frames reach
+            worst, in all levels. Default: the solver's.
         proxy: Vertices of a coarser mesh, by the same edge collapses in all key-frames, that moves in the place of the
             mesh and carries its detail (docs/passengers.md). 0: none. Default: 20,000 for meshes of more than 100,000
             vertices whose bases are not given.
@@ -102,7 +108,7 @@ def subdivide(
     carrier = Proxy(keyframes, faces, n_proxy) if n_proxy else None
     if carrier:
         keyframes, faces = check_keyframes(carrier.keyframes, carrier.faces)
-    chosen = settings(preset, objective, solver, contact)
+    chosen = settings(preset, objective, solver, contact, None, mu, regions)
     if smooth is None:
         smooth = n_keys > 2 and chosen.objective.space == "joint"
     if smooth and chosen.objective.space == "paired":
@@ -182,8 +188,9 @@ def _by_recursion(
         layers: dict[tuple[int, int], MidShape] = {}
         for a, b in [(0, 1)] if chosen.objective.space == "joint" else [(0, 1), (0, 0), (1, 1)]:
             own = bases[[ends[a], ends[b]]] if isinstance(bases, Tensor) else [bases[ends[a]], bases[ends[b]]]
-            made = MidShape(own, faces.cpu(), objective=chosen.objective, solver=chosen.solver)
-            layers[a, b] = made.to(keyframes.device)
+            solver = chosen.solver if a < b else replace(chosen.solver, regions=0)
+            layers[a, b] = MidShape(own, faces.cpu(), objective=chosen.objective, solver=solver).to(keyframes.device)
+            layers[a, b].in_between.core.local = layers[0, 1].in_between.core.local  # the originals' regions
         shapes = keyframes[list(ends)]
         for _ in range(levels):
             if chosen.objective.space == "joint":

@@ -28,10 +28,11 @@ class _ArgMin(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        energy: AmplitudeEnergy, limits: tuple[int, float], tree: Any, usable: Tensor, *tensors: Tensor
+        energy: AmplitudeEnergy, limits: tuple[Any, ...], tree: Any, usable: Tensor, *tensors: Tensor
     ) -> tuple[Tensor, ...]:
+        method, max_steps, tolerance = limits
         start = usable.new_zeros(len(usable), energy.n_amplitudes, dtype=tensors[0].dtype)
-        solution = minimise(energy, start, trees.filled(tree, tensors), *limits)
+        solution = method(energy, start, trees.filled(tree, tensors), max_steps, tolerance)
         solution = solution._replace(status=torch.where(usable, solution.status, Status.INVALID))
         return tuple(value for value in solution if value is not None)
 
@@ -106,7 +107,12 @@ def _warn_of_singular(singular: Tensor) -> None:
 
 
 def solve_implicit(
-    energy: AmplitudeEnergy, placement: Any, usable: Tensor, max_steps: int, tolerance: float
+    energy: AmplitudeEnergy,
+    placement: Any,
+    usable: Tensor,
+    max_steps: int,
+    tolerance: float,
+    method: Callable[..., Solution] = minimise,
 ) -> Solution:
     """Minimise from zeros; gradients of the amplitudes by the implicit function theorem.
 
@@ -116,8 +122,9 @@ def solve_implicit(
         usable: False for samples whose status is ``INVALID`` whatever comes out. *Shape:* ``(B,)``.
         max_steps: Of :func:`~torch_modal.solve.minimise.minimise`.
         tolerance: Likewise.
+        method: Minimises, with the arguments of :func:`~torch_modal.solve.minimise.minimise`.
     """
-    given = energy, (max_steps, tolerance), trees.skeleton(placement), usable, *trees.leaves(placement)
+    given = energy, (method, max_steps, tolerance), trees.skeleton(placement), usable, *trees.leaves(placement)
     return Solution(*applied(_ArgMin, *given))
 
 

@@ -121,6 +121,7 @@ def relax(
     n_products: int,
     anchors: Tensor | None = None,
     beside: Sequence[FurtherEnergy] = (),
+    free: Tensor | None = None,
 ) -> Tensor:
     """Steps of a truncated Newton method on all vertices, shortened where the energy would rise.
 
@@ -136,6 +137,7 @@ def relax(
         n_products: Iterations of conjugate gradients in each.
         anchors: Of the energy's terms, where there are some. *Shape:* ``(B, P, 3)``.
         beside: Further energies.
+        free: False where a vertex stays. *Shape:* ``(V,)``, bool.
 
     Returns:
         *Shape:* ``(B, V, 3)``.
@@ -146,7 +148,8 @@ def relax(
         extended = energy.extend(rows, fixed)
         at, more = energy.linearise(extended, reference), [one.at(rows.movedim(0, -1).contiguous()) for one in beside]
         right = -sum((one.gradient.movedim(-1, 0) for one in more), start=energy.fold(energy.gradient(at)))
-        direction = _solved(energy, ConvexHessian(energy, at), right, n_products, more)
+        right = right if free is None else free * right
+        direction = _solved(energy, ConvexHessian(energy, at), right, n_products, more, free)
         reached = rows + direction
         there = reached.movedim(0, -1).contiguous()
         before = sum((one.value for one in more), start=energy.value_at(at, reference))
@@ -180,7 +183,12 @@ def step_length(before: Tensor, slope: Tensor, after: Tensor, largest: Tensor) -
 
 
 def _solved(
-    energy: Energy, hessian: ConvexHessian, right: Tensor, n_products: int, more: Sequence[FurtherDerivatives]
+    energy: Energy,
+    hessian: ConvexHessian,
+    right: Tensor,
+    n_products: int,
+    more: Sequence[FurtherDerivatives],
+    free: Tensor | None,
 ) -> Tensor:
     """An approximate solution. *Shape:* ``(3, B, V)``."""
     blocks = hessian.diagonal()[..., : right.shape[-1]]
@@ -190,6 +198,7 @@ def _solved(
 
     def product(field: Tensor) -> Tensor:
         own = energy.fold(hessian(energy.extend(field)))
+        own = own if free is None else free * own
         return sum((one.product(field.movedim(0, -1).contiguous()).movedim(-1, 0) for one in more), start=own)
 
     def precondition(residual: Tensor) -> Tensor:
