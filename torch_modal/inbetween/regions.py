@@ -26,7 +26,6 @@ from torch_modal.energy.energy import Energy, Rest, RestShapes
 from torch_modal.energy.shell import N_SHELL_TERMS
 from torch_modal.energy.term import Mesh
 from torch_modal.geometry.canonical import CANONICAL_SIZE
-from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.inbetween.coarse import stretching
 from torch_modal.inbetween.paired import PairedSpace
 
@@ -79,7 +78,7 @@ def segments(space: PairedSpace, references: Tensor, n_segments: int = N_SEGMENT
         The segment of each coarse vertex. *Shape:* ``(V_coarse,)``.
     """
     coarse = space.first.coarse
-    area, mesh = coarse.weights.numpy(), Mesh.of(coarse.faces, coarse.n_vertices)
+    area, mesh = coarse.weights.numpy(), coarse.mesh
     sums = []
     for end, x in zip((space.first, space.second), coarse.restrict(references), strict=True):
         stiffness = stretching(mesh, x, end.basis.coarse)
@@ -102,7 +101,7 @@ def segments(space: PairedSpace, references: Tensor, n_segments: int = N_SEGMENT
         a, b, c = (p + q for p, q in zip(parts[i], parts[j], strict=True))
         heapq.heappush(queue, (deformation(a, b, c) - own[i] - own[j], i, j))
 
-    for i, j in Connectivity(coarse.faces.numpy()).edges.tolist():
+    for i, j in mesh.connectivity.edges.tolist():
         near[i].add(j)
         near[j].add(i)
         offer(i, j)

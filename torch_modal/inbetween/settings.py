@@ -157,8 +157,8 @@ def settings(
     chosen = PRESETS[preset]
     changes = {"contact": contact, "space": space, "mu": mu}
     changes = {name: value for name, value in changes.items() if value is not None}
-    objective = replace(objective or chosen.objective, **changes)  # type: ignore[arg-type]
-    solver = solver or chosen.solver
+    objective, solver = objective or chosen.objective, solver or chosen.solver
+    objective = replace(objective, **changes) if changes else objective  # type: ignore[arg-type]
     solver = solver if regions is None else replace(solver, regions=regions)
     if objective.space == "joint" and (mu is not None or solver.regions):
         what = "mu weighs the similarity" if mu is not None else f"regions={solver.regions} are interpolated"
