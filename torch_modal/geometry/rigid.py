@@ -75,8 +75,8 @@ def best_rotation(covariance: Tensor) -> Tensor:
     known = covariance.detach()
     u, _, vh = torch.linalg.svd(known.nan_to_num(0, 0, 0))  # raises on a NaN anywhere in a batch
     rotation = u @ vh
-    excess = torch.linalg.det(rotation)[..., None, None] - 1
-    rotation = rotation + excess * u[..., 2:] @ vh[..., 2:, :] + (0 * known).sum((-2, -1), keepdim=True)
+    beyond = torch.linalg.det(rotation)[..., None, None] - 1
+    rotation = rotation + beyond * u[..., 2:] @ vh[..., 2:, :] + (0 * known).sum((-2, -1), keepdim=True)
     if not torch.is_grad_enabled() and (traced(covariance) or not transformed(covariance)):
         return rotation
     eye = torch.eye(3, dtype=covariance.dtype, device=covariance.device)
