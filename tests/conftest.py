@@ -163,7 +163,7 @@ def placement_of(core: InBetweenSolver, keyframes: torch.Tensor, weights: torch.
         linear: True for the weighted sum of the key-frames in the place of their blend by local rotations.
     """
     shapes, _, _ = core.alignment(keyframes, weights)
-    stiffness = [torch.full_like(weights[:, :1], float(term.stiffness)) for term in core.fine.terms]
+    stiffness = [torch.full_like(weights[:, :1], float(part.term.stiffness)) for part in core.fine.energy.parts]
     base = (weights[..., None, None] * shapes).sum(1)
     if core.blend is not None and not linear:
         base = core.blend(shapes, weights, base)

@@ -159,6 +159,9 @@ def made_outside(make: Callable[..., Made], *seen: Tensor) -> Made:
     if torch.compiler.is_exporting():  # without the modes that would record it
         with _disable_current_modes(), torch._C.DisableTorchFunction():
             return lasting(make)(*seen)
+    plain = torch._C._functorch.peek_interpreter_stack() is None and forward_ad._current_level < 0
+    if plain and not torch.compiler.is_compiling():
+        return lasting(make)(*seen)
     found: list[Made] = []
     apply = torch.compiler.disable(_Outside.apply) if torch.compiler.is_compiling() else _Outside.apply
     apply(lambda *given: found.append(make(*given)), torch.empty(0), *seen)

@@ -5,7 +5,6 @@ import subprocess
 import sys
 import warnings
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +37,10 @@ from torch_modal.energy.term import Mesh
 from torch_modal.energy.volume import Volume
 from torch_modal.errors import MissingPackageError
 from torch_modal.geometry.canonical import CANONICAL_SIZE
+from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.local_rotations import LocalRotations, Trajectory
+from torch_modal.geometry.poisson import Poisson
+from torch_modal.geometry.triangle_frames import frames_of
 from torch_modal.inbetween.settings import PRESETS
 from torch_modal.motion.cubics import cubics
 
@@ -244,11 +246,13 @@ class TestModal:
             torch.testing.assert_close(found, wanted, rtol=1e-11, atol=1e-9)
 
 
-def turned(rotations: LocalRotations) -> Any:
-    """Edge vectors of pairs at times."""
+def turned(rotations: WarpRotations, kind: type[LocalRotations] = WarpRotations) -> Any:
+    """Pulls of the edge vectors of pairs at times, with stiffnesses of their own."""
+    mesh = Connectivity(rotations.faces.numpy())
+    poisson = Poisson(mesh, torch.linspace(1, 2, len(mesh.edges), dtype=DOUBLE))
 
     def run(first: Tensor, second: Tensor, t: Tensor) -> Tensor:
-        return rotations(torch.stack([first, second], 1), torch.stack([1 - t, t], -1))
+        return kind.pulls(rotations, torch.stack([first, second], 1), torch.stack([1 - t, t], -1), poisson)
 
     return run
 
@@ -262,7 +266,7 @@ class TestRotations:
     @staticmethod
     def oracle(rotations: WarpRotations) -> Any:
         """The same by torch."""
-        return turned(partial(LocalRotations.forward, rotations))  # type: ignore[arg-type]
+        return turned(rotations, LocalRotations)
 
     def test_between_two(self, rotations: WarpRotations, small_bars: Shapes) -> None:
         x = small_bars.keyframes
@@ -281,7 +285,7 @@ class TestRotations:
         which, t = torch.zeros(3, dtype=torch.int64), torch.tensor([0.0, 0.3, 0.8], dtype=DOUBLE)
 
         def by(kind: type, first: Tensor, second: Tensor, t: Tensor) -> Tensor:
-            before, own, after = (rotations.frames(shape) for shape in (x[2:3], first, second))
+            before, own, after = (frames_of(shape, rotations.faces) for shape in (x[2:3], first, second))
             found = cubics(torch.stack([rotations.step(before, own), rotations.step(own, after)]), t.new_ones(2), False)
             size = torch.stack(own[3:])
             trajectory = Trajectory(own.e1, own.e2, own.normal, size, *(part[1] for part in found))

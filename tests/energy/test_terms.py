@@ -1,6 +1,7 @@
 """Terms of an energy: those of Eq. 5 by ``torch.func``, and terms of one's own all the way through the layers."""
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -144,12 +145,21 @@ def test_exception_stiffness(shape: tuple[int, ...], bars: Shapes) -> None:
         layer(*bars.keyframes[1:], 0.5)
 
 
-def test_exception_elements(bars: Shapes) -> None:
+@pytest.mark.parametrize(
+    ("made", "message"),
+    [
+        (lambda x: x[:, 0], r"gave \(324,\)"),
+        (lambda x: x - 1, "vertices from -1"),
+        (lambda x: x + 2, "vertices from 2"),
+    ],
+    ids=["no rows", "below zero", "beyond the centre"],
+)
+def test_exception_elements(made: Callable[[Tensor], Tensor], message: str, bars: Shapes) -> None:
     class Wrong(Area):
         def elements(self, mesh: Mesh) -> Tensor:
-            return mesh.faces[:, 0]
+            return made(mesh.faces)
 
-    with pytest.raises(ValueError, match=r"Wrong.elements gave \(324,\)"):
+    with pytest.raises(ValueError, match=f"Wrong.elements .*{message}"):
         tm.InBetween(bars.bases[1:], bars.faces, objective=tm.Objective(terms=(Wrong(),)))
     with pytest.raises(ValueError, match="terms holds a type"):
         tm.Objective(terms=(Area,))  # type: ignore[arg-type]

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from sheets import cylinder, folded, rectangle
 
 import torch_modal as tm
-from torch_modal.geometry.canonical import ROUNDING, ordered_faces, placed, size
+from torch_modal.geometry.canonical import ROUNDING, in_order, placed, size
 from torch_modal.geometry.decimation import decimate
 from torch_modal.registration.load import load_keyframes
 
@@ -71,14 +71,15 @@ def test_axes_of_symmetric_shapes_are_the_callers() -> None:
 
 def test_order_of_faces_follows_from_the_points(hand: Mesh) -> None:
     points, faces = placed(hand[0][0], hand[1])[0], hand[1]
-    expected = ordered_faces(points, faces)
-    assert {tuple(np.roll(f, -f.argmin())) for f in faces} == {tuple(np.roll(f, -f.argmin())) for f in expected}
+    order, expected = in_order(points, faces)
+    found = {tuple(np.roll(f, -f.argmin())) for f in order[expected]}
+    assert {tuple(np.roll(f, -f.argmin())) for f in faces} == found
     random = np.random.default_rng(1)
     rolled = np.stack([np.roll(face, random.integers(3)) for face in random.permutation(faces)])
-    np.testing.assert_array_equal(ordered_faces(points, rolled), expected)
-    order = random.permutation(len(points))
-    back = np.argsort(order)
-    np.testing.assert_array_equal(order[ordered_faces(points[order], back[faces])], expected)
+    np.testing.assert_array_equal(in_order(points, rolled)[1], expected)
+    shuffle = random.permutation(len(points))
+    own, shuffled_faces = in_order(points[shuffle], np.argsort(shuffle)[faces])
+    np.testing.assert_array_equal(shuffle[own[shuffled_faces]], order[expected])
 
 
 def test_collapses_do_not_depend_on_axes_and_order(hand: Mesh) -> None:

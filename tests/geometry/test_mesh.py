@@ -76,9 +76,9 @@ def test_what_is_shared_cannot_be_written_to() -> None:
         mesh.edges[0] = 7
     faces[0] = 9
     assert mesh.faces.tolist() == TETRAHEDRON.tolist()
-    copy = pickle.loads(pickle.dumps(mesh))
-    assert vars(copy).keys() == {"faces", "n_vertices"}  # what follows from the faces is not pickled
-    np.testing.assert_array_equal(copy.hinges, mesh.hinges)
+    pickled = pickle.dumps(mesh)
+    assert len(pickled) < 500  # what follows from the faces is not pickled
+    np.testing.assert_array_equal(pickle.loads(pickled).hinges, mesh.hinges)
 
 
 @pytest.mark.parametrize(("faces", "n_hinges"), [(SQUARE, 1), (TETRAHEDRON, 6), (FINS, 0)])

@@ -15,6 +15,7 @@ from torch_modal.backends.warp.rotations import WarpRotations
 from torch_modal.data.samples import load_sample
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.local_rotations import LocalRotations
+from torch_modal.geometry.poisson import Poisson
 from torch_modal.geometry.rigid import best_rotation
 from torch_modal.geometry.rotations import exp
 from torch_modal.inbetween.blend import RotationBlend
@@ -142,9 +143,10 @@ def test_triangles_without_area_are_survived(kind: type[LocalRotations], dtype: 
     x_a[3], x_b[5] = x_a[4], 0.5 * (x_b[4] + x_b[6])
     x_a[:2], x_a[14] = x_a[2], x_a[2]  # one triangle is a point
     x_a, x_b = x_a.to(dtype), x_b.to(dtype)
-    rotations = kind(Connectivity(faces.numpy()), torch.stack([x_a, x_b]))
+    mesh = Connectivity(faces.numpy())
+    rotations = kind(mesh, torch.stack([x_a, x_b]))
     given = [x.requires_grad_() for x in (x_a[None], x_b[None], torch.tensor([0.5], dtype=dtype))]
-    found = rotations(*pair(*given))
+    found = rotations.pulls(*pair(*given), Poisson(mesh, torch.ones(len(mesh.edges), dtype=dtype)))
     assert found.isfinite().all()
     for gradient in torch.autograd.grad(found.square().sum(), given):
         assert gradient.isfinite().all()

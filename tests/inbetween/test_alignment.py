@@ -5,6 +5,7 @@ import torch
 from conftest import Shapes, random_rotation
 from torch import Tensor
 
+from torch_modal.energy.term import Mesh
 from torch_modal.geometry.canonical import CANONICAL_SIZE, size
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.inbetween.alignment import KeyframeAlignment
@@ -15,8 +16,9 @@ DOUBLE = torch.float64
 
 
 def frame_of(shapes: Tensor, faces: Tensor) -> tuple[KeyframeAlignment, CoarseMesh]:
-    alignment = KeyframeAlignment(shapes, Connectivity(faces.numpy()))
-    return alignment, CoarseMesh(alignment.references, faces, 200, alignment.weights, [])
+    mesh = Mesh(Connectivity(faces.numpy()))
+    alignment = KeyframeAlignment(shapes, mesh.connectivity)
+    return alignment, CoarseMesh(alignment.references, mesh, 200, alignment.weights, [])
 
 
 @pytest.fixture(scope="module")

@@ -23,7 +23,7 @@ class Setting:
         core = layer.in_between.core
         self.energy, self.ends = core.space, [core.space.first.basis, core.space.second.basis]
         self.coarse = core.space.first.coarse
-        self.shell = ShellEnergy(self.coarse.faces)
+        self.shell = ShellEnergy(self.coarse.mesh.faces)
         pairs, half = torch.stack([bars.keyframes[:2], bars.keyframes[1:3]]), torch.full((2, 2), 0.5).double()
         self.shapes = core.alignment(pairs, half)[0].unbind(1)
         self.placement = placement_of(core, pairs, half)._replace(mu=torch.full((2,), MU, dtype=torch.float64))

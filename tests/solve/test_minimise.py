@@ -111,7 +111,7 @@ def test_agrees_with_scipy(ends: tuple[int, int], small_bars: Shapes, monkeypatc
     placement = placement_of(core, bars.keyframes[None], half, linear=True)
     a, coarse = torch.zeros(1, energy.n_amplitudes, dtype=torch.float64), layer.space.coarse
     rests = [coarse.restrict(x) for x in core.alignment(bars.keyframes[None], half)[0].unbind(1)]
-    shell = ShellEnergy(coarse.faces)
+    shell = ShellEnergy(coarse.mesh.faces)
 
     def towards(x: Tensor, rest: Tensor) -> Tensor:
         """Residuals of Eq. 5, with the periodic function of angles in the place of the square."""

@@ -5,6 +5,7 @@ import dataclasses
 import pytest
 import torch
 from conftest import Shapes
+from shapes import edge_lengths
 
 import torch_modal as tm
 from torch_modal.data.samples import load_sample
@@ -87,8 +88,7 @@ class TestComponents:
         bases = tm.extract_bases(sample.keyframes, sample.faces, 8, progress=False)
         components = tm.ShapeSpace(bases, sample.faces).components(1)
         middle = components.shapes(components.coordinates(sample.keyframes).mean(0, keepdim=True))[0]
-        i, j = torch.tensor(tm.geometry.connectivity.Connectivity(sample.faces.numpy()).edges).unbind(1)
-        lengths = [(x[i] - x[j]).norm(dim=-1) for x in (*sample.keyframes, middle, sample.keyframes.mean(0))]
+        lengths = [edge_lengths(x, sample.faces) for x in (*sample.keyframes, middle, sample.keyframes.mean(0))]
         wanted = 0.5 * (lengths[0] + lengths[1])
         bent, straight = (float((one - wanted).abs().mean()) for one in lengths[2:])
         assert bent < 0.3 * straight

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -66,12 +67,9 @@ def run(args: argparse.Namespace) -> None:
         keyframes, faces, cyclic = sample.keyframes, sample.faces, sample.cyclic
         report(f"{name}: {len(keyframes)} key-frames of {keyframes.shape[1]} vertices")
         started = time.perf_counter()
-        bases = tm.extract_bases(keyframes, faces, **mode_options(args))
-        extracted = time.perf_counter()
-        kept = "" if args.no_cache else ", kept in the cache"
-        report(f"  {args.modes} modes of each: {extracted - started:.1f} s{kept}")
+        bases = partial(tm.extract_bases, **mode_options(args))
         frames = tm.subdivide(keyframes, faces, args.levels, bases=bases, cyclic=cyclic, progress=progress)
-        report(f"  {len(frames) - len(keyframes)} shapes in between: {time.perf_counter() - extracted:.1f} s")
+        report(f"  {len(frames) - len(keyframes)} shapes in between: {time.perf_counter() - started:.1f} s")
         places = tm.keyframe_places(len(keyframes), args.levels, cyclic=cyclic)
         tm.save_animation(
             frames,

@@ -1,7 +1,6 @@
 """Dihedral angles, the second term of Eq. 5."""
 
 from functools import reduce
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -142,14 +141,11 @@ def dihedral_hessian(edge_vectors: Tensor) -> Tensor:
 
 def fullness(edge_vectors: Tensor) -> Tensor:
     """0 to 1 by how far both triangles of a hinge are from needles. *Shape:* ``(3, 3, ..., H) -> (..., H)``."""
-    e, a, b = edge_vectors
-    found: Any = 1.0
-    for side in (a, b):
-        sides, normal = (e, side, side - e), cross(e, side)
-        longest = reduce(torch.maximum, [(x * x).sum(0) for x in sides])
-        squared = (normal * normal).sum(0)
-        found = found * squared * inverse(squared + (NEEDLE * longest).square(), longest <= 0)
-    return found  # type: ignore[no-any-return]
+    e, both = edge_vectors[0].unsqueeze(1), edge_vectors[1:].transpose(0, 1)  # (3, 1, ..., H), (3, 2, ..., H)
+    normal = cross(e.expand_as(both), both)
+    longest = reduce(torch.maximum, [(x * x).sum(0) for x in (e, both, both - e)])
+    squared = (normal * normal).sum(0)
+    return (squared * inverse(squared + (NEEDLE * longest).square(), longest <= 0)).prod(0)
 
 
 def collapsed(edge: Tensor, normal: Tensor) -> Tensor:

@@ -5,7 +5,6 @@ the mesh: its centre, and the anchors of the terms.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import torch
@@ -69,28 +68,16 @@ class OnMesh(nn.Module):
 
     Args:
         term: The term. It is not registered here: terms serve several meshes, and belong to who made them.
-        mesh: The mesh.
-        numbers: New numbers of the vertices, where not all are there; -1 for those that are not. *Shape:* ``(V,)``.
+        elements: Numbers of the vertices of each element. *Shape:* ``(M, n)``.
     """
 
+    term: Term
     corners: Tensor
 
-    def __init__(self, term: Term, mesh: Mesh, numbers: Tensor | None = None) -> None:
+    def __init__(self, term: Term, elements: Tensor) -> None:
         super().__init__()
-        self._term = (term,)
-        elements = term.elements(mesh)
-        if elements.dim() != 2 or elements.shape[1] < 2 or elements.is_floating_point():
-            raise ValueError(
-                f"{type(term).__name__}.elements gave {tuple(elements.shape)} of {elements.dtype}; they are rows of "
-                "two vertex indices or more, (M, n)"
-            )
-        elements = elements if numbers is None else numbers[elements]
+        self.__dict__["term"] = term
         self.register_buffer("corners", elements.T.contiguous(), persistent=False)
-
-    @property
-    def term(self) -> Term:
-        """The term."""
-        return self._term[0]
 
     def edge_vectors(self, rows: Tensor) -> Tensor:
         """Vectors from the first vertex of each element to the others. *Shape:* ``(3, ..., V) -> (n-1, 3, ..., M)``."""
@@ -128,26 +115,39 @@ class Energy(nn.Module):
 
     def __init__(self, mesh: Mesh, terms: Sequence[Term], sampled: bool = False) -> None:
         super().__init__()
-        for term in terms:
+        n, elements = mesh.n_vertices, []
+        n_anchors = [0 if term.anchors is None else len(term.anchors) for term in terms]
+        for term, more in zip(terms, n_anchors, strict=True):
             _outlasting_buffers(term)
-        n, n_anchors, meshes = mesh.n_vertices, 0, []
-        for term in terms:
-            meshes.append(replace(mesh, n_anchors=n_anchors))
-            n_anchors += 0 if term.anchors is None else len(term.anchors)
-        vertices, numbers = torch.arange(n), None
+            own, last = term.elements(mesh), n + more
+            if own.dim() != 2 or own.shape[1] < 2 or own.is_floating_point():
+                raise ValueError(
+                    f"{type(term).__name__}.elements gave {tuple(own.shape)} of {own.dtype}; they are rows of two "
+                    "vertex indices or more, (M, n)"
+                )
+            if own.numel() and not 0 <= int(own.min()) <= int(own.max()) <= last:
+                raise ValueError(
+                    f"{type(term).__name__}.elements gave vertices from {int(own.min())} to {int(own.max())}; they are "
+                    f"0 to {last}: those of the mesh, its centre, and the anchors of the term"
+                )
+            elements.append(own)
+        vertices = torch.arange(n)
         if sampled:
-            elements = [term.elements(own).flatten() for term, own in zip(terms, meshes, strict=True)]
-            vertices = torch.cat(elements).unique()
+            vertices = torch.cat([own.flatten() for own in elements]).unique()
             vertices = vertices[vertices < n]
-            numbers = torch.full((n + 1 + n_anchors,), -1).index_copy(0, vertices, torch.arange(len(vertices)))
-            numbers[n + 1 :] = len(vertices) + 1 + torch.arange(n_anchors)
-        parts = [OnMesh(term, own, numbers) for term, own in zip(terms, meshes, strict=True)]
+        self.n_vertices = len(vertices)
+        # The numbers that the mesh's vertices and its centre have here; each term's anchors follow those before.
+        numbers = torch.full((n + 1,), -1).index_copy(0, vertices, torch.arange(self.n_vertices))
+        numbers[n] = -1 if sampled else n
+        parts, self.n_extended = [], self.n_vertices + 1
+        for term, own, more in zip(terms, elements, n_anchors, strict=True):
+            anchors = torch.arange(self.n_extended, self.n_extended + more)
+            parts.append(OnMesh(term, torch.cat([numbers, anchors])[own]))
+            self.n_extended += more
         self.parts = nn.ModuleList(parts)
         self.sampled = sampled
-        self.n_vertices = len(vertices)
-        self.n_extended = len(vertices) + 1 + n_anchors
         self.register_buffer("vertices", vertices, persistent=False)
-        used = torch.arange(len(vertices)) if sampled else torch.tensor(mesh.connectivity.used)
+        used = torch.arange(self.n_vertices) if sampled else torch.tensor(mesh.connectivity.used)
         self.register_buffer("used", used, persistent=False)
         local = [part.corners.flatten() for part in parts if not part.term.total]
         corners = torch.cat(local) if local else torch.zeros(0, dtype=torch.int64)

@@ -7,7 +7,6 @@ Eq. 5 write theirs out. Angles take a smooth periodic function in the place of t
 """
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -18,52 +17,36 @@ from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.vectors import inverse
 
 
-@dataclass(frozen=True)
 class Mesh:
-    """The vertices that elements may be made of.
+    """The vertices that elements may be made of: those of a mesh, their centre, and the anchors of a term.
+
+    Args:
+        connectivity: Of the faces.
 
     Attributes:
-        connectivity: Of the faces.
-        n_anchors: How many :attr:`Term.anchors` other terms have before those of this one.
+        connectivity: The same.
+        faces: *Shape:* ``(F, 3)``.
+        edges: *Shape:* ``(E, 2)``.
+        hinges: Rows of :class:`torch_modal.geometry.connectivity.Connectivity`. *Shape:* ``(H, 4)``.
+        n_vertices: Number of vertices, V.
+        centre: The number that the mean of all vertices of faces has as a vertex.
+        first_anchor: The number that the first of the :attr:`Term.anchors` has as a vertex.
     """
 
-    connectivity: Connectivity
-    n_anchors: int = 0
+    def __init__(self, connectivity: Connectivity) -> None:
+        self.connectivity = connectivity
+        tables = connectivity.faces, connectivity.edges, connectivity.hinges
+        self.faces, self.edges, self.hinges = (torch.tensor(table) for table in tables)
+        self.n_vertices = self.centre = connectivity.n_vertices
+        self.first_anchor = self.n_vertices + 1
 
-    @property
-    def faces(self) -> Tensor:
-        """*Shape:* ``(F, 3)``."""
-        return torch.tensor(self.connectivity.faces)
-
-    @property
-    def edges(self) -> Tensor:
-        """*Shape:* ``(E, 2)``."""
-        return torch.tensor(self.connectivity.edges)
-
-    @property
-    def hinges(self) -> Tensor:
-        """Rows of :attr:`torch_modal.geometry.connectivity.Connectivity.hinges`. *Shape:* ``(H, 4)``."""
-        return torch.tensor(self.connectivity.hinges)
-
-    @property
-    def n_vertices(self) -> int:
-        """Number of vertices, V."""
-        return self.connectivity.n_vertices
-
-    @property
-    def centre(self) -> int:
-        """The number that the mean of all vertices of faces has as a vertex."""
-        return self.n_vertices
-
-    @property
-    def first_anchor(self) -> int:
-        """The number that the first of the term's own :attr:`Term.anchors` has as a vertex."""
-        return self.n_vertices + 1 + self.n_anchors
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Mesh, (self.connectivity,)
 
     @classmethod
     def of(cls, faces: Tensor, n_vertices: int) -> "Mesh":
         """The mesh of these faces."""
-        return cls(Connectivity(faces.detach().cpu().long().numpy().copy(), n_vertices))
+        return cls(Connectivity(faces.detach().cpu().numpy(), n_vertices))
 
 
 class Term(nn.Module):

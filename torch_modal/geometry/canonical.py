@@ -32,11 +32,6 @@ def size(points: FloatArray, faces: IntArray) -> float:
     return _moments(points, faces)[2]
 
 
-def canonical_scale(shapes: FloatArray, faces: IntArray) -> float:
-    """Factor that brings the mean size of shapes to :data:`CANONICAL_SIZE`. *Shape:* ``(K, V, 3), (F, 3)``."""
-    return CANONICAL_SIZE / float(np.mean([size(x, faces) for x in shapes]))
-
-
 def placed(points: FloatArray, faces: IntArray) -> tuple[FloatArray, FloatArray, FloatArray, float]:
     """A shape in its principal axes, centred, with a size of 100.
 
@@ -53,7 +48,8 @@ def placed(points: FloatArray, faces: IntArray) -> tuple[FloatArray, FloatArray,
     """
     second, centre, length, arms, areas = _moments(points, faces)
     axes = _principal_axes(second)
-    skewness = areas @ (arms @ axes.T) ** 3
+    along = axes @ arms
+    skewness = (along * along * along) @ areas
     is_skewed = np.abs(skewness) > ALIKE * max(float(np.trace(second)), 0.0) ** 1.5
     axes = axes * np.where(np.where(is_skewed, skewness, axes @ GENERIC) < 0, -1.0, 1.0)[:, None]
     # The axis of least skewness completes a right-handed frame: mirrored shapes stay different.
@@ -64,47 +60,48 @@ def placed(points: FloatArray, faces: IntArray) -> tuple[FloatArray, FloatArray,
     return np.round(turned / ROUNDING) * ROUNDING, axes, centre, scale
 
 
-def vertex_order(points: FloatArray) -> IntArray:
-    """Order of points by position; stable for equal ones. *Shape:* ``(V, 3) -> (V,)``."""
+def in_order(points: FloatArray, faces: IntArray) -> tuple[IntArray, IntArray]:
+    """A mesh in an order that follows from the positions, stable for equal points. *Shape:* ``(V, 3), (F, 3)``.
+
+    Returns:
+        The points in order, *shape* ``(V,)``; the faces, in terms of these, by their vertices from the first one on,
+        *shape* ``(F, 3)``.
+    """
     # By coordinate: a matrix product may round equal rows differently.
     key = points[:, 0] * GENERIC[0] + points[:, 1] * GENERIC[1] + points[:, 2] * GENERIC[2]
-    return np.argsort(key, kind="stable")
-
-
-def ordered_faces(points: FloatArray, faces: IntArray) -> IntArray:
-    """Faces in an order, and with a first corner, by position of the points. *Shape:* ``(F, 3)``."""
-    order = vertex_order(points)
+    order = np.argsort(key, kind="stable")
     rank = np.empty_like(order)
     rank[order] = np.arange(len(order))
-    ranks = rank[faces]
-    first = ranks.argmin(axis=1)[:, None]
-    ranks = np.take_along_axis(ranks, (first + np.arange(3)) % 3, axis=1)
-    return order[ranks[np.lexsort(ranks.T[::-1])]]
+    a, b, c = rank[faces].T
+    b_first, c_first = (b < a) & (b < c), (c < a) & (c < b)
+    corners = [np.where(b_first, y, np.where(c_first, z, x)) for x, y, z in ((a, b, c), (b, c, a), (c, a, b))]
+    ranks = np.stack(corners, axis=1)
+    return order, ranks[np.lexsort(corners[::-1])]
 
 
 def _moments(points: FloatArray, faces: IntArray) -> tuple[FloatArray, FloatArray, float, FloatArray, FloatArray]:
-    """Second moments over the surface, centroid, size, centroids of faces and their fractions of the area.
+    """Second moments over the surface, centroid, size, and of the faces centroids, *shape* ``(3, F)``, and areas.
 
-    The first and the last two are in units of the bounding box, against overflow of squares.
+    The first and the last two are in units of the bounding box, against overflow of squares; areas add up to one.
     """
-    corners = points[faces]
-    flat = corners.reshape(-1, 3)
-    low, high = flat.min(axis=0), flat.max(axis=0)
+    corners = np.array([[row[corner] for row in points.T] for corner in faces.T])  # rows are long: ten times as fast
+    low, high = corners.min(axis=(0, 2)), corners.max(axis=(0, 2))
     longest = float((high - low).max())
     unit = longest if longest > 0 else 1.0
-    corners = (corners - (low + high) / 2) / unit
-    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    middle = (low + high) / 2
+    corners = (corners - middle[:, None]) / unit
+    (ux, uy, uz), (vx, vy, vz) = corners[1] - corners[0], corners[2] - corners[0]
+    areas = np.sqrt((uy * vz - uz * vy) ** 2 + (uz * vx - ux * vz) ** 2 + (ux * vy - uy * vx) ** 2)
     if not areas.sum() > 0:
         length = unit * float(np.linalg.norm((high - low) / unit)) if longest > 0 else 1.0
-        return np.zeros((3, 3)), (low + high) / 2, length, corners.mean(axis=1), areas
+        return np.zeros((3, 3)), middle, length, corners.mean(axis=0), areas
     areas = areas / areas.sum()
-    centre = areas @ corners.mean(axis=1)
-    corners = corners - centre
-    arms = corners.mean(axis=1)
-    second = 9 * np.einsum("f,fi,fj->ij", areas, arms, arms) + np.einsum("f,fci,fcj->ij", areas, corners, corners)
-    second = second / 12
+    centre = corners.mean(axis=0) @ areas
+    corners = corners - centre[:, None]
+    arms = corners.mean(axis=0)
+    second = (9 * (areas * arms) @ arms.T + sum((areas * corner) @ corner.T for corner in corners)) / 12
     length = unit * float(np.sqrt(12 * np.trace(second)))
-    return second, (low + high) / 2 + unit * centre, length, arms, areas
+    return second, middle + unit * centre, length, arms, areas
 
 
 def _principal_axes(second: FloatArray) -> FloatArray:

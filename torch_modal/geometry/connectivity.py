@@ -4,7 +4,6 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 from scipy.spatial import cKDTree
@@ -16,49 +15,46 @@ SEAM_WIDTH = 1e-7
 
 
 class Connectivity:
-    """Connectivity of a triangle mesh, computed lazily from one sort of the half-edges, called sides here.
-
-    The arrays are shared and read-only; ``torch.tensor(...)`` makes a writable copy.
+    """Edges, hinges and neighbours of a triangle mesh, from one sort of its half-edges, called sides here.
 
     Side ``c F + f`` runs from corner ``c`` of face ``f`` to the next, so arrays of all ``3F`` sides are three
-    concatenated arrays of ``F``.
+    concatenated arrays of ``F``. All arrays are shared and read-only; ``torch.tensor(...)`` makes a writable copy.
 
     Args:
         faces: Vertex indices. *Shape:* ``(F, 3)``.
         n_vertices: Number of vertices, V; by default the largest index plus one.
+
+    Attributes:
+        faces: A copy. *Shape:* ``(F, 3)``.
+        n_vertices: V.
+        used: Referenced vertices, ascending. *Shape:* ``(·,)``.
+        start: The vertex at which each side starts. *Shape:* ``(3F,)``.
+        end: The vertex at which it ends. *Shape:* ``(3F,)``.
+        opposite: The vertex opposite to it. *Shape:* ``(3F,)``.
+        signs: +1 for a side from the smaller vertex to the larger, otherwise -1. *Shape:* ``(3F,)``.
+        sides: The edge of each side. *Shape:* ``(3F,)``.
+        edges: Each edge once, the smaller vertex first, sorted. *Shape:* ``(E, 2)``.
+        counts: Number of faces at each edge. *Shape:* ``(E,)``.
+        hinge_sides: The two sides of each edge of exactly two faces, in the order of the edges. *Shape:* ``(H, 2)``.
+        hinges: These edges with the two vertices opposite to them. Rows are ``(i, j, k, l)``: the edge ``ij`` and the
+            tips ``k`` and ``l`` of its two triangles. Where the winding is consistent, the triangles are ``(i, j, k)``
+            and ``(j, i, l)``. *Shape:* ``(H, 4)``.
+        boundary_edges: Edges of exactly one face. *Shape:* ``(·, 2)``.
+        boundary_chain: Boundary of the surface as a chain: the sum of all directed edges, with multiplicity. With
+            consistent winding these are the edges of one face, in its direction. *Shape:* ``(·, 2)``.
+        adjacent_sides: Pairs of sides of the same edge; at non-manifold edges each with the next. *Shape:* ``(n, 2)``.
+        face_neighbours: Faces of these, the smaller first. *Shape:* ``(n, 2)``.
     """
 
     def __init__(self, faces: IntArray, n_vertices: int | None = None) -> None:
-        self.faces: IntArray = _shared(np.array(faces, dtype=np.int64).reshape(-1, 3))
+        self.faces: IntArray = np.array(faces, dtype=np.int64).reshape(-1, 3)
         self.n_vertices = int(self.faces.max(initial=-1)) + 1 if n_vertices is None else n_vertices
+        self.used: IntArray = np.flatnonzero(np.bincount(self.faces.reshape(-1), minlength=self.n_vertices))
+        self.start: IntArray = self.faces.T.reshape(-1)
+        self.end: IntArray = self.faces[:, [1, 2, 0]].T.reshape(-1)
+        self.opposite: IntArray = self.faces[:, [2, 0, 1]].T.reshape(-1)
+        self.signs: FloatArray = np.where(self.start < self.end, 1.0, -1.0)
 
-    def __reduce__(self) -> tuple[Any, ...]:
-        """Pickles the faces alone: the rest is faster to compute than to read."""
-        return Connectivity, (self.faces, self.n_vertices)
-
-    @cached_property
-    def start(self) -> IntArray:
-        """The vertex at which each side starts. *Shape:* ``(3F,)``."""
-        return _shared(self.faces.T.reshape(-1))
-
-    @cached_property
-    def end(self) -> IntArray:
-        """The vertex at which each side ends. *Shape:* ``(3F,)``."""
-        return _shared(self.faces[:, [1, 2, 0]].T.reshape(-1))
-
-    @cached_property
-    def opposite(self) -> IntArray:
-        """The vertex opposite to each side. *Shape:* ``(3F,)``."""
-        return _shared(self.faces[:, [2, 0, 1]].T.reshape(-1))
-
-    @cached_property
-    def used(self) -> IntArray:
-        """Referenced vertices, ascending. *Shape:* ``(·,)``."""
-        return _shared(np.flatnonzero(np.bincount(self.faces.reshape(-1), minlength=self.n_vertices)))
-
-    @cached_property
-    def _runs(self) -> tuple[IntArray, IntArray, IntArray]:
-        """Sides sorted by edge, ``(3F,)``; first position and end vertices of each edge, ``(E,)`` and ``(E, 2)``."""
         width = max(self.n_vertices - 1, 0).bit_length()
         key = np.minimum(self.start, self.end) << width | np.maximum(self.start, self.end)
         bits = len(key).bit_length()
@@ -68,86 +64,34 @@ class Connectivity:
         else:
             order = np.argsort(key, kind="stable")
             key = key[order]
-        first = np.flatnonzero(np.diff(key, prepend=-1))
-        return order, first, np.stack([key[first] >> width, key[first] & (1 << width) - 1], axis=1)
+        first = np.flatnonzero(np.diff(key, prepend=-1))  # of the sides of each edge
+        self.edges: IntArray = np.stack([key[first] >> width, key[first] & (1 << width) - 1], axis=1)
+        self.counts: IntArray = np.diff(first, append=len(order))
+        self.sides: IntArray = np.empty(len(order), dtype=np.int64)
+        self.sides[order] = np.repeat(np.arange(len(first)), self.counts)
 
-    @cached_property
-    def edges(self) -> IntArray:
-        """Each edge once, the smaller vertex first, sorted. *Shape:* ``(E, 2)``."""
-        return _shared(self._runs[2])
-
-    @cached_property
-    def counts(self) -> IntArray:
-        """Number of faces at each edge. *Shape:* ``(E,)``."""
-        order, first, _ = self._runs
-        return _shared(np.diff(first, append=len(order)))
-
-    @cached_property
-    def sides(self) -> IntArray:
-        """Edge of each side. *Shape:* ``(3F,)``."""
-        sides = np.empty(3 * len(self.faces), dtype=np.int64)
-        sides[self._runs[0]] = np.repeat(np.arange(len(self.counts)), self.counts)
-        return _shared(sides)
-
-    @cached_property
-    def signs(self) -> FloatArray:
-        """+1 for a side from the smaller vertex to the larger, otherwise -1. *Shape:* ``(3F,)``."""
-        return _shared(np.where(self.start < self.end, 1.0, -1.0))
-
-    @cached_property
-    def hinge_sides(self) -> IntArray:
-        """The two sides of each interior edge, in the order of the edges. *Shape:* ``(H, 2)``."""
-        order, first, _ = self._runs
-        one = first[self.counts == 2]
-        return _shared(np.stack([order[one], order[one + 1]], axis=1))
-
-    @cached_property
-    def hinges(self) -> IntArray:
-        """Edges of exactly two faces with the two vertices opposite to them. *Shape:* ``(H, 4)``.
-
-        Rows are ``(i, j, k, l)``: the edge ``ij`` and the opposite vertices ``k`` and ``l`` of its two triangles. Where
-        the winding is consistent, the triangles are ``(i, j, k)`` and ``(j, i, l)``.
-        """
-        first, second = self.hinge_sides.T
-        ends = self.start[first], self.end[first]
-        return _shared(np.stack([*ends, self.opposite[first], self.opposite[second]], axis=1))
-
-    @cached_property
-    def adjacent_sides(self) -> IntArray:
-        """Pairs of sides of the same edge; at non-manifold edges each with the next. *Shape:* ``(n, 2)``."""
-        order = self._runs[0]
-        same = np.diff(self.sides[order]) == 0
-        return _shared(np.stack([order[:-1][same], order[1:][same]], axis=1))
-
-    @cached_property
-    def face_neighbours(self) -> IntArray:
-        """Faces of the :attr:`adjacent_sides`, the smaller first. *Shape:* ``(n, 2)``."""
-        return _shared(np.sort(self.adjacent_sides % len(self.faces), axis=1))
-
-    @cached_property
-    def boundary_edges(self) -> IntArray:
-        """Edges of exactly one face. *Shape:* ``(·, 2)``."""
-        return _shared(self.edges[self.counts == 1])
-
-    @cached_property
-    def boundary_chain(self) -> IntArray:
-        """Boundary of the surface as a chain: the sum of all directed edges, with multiplicity. *Shape:* ``(·, 2)``.
-
-        With consistent winding these are the edges of one face, in its direction.
-        """
+        one, two = pair = np.stack([order[first[self.counts == 2] + i] for i in (0, 1)])
+        self.hinge_sides: IntArray = pair.T
+        self.hinges: IntArray = np.stack([self.start[one], self.end[one], self.opposite[one], self.opposite[two]], 1)
+        self.boundary_edges: IntArray = self.edges[self.counts == 1]
         net = np.bincount(self.sides, self.signs, minlength=len(self.edges)).astype(np.int64)
         oriented = np.where((net > 0)[:, None], self.edges, self.edges[:, ::-1])
-        return _shared(np.repeat(oriented, np.abs(net), axis=0))
+        self.boundary_chain: IntArray = np.repeat(oriented, np.abs(net), axis=0)
+        same = np.flatnonzero(np.diff(key) == 0)
+        self.adjacent_sides: IntArray = np.stack([order[same], order[same + 1]], axis=1)
+        self.face_neighbours: IntArray = np.sort(self.adjacent_sides % max(len(self.faces), 1), axis=1)
+        for array in vars(self).values():
+            if isinstance(array, np.ndarray):
+                array.flags.writeable = False
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickles the faces alone: the rest is faster to compute than to read."""
+        return Connectivity, (self.faces, self.n_vertices)
 
     @cached_property
     def vertex_pieces(self) -> IntArray:
         """Connected component of each vertex, including unreferenced ones. *Shape:* ``(V,)``."""
-        return _shared(connected_pieces(self.edges, self.n_vertices))
-
-
-def _shared(array: NDArray[Any]) -> NDArray[Any]:
-    array.flags.writeable = False
-    return array
+        return connected_pieces(self.edges, self.n_vertices)
 
 
 def connected_pieces(pairs: IntArray, n: int) -> IntArray:

@@ -9,7 +9,7 @@ import fast_simplification
 import numpy as np
 
 from torch_modal.arrays import FloatArray, IntArray
-from torch_modal.geometry.canonical import CANONICAL_SIZE, ordered_faces, placed, vertex_order
+from torch_modal.geometry.canonical import CANONICAL_SIZE, in_order, placed
 
 # The library keeps its mesh in static memory.
 _NOT_THREAD_SAFE = threading.Lock()
@@ -35,10 +35,8 @@ def decimate(vertices: FloatArray, faces: IntArray, n_faces: int) -> tuple[Float
         does not, *shape* ``(n, 2)``.
     """
     points, axes, centre, scale = placed(vertices, faces)
-    order = vertex_order(points)
-    rank = np.argsort(order)
-    sorted_points = np.ascontiguousarray(points[order])
-    sorted_faces = np.ascontiguousarray(rank[ordered_faces(points, faces)], dtype=np.int32)
+    order, sorted_faces = in_order(points, faces)
+    sorted_points, sorted_faces = points[order], sorted_faces.astype(np.int32)
 
     def simplified(points: FloatArray) -> tuple[FloatArray, IntArray, IntArray]:
         with _NOT_THREAD_SAFE:

@@ -8,6 +8,7 @@ from torch import Tensor, nn
 
 from torch_modal.geometry.clusters import Clusters, beyond_a_turn
 from torch_modal.geometry.connectivity import Connectivity, spanning_forest
+from torch_modal.geometry.poisson import Poisson
 from torch_modal.geometry.rotations import agreeing, arc, mean, quaternion, rotate, turned
 from torch_modal.geometry.triangle_frames import (
     Frames,
@@ -72,7 +73,7 @@ class LocalRotations(nn.Module):
     def __init__(self, mesh: Connectivity, references: Tensor) -> None:
         super().__init__()
         self.register_buffer("faces", torch.tensor(mesh.faces), persistent=False)
-        every = [self.frames(x[None]) for x in references]
+        every = [frames_of(x[None], self.faces) for x in references]
         a, b = every[:2]
         slenderness = reduce(torch.minimum, [x.slenderness for x in every]).squeeze(0)
         parents, piece = self._tree(_turn_between(a, b).squeeze(1), slenderness, mesh)
@@ -118,8 +119,8 @@ class LocalRotations(nn.Module):
             *Shape:* ``(3, B, E)``.
         """
         # From one of two shapes: the way from a third to a triangle that collapses in one has no bounded gradient.
-        start = self.frames(shapes[:, 0] if shapes.shape[1] == 2 else self.reference)
-        own = Frames(*(x.unflatten(-2, weights.shape) for x in self.frames(shapes.flatten(0, 1))))
+        start = frames_of(shapes[:, 0] if shapes.shape[1] == 2 else self.reference, self.faces)
+        own = Frames(*(x.unflatten(-2, weights.shape) for x in frames_of(shapes.flatten(0, 1), self.faces)))
         turns = _turn_between(Frames(*(x[..., None, :] for x in start)), own)
         if self.clusters is None:
             signs = self.sign(turns.detach().flatten(1, 2).movedim(0, -1), own.doubled_areas.detach().flatten(0, 1))
@@ -133,6 +134,10 @@ class LocalRotations(nn.Module):
         xx, xy, yy = ((weights[..., None] * x).sum(-2) for x in own[3:])
         first, second = (rotate(turn, start.world(*side)) for side in mapped(xx, xy, xy, yy))
         return self._edges((first, second), self.areas.expand(len(weights), -1))
+
+    def pulls(self, shapes: Tensor, weights: Tensor, poisson: Poisson) -> Tensor:
+        """:meth:`Poisson.pulls` of these edge vectors. *Shape:* ``(B, K, V, 3), (B, K) -> (B, V, 3)``."""
+        return poisson.pulls(self(shapes, weights))
 
     def _agreeing(self, turns: Tensor, weights: Tensor) -> Tensor:
         """Signs for the pieces of K shapes, with which they turn the short way from each other.
@@ -157,10 +162,6 @@ class LocalRotations(nn.Module):
         """
         growth = [y - x for x, y in zip(a[3:], b[3:], strict=True)]
         return torch.stack([*a.coordinates(2 * arc(self._signed(a, b))), *growth])
-
-    def frames(self, x: Tensor) -> Frames:
-        """The frames of the triangles of shapes. *Shape:* ``(B, V, 3)``."""
-        return frames_of(x, self.faces)
 
     def along(self, trajectory: Trajectory, which: Tensor, t: Tensor) -> Tensor:
         """Edge vectors of shapes on trajectories, components first.
@@ -209,7 +210,7 @@ class LocalRotations(nn.Module):
 
     def turns(self, first: Tensor, second: Tensor) -> Tensor:
         """Quaternions of triangles, whose signs tell the way round. *Shape:* ``(B, V, 3), (B, V, 3) -> (4, B, F)``."""
-        return self._signed(self.frames(first), self.frames(second))
+        return self._signed(frames_of(first, self.faces), frames_of(second, self.faces))
 
     def _signed(self, a: Frames, b: Frames) -> Tensor:
         """Quaternions between frames, whose signs tell the way round. *Shape:* ``(4, B, F)``."""

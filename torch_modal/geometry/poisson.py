@@ -12,7 +12,6 @@ from torch_modal.geometry.connectivity import Connectivity, half_cotangents, ver
 from torch_modal.geometry.rigid import best_fit
 from torch_modal.geometry.sparse import SparseSolver, graph_laplacian, solve_by, solve_exported
 from torch_modal.geometry.triangle_frames import Sides, edge_means
-from torch_modal.geometry.vectors import pick
 
 # Bounds of cotangent weights, for slivers. Positive weights make the matrix positive definite.
 _WEIGHT_RANGE = (0.02, 20.0)
@@ -68,34 +67,43 @@ class Poisson(nn.Module):
         self._made = weights, solver
         return solver
 
-    def forward(self, wanted: Tensor, near: Tensor) -> Tensor:
+    def forward(self, pulls: Tensor, near: Tensor) -> Tensor:
         """The shape that fits target edge vectors.
 
         Args:
-            wanted: Target edge vectors, components first. *Shape:* ``(3, ..., E)``.
-            near: A shape with the centres of the pieces of the result. *Shape:* ``(3, ..., V)``.
+            pulls: Of :meth:`pulls`. *Shape:* ``(..., V, 3)``.
+            near: A shape with the centres of the pieces of the result. *Shape:* ``(..., V, 3)``.
 
         Returns:
-            Positions; unreferenced vertices have those of ``near``. *Shape:* ``(3, ..., V)``.
+            Positions; unreferenced vertices have those of ``near``. *Shape:* ``(..., V, 3)``.
         """
-        pulls = wanted * self.weights.to(wanted)
-        both = torch.cat([-pulls, pulls], -1)
-        right = torch.zeros_like(near).index_add(-1, self.edges.T.flatten().to(near.device), both).movedim(0, -1)
         if torch.compiler.is_exporting():
-            x = solve_exported(self.edges, self.weights, self.free, right).movedim(-1, 0)
+            x = solve_exported(self.edges, self.weights, self.free, pulls)
         else:
             # Bound to the current weights: other weights may be in place during the backward solve.
-            x = solve_by(cache(partial(self._solver_of, self.weights)), right).movedim(-1, 0)
+            x = solve_by(cache(partial(self._solver_of, self.weights)), pulls)
         return x + self.centres(near - x)
 
+    def or_near(self, pulls: Tensor, near: Tensor) -> Tensor:
+        """:meth:`forward`, and the shape nearby where that is not finite. *Shape:* ``(B, V, 3), (B, V, 3)``."""
+        found = self(pulls, near)
+        return torch.where(found.detach().sum((1, 2)).isfinite()[:, None, None], found, near)
+
+    def pulls(self, wanted: Tensor) -> Tensor:
+        """Right-hand side of the system of target edge vectors. *Shape:* ``(3, ..., E) -> (..., V, 3)``."""
+        weighted = wanted * self.weights.to(wanted)
+        both, ends = torch.cat([-weighted, weighted], -1), self.edges.T.flatten().to(wanted.device)
+        zero = wanted.new_zeros(*wanted.shape[:-1], len(self.piece))
+        return zero.index_add(-1, ends, both).movedim(0, -1)
+
     def centres(self, x: Tensor) -> Tensor:
-        """Centre of the piece of each vertex. *Shape:* ``(3, ..., V) -> (3, ..., V)``, or ``(3, ..., 1)``."""
+        """Centre of the piece of each vertex. *Shape:* ``(..., V, 3) -> (..., V, 3)``, or ``(..., 1, 3)``."""
         piece, shares = self.piece.to(x.device), self.shares.to(x.device)
         # Sequential float32 sums over thousands of vertices lose three digits.
-        weighted = x.double() * shares.double()
+        weighted = x.double() * shares.double()[:, None]
         if self.n_pieces == 1:
-            return weighted.sum(-1, keepdim=True).to(x)
-        return pick(torch.zeros_like(weighted).index_add(-1, piece, weighted), piece).to(x)
+            return weighted.sum(-2, keepdim=True).to(x)
+        return torch.zeros_like(weighted).index_add(-2, piece, weighted).index_select(-2, piece).to(x)
 
 
 class Reconstruction(nn.Module):
@@ -161,7 +169,7 @@ class Reconstruction(nn.Module):
             *Shape:* ``(3, B, V)``.
         """
         edges = edge_means(wanted, self.weights.to(rest), self.sides, self.signs.to(rest), len(self.edges))
-        out = placed = self.poisson(edges, rest)
+        out = placed = self.poisson(self.poisson.pulls(edges), rest.movedim(0, -1)).movedim(-1, 0)
         for piece, anchors in self.loose:
             before, after = (x[..., anchors].movedim(0, -1) for x in (rest, placed))
             motion = best_fit(before, after, before.new_ones(len(anchors)))

@@ -45,6 +45,12 @@ class RigidMotion(NamedTuple):
         return RigidMotion(rotation, self.source, self.source + t * (self.target - self.source))
 
 
+def infinitesimal_motions(x: Tensor) -> Tensor:
+    """Fields of translations along the axes and of rotations about them. *Shape:* ``(V, 3) -> (6, V, 3)``."""
+    axes = torch.eye(3).to(x)[:, None].expand(3, *x.shape)
+    return torch.cat([axes, torch.linalg.cross(axes, x.expand(3, *x.shape))])
+
+
 def centroid(x: Tensor, weights: Tensor) -> Tensor:
     """Weighted mean of the vertices. *Shape:* ``(..., V, 3), (V,) -> (..., 3)``."""
     return weights @ x / weights.sum()
@@ -66,11 +72,11 @@ def best_rotation(covariance: Tensor) -> Tensor:
     Returns:
         *Shape:* ``(..., 3, 3)``, determinant one; NaN where the covariance is not finite.
     """
-    finite = covariance.detach().isfinite().all(-1).all(-1)[..., None, None]
-    u, _, vh = torch.linalg.svd(torch.where(finite, covariance.detach(), 0))  # raises on a NaN anywhere in a batch
-    sign = torch.ones_like(u[..., 0])
-    sign[..., 2] = torch.linalg.det(u @ vh)
-    rotation = torch.where(finite, (u * sign[..., None, :]) @ vh, torch.nan)
+    known = covariance.detach()
+    u, _, vh = torch.linalg.svd(known.nan_to_num(0, 0, 0))  # raises on a NaN anywhere in a batch
+    rotation = u @ vh
+    excess = torch.linalg.det(rotation)[..., None, None] - 1
+    rotation = rotation + excess * u[..., 2:] @ vh[..., 2:, :] + (0 * known).sum((-2, -1), keepdim=True)
     if not torch.is_grad_enabled() and (traced(covariance) or not transformed(covariance)):
         return rotation
     eye = torch.eye(3, dtype=covariance.dtype, device=covariance.device)

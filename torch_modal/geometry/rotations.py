@@ -7,14 +7,26 @@ first, as in :mod:`~torch_modal.geometry.vectors`.
 
 from math import factorial, pi
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from torch_modal.arrays import FloatArray
 from torch_modal.geometry.vectors import cross
 
 # Squared half angle below which series are evaluated: they are exact to rounding there, and beyond it closed forms lose
 # at most six digits when differentiated twice.
 SMALL = 1e-3
+# Matrices of rotations are linear in the products of the entries of their quaternions, and these in the matrices; of
+# both, the identity is left out. *Shape:* ``(9, 16)`` and, of four times the products, ``(16, 9)``.
+_EYE = np.eye(3)
+_CROSS = np.cross(_EYE[:, None], _EYE)
+_MATRIX, _PRODUCTS = np.zeros((3, 3, 4, 4)), np.zeros((4, 4, 3, 3))
+_MATRIX[..., 0, 1:] = -2 * _CROSS
+_MATRIX[..., 1:, 1:] = 2 * (np.einsum("ia,jb->ijab", _EYE, _EYE) - np.einsum("ij,ab->ijab", _EYE, _EYE))
+_PRODUCTS[0, 0], _PRODUCTS[0, 1:], _PRODUCTS[1:, 0] = _EYE, -_CROSS, -_CROSS
+_PRODUCTS[1:, 1:] = np.einsum("ai,bj->abij", _EYE, _EYE) + np.einsum("aj,bi->abij", _EYE, _EYE)
+_PRODUCTS[1:, 1:] -= np.einsum("ab,ij->abij", _EYE, _EYE)
 _COS = [(-1) ** k / factorial(2 * k) for k in range(4)]
 _SINC = [(-1) ** k / factorial(2 * k + 1) for k in range(4)]
 _ARC = [(-1) ** k / (2 * k + 1) for k in range(5)]
@@ -36,12 +48,7 @@ SMALLEST_CURVATURE = 0.1
 
 def exp(turn: Tensor) -> Tensor:
     """Rotation matrix of axis times angle in radians (Rodrigues). *Shape:* ``(..., 3) -> (..., 3, 3)``."""
-    w = turn.movedim(-1, 0)
-    cosine, sinc = _cos_and_sinc(0.25 * (w * w).sum(0))
-    x, y, z = sinc * cosine * w
-    real = 2 * cosine * cosine - 1
-    skew = torch.stack([real, -z, y, z, real, -x, -y, x, real]).unflatten(0, (3, 3))
-    return (skew + (0.5 * sinc * sinc * w)[:, None] * w).movedim((0, 1), (-2, -1))
+    return matrix(about(0.5 * turn.movedim(-1, 0))).movedim((0, 1), (-2, -1))
 
 
 def log(rotation: Tensor) -> Tensor:
@@ -58,11 +65,9 @@ def log(rotation: Tensor) -> Tensor:
 
 def quaternion(rotation: Tensor) -> Tensor:
     """Quaternion of a rotation, of either sign. *Shape:* ``(3, 3, ...) -> (4, ...)``."""
-    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rotation
     # Four times the quaternion's products with itself. The row of its largest entry is far from zero.
-    w, x, y, z = 1 + xx + yy + zz, 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz
-    wx, wy, wz, xy2, xz2, yz2 = zy - yz, xz - zx, yx - xy, xy + yx, xz + zx, yz + zy
-    products = torch.stack([w, wx, wy, wz, wx, x, xy2, xz2, wy, xy2, y, yz2, wz, xz2, yz2, z]).unflatten(0, (4, 4))
+    products = _linear(_PRODUCTS, rotation)
+    w, x, y, z = products.diagonal().unbind(-1)
     # Elementwise, at a tenth of what argmax takes over few long rows.
     first, second = torch.where(x > w, 1, 0), torch.where(z > y, 3, 2)
     largest = torch.where(torch.maximum(y, z) > torch.maximum(w, x), second, first)
@@ -70,9 +75,17 @@ def quaternion(rotation: Tensor) -> Tensor:
     return 0.5 * row / row.gather(0, largest[None]).clamp_min(torch.finfo(row.dtype).eps).sqrt()
 
 
-def power(q: Tensor, t: Tensor) -> Tensor:
-    """Rotations by the fraction ``t`` of the angle, below a whole turn. *Shape:* ``(4, ...), (...) -> (4, ...)``."""
-    return about(t * arc(q))
+def matrix(q: Tensor) -> Tensor:
+    """Rotation matrix of a quaternion of norm one. *Shape:* ``(4, ...) -> (3, 3, ...)``."""
+    return _linear(_MATRIX, q[:, None] * q)
+
+
+def _linear(table: FloatArray, given: Tensor) -> Tensor:
+    """The identity plus a linear function of matrices. *Shape:* ``(m, m, n, n), (n, n, ...) -> (m, m, ...)``."""
+    m, n = len(table), table.shape[-1]
+    own = torch.as_tensor(table.reshape(m * m, n * n), dtype=given.dtype, device=given.device)
+    eye = torch.eye(m, dtype=given.dtype, device=given.device).view(m, m, *[1] * (given.dim() - 2))
+    return torch.tensordot(own, given.flatten(0, 1), 1).unflatten(0, (m, m)) + eye
 
 
 def product(p: Tensor, q: Tensor) -> Tensor:
@@ -98,7 +111,10 @@ def turned(turn: Tensor, v: Tensor) -> Tensor:
 
 
 def arc(q: Tensor) -> Tensor:
-    """Axis times half the angle: the logarithm of a quaternion of any norm. *Shape:* ``(4, ...) -> (3, ...)``."""
+    """Axis times half the angle: the logarithm of a quaternion of any norm. *Shape:* ``(4, ...) -> (3, ...)``.
+
+    Of a point of a sphere of any dimension, whose first coordinate is its cosine, it is the way there from the pole.
+    """
     real, imaginary = q[0], q[1:]
     squared = (imaginary * imaginary).sum(0)
     small = (squared < SMALL * real * real) & (real > 0)
@@ -128,7 +144,10 @@ def mean(rotations: Tensor, weights: Tensor) -> Tensor:
     """
     if rotations.shape[-2] == 2:
         first, second = rotations.unbind(-2)
-        return product(first, power(product(conjugate(first), second), weights[..., 1, :]))
+        cosine = (first * second).sum(0, keepdim=True)
+        # Quaternions are points of a sphere, where the arc from the first to the second is half as long as the angle.
+        part = about(weights[..., 1, :] * arc(torch.cat([cosine, second - cosine * first])))
+        return part[:1] * first + part[1:]
     with torch.no_grad():
         found = (weights * rotations).sum(-2)
         found = found / found.square().sum(0).sqrt().clamp_min(torch.finfo(found.dtype).tiny)
@@ -151,6 +170,8 @@ def agreeing(products: Tensor, weights: Tensor) -> Tensor:
     Returns:
         *Shape:* ``(..., K)``.
     """
+    if weights.shape[-1] == 2:
+        return torch.where(products[..., 0] < 0, -1.0, 1.0).to(products)
     roots = weights.clamp_min(0).sqrt()
     dominant = torch.linalg.eigh(roots[..., None] * products * roots[..., None, :]).eigenvectors[..., -1]
     return torch.where((products @ (roots * dominant)[..., None]).squeeze(-1) < 0, -1.0, 1.0).to(products)

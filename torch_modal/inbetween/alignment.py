@@ -8,10 +8,10 @@ from torch import Tensor, nn
 
 from torch_modal.autograd import traced, transformed
 from torch_modal.errors import MeshWarning
-from torch_modal.geometry.canonical import CANONICAL_SIZE, canonical_scale
+from torch_modal.geometry.canonical import CANONICAL_SIZE, size
 from torch_modal.geometry.connectivity import Connectivity, vertex_areas
 from torch_modal.geometry.rigid import best_rotation, centroid, looks_mirrored
-from torch_modal.geometry.rotations import agreeing, mean, quaternion, rotate
+from torch_modal.geometry.rotations import agreeing, matrix, mean, quaternion
 from torch_modal.geometry.vectors import cross, pick
 
 # Rounds in which more than two key-frames are turned on to their mean, and the last of them, which have derivatives: of
@@ -48,12 +48,14 @@ class KeyframeAlignment(nn.Module):
     turns: Tensor
     roots: Tensor
     rooted: Tensor
-    faces: Tensor
+    extent: Tensor
+    corners: Tensor
 
     def __init__(self, references: Tensor, mesh: Connectivity) -> None:
         super().__init__()
-        faces = torch.tensor(mesh.faces)
-        scale = torch.tensor(canonical_scale(references.numpy(), mesh.faces), dtype=references.dtype)
+        corners = torch.tensor(mesh.faces).T.contiguous()
+        sizes = torch.tensor([size(x.numpy(), mesh.faces) for x in references], dtype=references.dtype)
+        scale = CANONICAL_SIZE / sizes.mean()
         areas = torch.stack([torch.from_numpy(vertex_areas(x.numpy(), mesh.faces)) for x in references])
         weights = (areas / areas.sum(1, keepdim=True)).mean(0)
         centred = references - centroid(references, weights)[:, None]
@@ -66,10 +68,14 @@ class KeyframeAlignment(nn.Module):
         self.register_buffer("turns", turns, persistent=False)
         #: The references in the frame, turned on to the first. *Shape:* ``(K, V, 3)``.
         self.register_buffer("references", centred @ turns.mT * scale, persistent=False)
-        #: Roots of the weights, and the first reference times these. *Shape:* ``(V, 1), (3, V)``.
-        self.register_buffer("roots", weights.sqrt()[:, None], persistent=False)
-        self.register_buffer("rooted", (self.reference * self.roots).mT.contiguous(), persistent=False)
-        self.register_buffer("faces", faces, persistent=False)
+        #: Roots of the weights, and the first reference times these. *Shape:* ``(V,), (3, V)``.
+        self.register_buffer("roots", weights.sqrt(), persistent=False)
+        self.register_buffer("rooted", (self.reference.mT * self.roots).contiguous(), persistent=False)
+        extent = (self.reference.amax(0) - self.reference.amin(0)).norm()
+        #: Diagonal of the bounding box of the first reference.
+        self.register_buffer("extent", extent, persistent=False)
+        #: Of the faces. *Shape:* ``(3, F)``.
+        self.register_buffer("corners", corners, persistent=False)
         self.closed = len(mesh.boundary_edges) == 0
         self.size_warned = False
 
@@ -92,33 +98,33 @@ class KeyframeAlignment(nn.Module):
             Shapes, *shape* ``(B, K, V, 3)``; the pose; *shape* ``(B,)``, bool.
         """
         weights, known = torch.where(weights.isfinite(), weights, 1 / weights.shape[1]), weights.isfinite()
-        x, usable = self.checked(keyframes)
-        shapes, pose = self._aligned(x, weights)
-        usable = usable & ~self.mirrored(shapes.detach(), weights)
-        return shapes, pose, ((usable | (weights == 0)) & known).all(1)
+        x, usable = self.checked(keyframes.mT.contiguous())
+        turned, pose = self._aligned(x, weights)
+        usable = usable & ~self.mirrored(turned.detach(), weights)
+        return turned.mT.contiguous(), pose, ((usable | (weights == 0)) & known).all(1)
 
     def checked(self, keyframes: Tensor) -> tuple[Tensor, Tensor]:
         """Key-frames that are finite and have a size, the reference in the place of others; which those are.
 
-        *Shape:* ``(B, K, V, 3) -> (B, K, V, 3), (B, K)``.
+        *Shape:* ``(B, K, 3, V) -> (B, K, 3, V), (B, K)``.
         """
-        rows = keyframes.detach().movedim(-1, 0).contiguous()
-        sizes = (rows.amax(-1) - rows.amin(-1)).norm(dim=0) * self.scale
+        rows = keyframes.detach()
+        sizes = (rows.amax(-1) - rows.amin(-1)).norm(dim=-1) * self.scale
         usable = sizes.isfinite() & (sizes > SMALLEST_SIZE * CANONICAL_SIZE)  # what is not finite has no extent
         self._warn_of_size(sizes)
         if not traced(usable) and not transformed(usable) and usable.all():
             return keyframes, usable
-        return torch.where(usable[..., None, None], keyframes, self.reference / self.scale), usable
+        return torch.where(usable[..., None, None], keyframes, self.reference.mT / self.scale), usable
 
     def _aligned(self, keyframes: Tensor, weights: Tensor) -> tuple[Tensor, Pose]:
-        """Key-frames turned on to their weighted mean, and this to the reference.
+        """Key-frames turned on to their weighted mean, and this to the reference. *Shape:* ``(B, K, 3, V)``.
 
         Generalised Procrustes analysis: the weighted squared distances of all pairs are least. Of two, it is their best
         fit.
         """
-        centres = centroid(keyframes, self.weights)
-        centred = (keyframes - centres[..., None, :]) * self.scale
-        rows = (centred * self.roots).mT.flatten(1, 2)
+        centres = keyframes @ self.weights
+        centred = (keyframes - centres[..., None]) * self.scale
+        rows = (centred * self.roots).flatten(1, 2)
         to_reference = (self.rooted @ rows.mT).unflatten(2, (-1, 3)).transpose(1, 2)  # (B, K, 3, 3)
         among = (rows @ rows.mT).unflatten(2, (-1, 3)).unflatten(1, (-1, 3)).transpose(2, 3)  # (B, K, K, 3, 3)
         pulls = weights[..., None, None]
@@ -135,9 +141,9 @@ class KeyframeAlignment(nn.Module):
         turns = best_rotation((pulls * to_reference @ turns.mT).sum(1))[:, None] @ turns
         poses = quaternion(turns.mT.movedim((-2, -1), (0, 1)))  # (4, B, K)
         signs = agreeing(torch.einsum("ibk,ibl->bkl", poses, poses).detach(), weights.detach())
-        pose = mean((signs * poses)[..., None], weights[..., None])
-        rotation = rotate(pose, torch.eye(3).to(poses)[:, None]).movedim(0, 1)
-        return centred @ turns.mT, Pose(rotation, (weights[..., None] * centres).sum(1))
+        pose = mean((signs * poses)[..., None], weights[..., None]).squeeze(-1)
+        rotation = matrix(pose).movedim(-1, 0)
+        return turns @ centred, Pose(rotation, (weights[..., None] * centres).sum(1))
 
     def restore(self, x: Tensor, pose: Pose) -> Tensor:
         """Shapes of the frame in the caller's coordinates. *Shape:* ``(B, V, 3)``."""
@@ -148,24 +154,26 @@ class KeyframeAlignment(nn.Module):
         return (points - pose.centre[:, None]) @ pose.rotation * self.scale
 
     def mirrored(self, shapes: Tensor, weights: Tensor) -> Tensor:
-        """True for mirror images of the heaviest, of closed surfaces. *Shape:* ``(B, K, V, 3), (B, K) -> (B, K)``."""
+        """True for mirror images of the heaviest, of closed surfaces. *Shape:* ``(B, K, 3, V), (B, K) -> (B, K)``."""
         if not self.closed:
             return torch.zeros_like(weights, dtype=torch.bool)
-        rows = shapes.movedim(-1, 0).contiguous()
-        a, b, c = (pick(rows, corner) for corner in self.faces.unbind(1))
+        a, b, c = (pick(shapes, corner).movedim(2, 0) for corner in self.corners)
         volumes = (a * cross(b, c)).sum((0, -1))
         heaviest = weights.argmax(1, keepdim=True)
         turned = volumes * volumes.gather(1, heaviest) < 0
         if not traced(turned) and not transformed(turned) and not turned.any():
             return turned
         first = shapes.take_along_dim(heaviest[..., None, None], 1).expand_as(shapes)
-        return turned & looks_mirrored(first.flatten(0, 1), shapes.flatten(0, 1), self.faces).view_as(turned)
+        own, of = first.flatten(0, 1).mT, shapes.flatten(0, 1).mT
+        return turned & looks_mirrored(own, of, self.corners.T).view_as(turned)
 
     def _warn_of_size(self, sizes: Tensor) -> None:
         """Say, once for a layer, that key-frames and bases seem to be in different units."""
         if self.size_warned or traced(sizes) or transformed(sizes):
             return
-        ratios = sizes / (self.reference.amax(0) - self.reference.amin(0)).norm()
+        ratios = sizes / self.extent
+        if bool(((ratios < OTHER_SIZE) & (ratios > 1 / OTHER_SIZE)).all()):
+            return
         other = (ratios > SMALLEST_SIZE) & ((ratios > OTHER_SIZE) | (ratios < 1 / OTHER_SIZE)) & ratios.isfinite()
         if not bool(other.any()):
             return

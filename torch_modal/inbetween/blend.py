@@ -1,6 +1,5 @@
 """Weighted means of shapes by local rotations of all triangles: the base of in-betweens."""
 
-import torch
 from torch import Tensor, nn
 
 from torch_modal.backends.torch.backend import TorchBackend
@@ -36,5 +35,4 @@ class RotationBlend(nn.Module):
         Returns:
             The weighted sum where the mean is not finite. *Shape:* ``(B, V, 3)``.
         """
-        found = self.poisson(self.rotations(shapes, weights), straight.movedim(-1, 0)).movedim(0, -1)
-        return torch.where(found.isfinite().flatten(1).all(1)[:, None, None], found, straight)
+        return self.poisson.or_near(self.rotations.pulls(shapes, weights, self.poisson), straight)

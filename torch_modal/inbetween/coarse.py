@@ -10,6 +10,7 @@ from torch_modal.autograd import applied
 from torch_modal.energy.energy import Energy
 from torch_modal.energy.stretch import Stretch
 from torch_modal.energy.term import Mesh
+from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.inspect import is_flat
 from torch_modal.modes.coarsening import Coarsening, coarsen
 
@@ -30,29 +31,27 @@ class CoarseMesh(nn.Module):
 
     Args:
         shapes: In the frame, float64 on the CPU. *Shape:* ``(K, V, 3)``.
-        faces: Vertex indices. *Shape:* ``(F, 3)``.
+        whole: The mesh.
         n_faces: Of the coarse mesh, or more, where that does not resolve the modes or pieces.
         weights: Of the vertices. *Shape:* ``(V,)``.
         modes: Of the shapes, which the coarse mesh should resolve. *Shape of each:* ``(k, V, 3)``.
     """
 
-    faces: Tensor
     weights: Tensor
     clusters: Tensor
     members: Tensor
     first_member: Tensor
     shares_of_members: Tensor
 
-    def __init__(self, shapes: Tensor, faces: Tensor, n_faces: int, weights: Tensor, modes: Sequence[Tensor]) -> None:
+    def __init__(self, shapes: Tensor, whole: Mesh, n_faces: int, weights: Tensor, modes: Sequence[Tensor]) -> None:
         super().__init__()
-        coarsening = resolving(shapes, faces, n_faces, modes)
+        coarsening = resolving(shapes, whole, n_faces, modes)
         clusters = torch.from_numpy(coarsening.clusters).clamp_min(0)
         member = torch.from_numpy(coarsening.clusters >= 0).double()
         per_cluster = torch.zeros(coarsening.n_vertices, dtype=torch.float64)
 
         self.n_vertices = coarsening.n_vertices
-        self.register_buffer("faces", torch.from_numpy(coarsening.faces), persistent=False)
-        self.mesh = Mesh.of(self.faces, self.n_vertices)
+        self.mesh = Mesh(Connectivity(coarsening.faces, self.n_vertices))
         self.register_buffer("weights", per_cluster.index_add(0, clusters, weights), persistent=False)
         self.register_buffer("clusters", clusters, persistent=False)
         shares = member / per_cluster.index_add(0, clusters, member)[clusters]
@@ -69,7 +68,7 @@ class CoarseMesh(nn.Module):
         return means.reshape(*x.shape[:-2], self.n_vertices, 3)
 
 
-def resolving(shapes: Tensor, faces: Tensor, n_faces: int, modes: Sequence[Tensor]) -> Coarsening:
+def resolving(shapes: Tensor, whole: Mesh, n_faces: int, modes: Sequence[Tensor]) -> Coarsening:
     """A coarse mesh of so many faces, or of more, where those do not resolve the modes.
 
     A flat shape does not tell where the other one bends: the collapses are then those of the other, and there are
@@ -77,23 +76,25 @@ def resolving(shapes: Tensor, faces: Tensor, n_faces: int, modes: Sequence[Tenso
 
     Arguments as for :class:`CoarseMesh`.
     """
+    faces, used = whole.connectivity.faces, whole.connectivity.used
     enough = min(ENOUGH_FACES, len(faces))
-    flat = [is_flat(x[faces.unique()].numpy()) for x in shapes]
+    points = shapes.numpy()
+    flat = [is_flat(x[used]) for x in points]
     curved = [i for i, one in enumerate(flat) if not one] or [0]
     n_faces = max(n_faces, enough) if any(flat) else n_faces
-    found = coarsen(shapes.numpy(), faces.numpy(), n_faces, curved)
+    found = coarsen(points, faces, n_faces, curved)
     if n_faces >= enough:
         return found
-    whole, ends = Mesh.of(faces, shapes.shape[1]), [(x, y) for x, y in zip(shapes, modes, strict=False) if len(y)]
+    ends = [(x, y) for x, y in zip(shapes, modes, strict=False) if len(y)]
     fine = [stretching(whole, *end) for end in ends]
     while n_faces < enough:
-        mesh = Mesh.of(torch.from_numpy(found.faces), found.n_vertices)
+        mesh = Mesh(Connectivity(found.faces, found.n_vertices))
         coarse = [[torch.from_numpy(found.restrict(part.numpy())) for part in end] for end in ends]
         pairs = zip(fine, coarse, strict=True)
         if all(spread(own, stretching(mesh, x, moves)) <= MOST_SPREAD for own, (x, moves) in pairs):
             break
         n_faces = min(round(MORE * n_faces), ENOUGH_FACES)
-        found = coarsen(shapes.numpy(), faces.numpy(), n_faces, curved)
+        found = coarsen(points, faces, n_faces, curved)
     return found
 
 

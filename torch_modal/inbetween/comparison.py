@@ -51,7 +51,13 @@ def no_worse(
     shapes, slight = [x, *starts], distortion.slight(rests.stiffness, x)
     with torch.no_grad():
         found = distortion(shapes, rests)
-    if torch.is_grad_enabled() and _needs_gradient(found, slight, slack):
+    parts = _part(found[0], found[1:] + slight, slack)
+    # A graph has no numbers to look at.
+    if not traced(parts) and not transformed(parts):
+        if not bool((parts > 0).any()):
+            return x, solution
+        depends = bool(((parts > 0) & (parts < 1)).any())  # to first order, on the distortions
+    if torch.is_grad_enabled() and (traced(parts) or transformed(parts) or depends):
         found = distortion(shapes, rests)
     x, replaced = blended(x, starts, found, slight, slack)
     fell = replaced & (solution.status != Status.INVALID)
@@ -70,24 +76,14 @@ def blended(
     for start, other in zip(starts, others, strict=True):
         part = _part(own, other + slight, slack)
         replaced = replaced | (part == 1)
-        # What need not be looked at need not be copied, either. A graph has no numbers to look at.
-        if traced(part) or transformed(part) or bool((part > 0).any()):
-            whole = part[:, None, None]
-            x = torch.where(whole < 1, torch.lerp(x, start, whole), start)
-            own = torch.where(part < 1, torch.lerp(own, other, part), other)
+        whole = part[:, None, None]
+        x = torch.where(whole < 1, torch.lerp(x, start, whole), start)
+        own = torch.where(part < 1, torch.lerp(own, other, part), other)
     return x, replaced
 
 
-def _needs_gradient(distortion: Tensor, slight: Tensor, slack: float) -> bool:
-    """True where the blend depends on the distortions to first order. *Shape:* ``(1 + S, B), (B,)``."""
-    if traced(distortion) or transformed(distortion):
-        return True
-    parts = _part(distortion[:1], distortion[1:] + slight, slack)
-    return bool(((parts > 0) & (parts < 1)).any())
-
-
 def _part(own: Tensor, other: Tensor, slack: float) -> Tensor:
-    """Part by which a shape gives way to one of its starts, 0 to 1. *Shape:* ``(B,)`` each."""
+    """Part by which a shape gives way to one of its starts, 0 to 1. *Shape:* ``(B,), (..., B) -> (..., B)``."""
     least = 1 + MARGIN * (slack - 1)
     part = ((own / other - least) / (slack - least)).clamp(0, 1)
     part = torch.where(own.isfinite(), part * part * (3 - 2 * part), 1)

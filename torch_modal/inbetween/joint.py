@@ -33,11 +33,13 @@ class JointSpace(nn.Module):
         anchor: ``rho``.
     """
 
+    fine: FineEnergy
+
     def __init__(
         self, coarse: CoarseMesh, fine: FineEnergy, backend: TorchBackend, basis: SubspaceBasis, anchor: float = 0.0
     ) -> None:
         super().__init__()
-        mesh, terms = coarse.mesh, fine.terms
+        mesh, terms = coarse.mesh, [part.term for part in fine.energy.parts]
         kinds = [2 if term.sampled else 1 if i >= N_SHELL_TERMS else 0 for i, term in enumerate(terms)]
         members = [[i for i, kind in enumerate(kinds) if kind == level] for level in range(3)]
         #: The terms of each part.
@@ -50,7 +52,8 @@ class JointSpace(nn.Module):
             columns = basis.fine[:, energy.vertices] if sampled else basis.coarse
             parts.append(backend.modal_energy(energy, mesh, columns))
         self.parts: Any = nn.ModuleList(parts)
-        self.coarse, self.basis, self.anchor, self._fine = coarse, basis, anchor, (fine,)
+        self.coarse, self.basis, self.anchor = coarse, basis, anchor
+        self.__dict__["fine"] = fine  # not registered here: it belongs to the solver
 
     # ----------------------------------------------------------------------------------------------- the affine space
     def place(self, base: Tensor, rests: RestShapes, mu: Tensor | None = None, soften: bool = True) -> list[Placement]:
@@ -89,7 +92,7 @@ class JointSpace(nn.Module):
         own = [values[i] for i in members]
         if energy.sampled:
             return own
-        fine, coarse = self._fine[0].energy.parts, self.coarse
+        fine, coarse = self.fine.energy.parts, self.coarse
         parts = zip(own, members, energy.parts, strict=True)
         return [coarse_values(value, fine[i], part, coarse.clusters, coarse.n_vertices) for value, i, part in parts]
 

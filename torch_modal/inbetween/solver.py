@@ -68,7 +68,7 @@ class InBetweenSolver(nn.Module):
         """The space that the modal solve minimises in."""
         alignment, turns = self.alignment, self.alignment.turns
         turned = [own @ turn.mT for own, turn in zip(modes, turns, strict=True)]
-        coarse = CoarseMesh(alignment.references, self.mesh.faces, objective.coarse_faces, alignment.weights, turned)
+        coarse = CoarseMesh(alignment.references, self.mesh, objective.coarse_faces, alignment.weights, turned)
         # The paired space, and steps that are unrolled, are differentiated like any other expression: by torch.
         by_kernels = objective.space == "joint" and self.solver.gradient == "implicit"
         given = coarse, self.fine, self.backend if by_kernels else TorchBackend()

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from torch_modal.geometry.rigid import infinitesimal_motions
 from torch_modal.inbetween.alignment import KeyframeAlignment
 from torch_modal.inbetween.coarse import CoarseMesh
 
@@ -51,20 +52,16 @@ def elastic_subspace(modes: Sequence[Tensor], alignment: KeyframeAlignment, coar
     Returns:
         No more directions than two of the bases have modes: of more bases, what most of them have in common.
     """
-    fine = torch.cat(list(modes))
     most = sum(sorted(len(own) for own in modes)[-2:])
-    x = alignment.references.mean(0)
-    axes = torch.eye(3).to(x)[:, None].expand(3, *x.shape)
-    rigid = torch.cat([axes, torch.linalg.cross(axes, x.expand(3, *x.shape))])
-    rigid_coarse = coarse.restrict(rigid)
-    mix = _orthonormal(rigid_coarse, coarse.weights)
-    rigid, rigid_coarse = _mixed(mix, rigid), _mixed(mix, rigid_coarse)
-    restricted = coarse.restrict(fine)
-    parts = restricted.flatten(1) @ (rigid_coarse * coarse.weights[:, None]).flatten(1).mT
-    elastic = restricted - _mixed(parts, rigid_coarse)
+    fine = torch.cat([infinitesimal_motions(alignment.references.mean(0)), *modes])
+    rigid, others = coarse.restrict(fine).tensor_split([6])
+    to_rigid = _orthonormal(rigid, coarse.weights)
+    rigid = _mixed(to_rigid, rigid)
+    parts = others.flatten(1) @ (rigid * coarse.weights[:, None]).flatten(1).mT
+    elastic = others - _mixed(parts, rigid)
     sizes = elastic.flatten(1).norm(dim=1)[:, None].clamp_min(torch.finfo(elastic.dtype).tiny)
     mix = _orthonormal(elastic / sizes[:, None], coarse.weights, most) / sizes.T
-    return SubspaceBasis(_mixed(mix, fine).sub_(_mixed(mix @ parts, rigid)), _mixed(mix, elastic))
+    return SubspaceBasis(_mixed(torch.cat([-mix @ parts @ to_rigid, mix], 1), fine), _mixed(mix, elastic))
 
 
 def _mixed(mix: Tensor, fields: Tensor) -> Tensor:

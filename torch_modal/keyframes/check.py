@@ -26,6 +26,8 @@ _DIAGONAL_RANGE = {torch.float32: (1e-30, 1e30), torch.float64: (1e-250, 1e250)}
 _LARGEST_SIZE_RATIO = 100.0
 # Visible rounding of the coordinates, relative to the diagonal.
 _COARSE_ROUNDING = 1e-4
+# Volume at a diagonal of 1 from which on its sign means something.
+_LEAST_VOLUME = 1e-6
 
 
 class Keyframes(NamedTuple):
@@ -57,22 +59,26 @@ def check_keyframes(keyframes: Any, faces: Any, *, min_keyframes: int = 1, warn:
     Warns:
         MeshWarning: At most once per kind of flaw, with the number of places and the first one.
     """
-    positions, mesh, found = checked_surface(keyframes, faces, min_keyframes)
-    if warn:
-        for message in found:
-            warnings.warn(message, MeshWarning, stacklevel=2)
+    flaws: list[str] = []
+    positions, mesh = checked_surface(keyframes, faces, min_keyframes, flaws if warn else None)
+    for message in flaws:
+        warnings.warn(message, MeshWarning, stacklevel=2)
     return Keyframes(positions, torch.tensor(mesh.faces, device=positions.device))
 
 
-def checked_surface(keyframes: Any, faces: Any, min_keyframes: int = 1) -> tuple[torch.Tensor, Connectivity, list[str]]:
-    """`check_keyframes` with the connectivity and the list of warnings."""
-    found: list[str] = []
-    note = found.append
+def checked_surface(
+    keyframes: Any, faces: Any, min_keyframes: int = 1, flaws: list[str] | None = None
+) -> tuple[torch.Tensor, Connectivity]:
+    """`check_keyframes` with the connectivity in the place of the faces; flaws, where a list is given, go there."""
     positions, shapes, indices = checked_arrays(keyframes, faces, min_keyframes)
-    mesh, orientable = _repaired(indices, shapes.shape[1], note)
-    scaled = _check_sizes(shapes, mesh, positions.dtype, note)
-    _check_surface(scaled, mesh, orientable, _RESOLUTION[positions.dtype], note)
-    return positions, mesh, found
+    notes: list[str] = [] if flaws is None else flaws
+    mesh, orientable = _repaired(indices, shapes.shape[1], notes.append)
+    scaled = _check_sizes(shapes, mesh, positions.dtype, notes.append)
+    if orientable and not (mesh.counts % 2).any():
+        _refuse_mirrored(scaled, mesh.faces)
+    if flaws is not None:
+        _note_flaws(scaled, mesh, _RESOLUTION[positions.dtype], notes.append)
+    return positions, mesh
 
 
 def checked_arrays(keyframes: Any, faces: Any, min_keyframes: int = 1) -> tuple[torch.Tensor, FloatArray, IntArray]:
@@ -193,10 +199,24 @@ def _check_sizes(shapes: FloatArray, mesh: Connectivity, dtype: torch.dtype, not
         return (shapes - surface.mean(axis=1, keepdims=True)) / diagonals[:, None, None]
 
 
-def _check_surface(
-    scaled: FloatArray, mesh: Connectivity, orientable: bool, resolution: float, note: Callable[[str], None]
-) -> None:
-    """Report flaws that the solver tolerates; reject mirrored closed meshes."""
+def _refuse_mirrored(scaled: FloatArray, faces: IntArray) -> None:
+    """Reject closed meshes that are mirror images of each other. *Shape:* ``(K, V, 3), (F, 3)``."""
+    volumes = np.array([inspect.signed_volume(shape, faces) for shape in scaled])
+    positive, turned = int(volumes.argmax()), np.flatnonzero(volumes < -_LEAST_VOLUME)
+    if volumes[positive] > _LEAST_VOLUME and len(turned):
+        first, others = (torch.from_numpy(scaled[rows]) for rows in ([positive] * len(turned), turned))
+        turned = turned[looks_mirrored(first, others, torch.tensor(faces)).numpy()]
+        if len(turned):
+            few, many = sorted((positive, int(turned[volumes[turned].argmin()])))
+            raise MeshError(
+                f"key-frame {many} is mirrored: its faces wind the other way round than those of key-frame "
+                f"{few}, seen from outside, and no motion without passing through itself leads from one to the "
+                "other; mirror it back (negate one coordinate)"
+            )
+
+
+def _note_flaws(scaled: FloatArray, mesh: Connectivity, resolution: float, note: Callable[[str], None]) -> None:
+    """Report flaws that the solver tolerates."""
     faces, edges, counts = mesh.faces, mesh.edges, mesh.counts
     along = scaled[:, edges[:, 0]] - scaled[:, edges[:, 1]]
     vanishing = np.einsum("kei,kei->ke", along, along) <= resolution**2
@@ -235,16 +255,3 @@ def _check_surface(
             f"the surface is open: {len(boundary)} edges belong to one face only, the first is edge "
             f"{boundary[0].tolist()}{seam if split else ''}"
         )
-    elif orientable and not (counts % 2).any():
-        volumes = np.array([inspect.signed_volume(shape, faces) for shape in scaled])
-        positive, turned = int(volumes.argmax()), np.flatnonzero(volumes < -inspect.FLATNESS)
-        if volumes[positive] > inspect.FLATNESS and len(turned):
-            first, others = (torch.from_numpy(scaled[rows]) for rows in ([positive] * len(turned), turned))
-            turned = turned[looks_mirrored(first, others, torch.tensor(faces)).numpy()]
-            if len(turned):
-                few, many = sorted((positive, int(turned[volumes[turned].argmin()])))
-                raise MeshError(
-                    f"key-frame {many} is mirrored: its faces wind the other way round than those of key-frame "
-                    f"{few}, seen from outside, and no motion without passing through itself leads from one to the "
-                    "other; mirror it back (negate one coordinate)"
-                )

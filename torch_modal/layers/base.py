@@ -112,10 +112,11 @@ class InBetweenLayer(PreciseModule):
             [getattr(basis, name).double().cpu() for basis in self.bases] for name in ("reference", "modes")
         )
         connectivity = checked_surface(references, self.faces.cpu())[1]
-        self.faces = torch.tensor(connectivity.faces)
+        mesh = Mesh(connectivity)
+        self.faces = mesh.faces
         #: True where there is a volume to be kept: not in sheets, whose energy has two terms.
         self.encloses = all(encloses(x, connectivity) for x in references)
-        given = torch.stack(references), modes, Mesh(connectivity), list(self.terms), self.objective, self.solver
+        given = torch.stack(references), modes, mesh, list(self.terms), self.objective, self.solver
         kind = ContactSolver if self.objective.contact else InBetweenSolver
         self.core = kind(*given).to(like)
 

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 
 from torch_modal.autograd import lasting, outlasting
+from torch_modal.geometry.rigid import infinitesimal_motions
 from torch_modal.io.tensors import TensorFile, write_tensors
 
 FORMAT = "torch_modal.basis"
@@ -74,14 +75,10 @@ class ModalBasis:
 
         In the Euclidean product over all vertices: translations along x, y and z, then rotations about their mean.
         """
-        v = self.n_vertices
-        axes = torch.eye(3, dtype=self.reference.dtype, device=self.reference.device)
         arms = self.reference - self.reference.mean(dim=0)
-        arms = arms / arms.abs().max()  # avoids overflow; rotations are normalised below
-        translations = axes[:, None].expand(3, v, 3) / v**0.5
-        turned = torch.linalg.cross(axes[:, None].expand(3, v, 3), arms.expand(3, v, 3))
-        rotations = torch.linalg.qr(turned.reshape(3, 3 * v).T).Q.T.reshape(3, v, 3)
-        return torch.cat([translations, rotations])
+        translations, turned = infinitesimal_motions(arms / arms.abs().max()).split(3)  # scaled against overflow
+        rotations = torch.linalg.qr(turned.flatten(1).T).Q.T.view_as(turned)
+        return torch.cat([translations / self.n_vertices**0.5, rotations])
 
     def truncate(self, k: int) -> "ModalBasis":
         """The basis of the lowest ``k`` modes.

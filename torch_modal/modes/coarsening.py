@@ -35,6 +35,8 @@ class Coarsening:
     """Coarse vertex of each fine vertex, -1 for those without a face. *Shape:* ``(V,)``."""
     faces: IntArray
     """Faces of the coarse mesh. *Shape:* ``(F_coarse, 3)``."""
+    n_vertices: int
+    """Number of coarse vertices."""
 
     @classmethod
     def of_labels(cls, labels: IntArray, faces: IntArray) -> "Coarsening":
@@ -43,12 +45,7 @@ class Coarsening:
         used = np.unique(coarse)
         index = np.full(labels.max() + 2, -1)  # the last for the label -1
         index[used] = np.arange(len(used))
-        return cls(index[labels], index[coarse])
-
-    @property
-    def n_vertices(self) -> int:
-        """Number of coarse vertices."""
-        return int(self.clusters.max()) + 1
+        return cls(index[labels], index[coarse], len(used))
 
     def restrict(self, x: FloatArray) -> FloatArray:
         """Cluster averages. *Shape:* ``(..., V, 3) -> (..., V_coarse, 3)``."""

@@ -6,10 +6,12 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg
 import scipy.sparse as sp
+import torch
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import LinearOperator, eigsh
 
 from torch_modal.arrays import FloatArray, IntArray
+from torch_modal.geometry.rigid import infinitesimal_motions
 from torch_modal.geometry.sparse import factorize
 
 N_RIGID = 6
@@ -126,11 +128,8 @@ def rigid_motions(positions: FloatArray, inertia: sp.csr_matrix) -> FloatArray:
     centered = positions - positions.mean(axis=0)
     # Scaled to order 1 like the translations, for a well-conditioned factorisation.
     centered = centered / np.sqrt((centered**2).sum(axis=1).mean())
-    motions = np.zeros((len(positions), 3, N_RIGID))
-    motions[:, :, :3] = np.eye(3)
-    for axis in range(3):
-        motions[:, :, 3 + axis] = np.cross(np.eye(3)[axis], centered)
-    return _orthonormal(motions.reshape(-1, N_RIGID), inertia)
+    motions = infinitesimal_motions(torch.from_numpy(centered)).flatten(1).T
+    return _orthonormal(motions.numpy(), inertia)
 
 
 def _component_modes(

@@ -89,10 +89,8 @@ class ModalDecoder(nn.Module):
         self.register_buffer("columns", _bounded(torch.cat([own.coordinates(turn), strain]), own))
         #: What it does to the centres of loose pieces, if there are several. *Shape:* ``(k, 3V)``, or none.
         several = int(self._mesh.vertex_pieces.max()) > 0
-        centres = (
-            self.spline.poisson.centres(displaced) * self.spline.alignment.scale if several else displaced[..., :0]
-        )
-        self.register_buffer("moves", centres.permute(1, 2, 0).flatten(1).contiguous())
+        centres = self.spline.poisson.centres(displaced.movedim(0, -1)) * self.spline.alignment.scale
+        self.register_buffer("moves", centres.flatten(1)[:, : centres[0].numel() if several else 0].contiguous())
         self.register_load_state_dict_post_hook(ModalDecoder._build)
 
     @lasting

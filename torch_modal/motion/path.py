@@ -96,7 +96,7 @@ class Path(PreciseModule):
         self.contact = objective.contact
         if self.contact:
             require_contact()
-        self.objective = replace(objective, contact=False)
+        self.objective = replace(objective, contact=False) if self.contact else objective
         self.register_buffer("times", checked_times(times, n, cyclic))
         self.bases = nn.ModuleList(own)
         #: Number of key-frames, K.

@@ -12,6 +12,7 @@ from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.local_rotations import Trajectory, weights_per_length
 from torch_modal.geometry.rigid import best_rotation, centroid
 from torch_modal.geometry.rotations import exp, log
+from torch_modal.geometry.triangle_frames import frames_of
 from torch_modal.geometry.vectors import pick
 from torch_modal.inbetween.alignment import KeyframeAlignment, Pose
 from torch_modal.motion.cubics import Cubics, Scheme, cubics, offset
@@ -76,7 +77,7 @@ class Spline(nn.Module):
             ends = references[[i, (i + 1) % n]]
             plain = first.clusters is None
             if plain:
-                plain = not beyond_a_turn(*first.wound(*(first.frames(x[None]) for x in ends)))
+                plain = not beyond_a_turn(*first.wound(*(frames_of(x[None], first.faces) for x in ends)))
             if plain:
                 turns = first.turns(ends[:1], ends[1:])[:, 0]
                 plain = bool(((pick(turns, one) * pick(turns, other)).sum(0) >= 0).all())
@@ -86,8 +87,8 @@ class Spline(nn.Module):
     def knots(self, keyframes: Tensor) -> Knots:
         """The velocities at all key-frames. *Shape:* ``(L, K, V, 3)``."""
         weights, reference = self.alignment.weights, self.alignment.reference
-        x, usable = self.alignment.checked(keyframes)
-        x = x.movedim(1, 0)
+        x, usable = self.alignment.checked(keyframes.mT)
+        x = x.mT.movedim(1, 0)
         x = torch.cat([x, x[:1]]) if self.cyclic else x
         centres = centroid(x, weights)
         centred = x - centres[..., None, :]
@@ -98,7 +99,7 @@ class Spline(nn.Module):
             turns.append(turns[-1] @ step)
         rotations = torch.stack(turns).mT
         shapes = self.alignment.scale * centred @ rotations
-        flat = shapes.detach().movedim(0, 1)
+        flat = shapes.detach().movedim(0, 1).mT
         usable = usable.all(1) & ~self.alignment.mirrored(flat, torch.ones_like(flat[..., 0, 0])).any(1)
         durations = self.times.diff()
 
@@ -109,10 +110,11 @@ class Spline(nn.Module):
 
             return cubics(steps, durations, self.cyclic, squared, self.scheme)
 
-        here, steps = self.rotations[0].frames(shapes[0]), []
+        faces = self.rotations[0].faces
+        here, steps = frames_of(shapes[0], faces), []
         unit = here.size / len(shapes)
         for rotations_of, shape in zip(self.rotations, shapes[1:], strict=True):
-            there = rotations_of.frames(shape)
+            there = frames_of(shape, faces)
             steps.append(rotations_of.step(here, there))
             here, unit = there, unit + there.size / len(shapes)
         unit = torch.maximum(unit, SMALLEST * unit.mean(-1, keepdim=True))
@@ -131,7 +133,7 @@ class Spline(nn.Module):
 
     def trajectory(self, knots: Knots, i: int) -> Trajectory:
         """The cubics of the triangles in one interval."""
-        own = self.rotations[i].frames(knots.shapes[i])
+        own = frames_of(knots.shapes[i], self.rotations[i].faces)
         return Trajectory(own.e1, own.e2, own.normal, torch.stack(own[3:]), *(part[i] for part in knots.triangles))
 
     def straight(self, knots: Knots, i: int, which: Tensor, u: Tensor) -> Tensor:
@@ -175,8 +177,7 @@ class Spline(nn.Module):
             edges = rotations(ends, torch.stack([1 - u, u], -1))
         else:
             edges = rotations.along(trajectory, which, u)
-        found = self.poisson(edges, straight.movedim(-1, 0)).movedim(0, -1)
-        return torch.where(found.isfinite().flatten(1).all(1)[:, None, None], found, straight)
+        return self.poisson.or_near(self.poisson.pulls(edges), straight)
 
     def pose(self, knots: Knots, i: int, which: Tensor, u: Tensor) -> Pose:
         """The poses at times of one interval. Arguments as for :meth:`forward`."""

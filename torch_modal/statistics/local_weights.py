@@ -172,8 +172,8 @@ class LocalWeights:
         with torch.enable_grad():
             weights, signs = reconstruction.weights, reconstruction.signs
             edges = edge_means((first, second), weights, reconstruction.sides, signs, len(reconstruction.edges))
-            found = reconstruction.poisson(edges, parts.new_zeros(1, n, v))
-            of_first, of_second = torch.autograd.grad((found[0] * parts).sum(), (first, second))
+            found = reconstruction.poisson(reconstruction.poisson.pulls(edges), parts.new_zeros(n, v, 1))
+            of_first, of_second = torch.autograd.grad((found[..., 0] * parts).sum(), (first, second))
         return of_first[0], of_second[0]
 
 

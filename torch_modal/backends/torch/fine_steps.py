@@ -291,11 +291,6 @@ class FineEnergy(nn.Module):
         self.mesh = mesh
         self.energy = Energy(mesh, terms)
 
-    @property
-    def terms(self) -> tuple[Term, ...]:
-        """The terms; the layer owns them."""
-        return tuple(part.term for part in self.energy.parts)
-
     def relax(
         self, x: Tensor, rests: RestShapes, stages: Sequence[tuple[int, int]], beside: Beside | None = None
     ) -> Tensor:

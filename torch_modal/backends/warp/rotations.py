@@ -11,12 +11,14 @@ from torch_modal.backends.warp.function import fused
 from torch_modal.backends.warp.launch import Constants, kernels, launch
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.local_rotations import LocalRotations, Trajectory
+from torch_modal.geometry.poisson import Poisson
 
 
 class WarpRotations(LocalRotations):
     """:class:`~torch_modal.geometry.local_rotations.LocalRotations` by kernels, in float64.
 
-    Edge vectors between two shapes and on trajectories come from kernels; of more shapes, the signs of rotations do.
+    Pulls of edge vectors between two shapes, and edge vectors on trajectories, come from kernels; of more shapes, the
+    signs of rotations do.
     """
 
     shares: Tensor
@@ -28,7 +30,7 @@ class WarpRotations(LocalRotations):
         while bool((above != above[above]).any()):
             depth, above = depth + depth[above], above[above]
         total = references.new_zeros(self.n_edges).index_add(0, self.sides, self.areas.repeat(3))
-        shares = self.side_signs * self.areas.repeat(3) / total[self.sides].clamp_min(torch.finfo(total.dtype).tiny)
+        shares = self.areas.repeat(3) / total[self.sides].clamp_min(torch.finfo(total.dtype).tiny)
         integers = {
             "faces": self.faces,
             "sides": self.sides.view(3, -1).T,
@@ -36,7 +38,7 @@ class WarpRotations(LocalRotations):
             "parent": parent,
             "piece": self.piece,
         }
-        #: Parts of the sides in their edge vectors, with their senses. *Shape:* ``(F, 3)``.
+        #: Parts of the sides in their edge vectors. *Shape:* ``(F, 3)``.
         self.register_buffer("shares", shares.view(3, -1).T.contiguous(), persistent=False)
         #: The surface as the first argument of kernels.
         self.constants = Constants(
@@ -49,11 +51,11 @@ class WarpRotations(LocalRotations):
             n_pieces=self.n_pieces,
         )
 
-    def forward(self, shapes: Tensor, weights: Tensor) -> Tensor:
+    def pulls(self, shapes: Tensor, weights: Tensor, poisson: Poisson) -> Tensor:
         """Overrides the base class."""
         if self.clusters is not None or weights.shape[1] != 2:
-            return super().forward(shapes, weights)
-        return fused(_Turned(self), shapes, weights)[0].movedim(-1, 0).to(shapes)
+            return super().pulls(shapes, weights, poisson)
+        return fused(_Turned(self, poisson), shapes, weights)[0].to(shapes)
 
     def turns(self, first: Tensor, second: Tensor) -> Tensor:
         """Overrides the base class."""
@@ -87,23 +89,23 @@ class WarpRotations(LocalRotations):
 
 
 class _Turned:
-    """Edge vectors between two shapes. *Shape:* ``(B, 2, V, 3), (B, 2) -> (B, E, 3)``."""
+    """Pulls of the edge vectors between two shapes. *Shape:* ``(B, 2, V, 3), (B, 2) -> (B, V, 3)``."""
 
     n_results = n_differentiable = 1
 
-    def __init__(self, rotations: WarpRotations) -> None:
-        self.rotations = rotations
+    def __init__(self, rotations: WarpRotations, poisson: Poisson) -> None:
+        self.rotations, self.poisson = rotations, poisson
 
     def run(self, kept: list[Any] | None, shapes: Tensor, weights: Tensor) -> tuple[Tensor, ...]:
         """See :class:`~torch_modal.backends.warp.function.Operation`."""
-        own, edges = self.rotations, shapes.new_zeros(len(shapes), self.rotations.n_edges, 3)
+        own, pulls = self.rotations, torch.zeros_like(shapes[:, 0])
         quaternions, areas, packed = own.turned(shapes)
         sign = own.sign(quaternions, areas)
-        given = [own.constants, quaternions, sign, packed, weights, own.shares.double(), edges]
-        launch(kernels("rotations").part_turned, (len(shapes), len(own.faces)), given)
+        given = [own.constants, quaternions, sign, packed, weights, own.shares.double(), self.poisson.weights.double()]
+        launch(kernels("rotations").part_turned, (len(shapes), len(own.faces)), [*given, pulls])
         if kept is not None:
             kept.append(sign)
-        return (edges,)
+        return (pulls,)
 
     def back(
         self, kept: list[Any], grads: Sequence[Tensor], shapes: Tensor, weights: Tensor
@@ -112,13 +114,13 @@ class _Turned:
         own = self.rotations
         sign = kept[0] if kept else own.sign(*own.turned(shapes)[:2])
         found = torch.zeros_like(shapes), torch.zeros_like(weights)
-        given = [own.constants, shapes, weights, sign, own.shares.double(), grads[0], *found]
-        launch(kernels("rotations_adjoint").from_turned, (len(shapes), len(own.faces)), given)
+        given = [own.constants, shapes, weights, sign, own.shares.double(), self.poisson.weights.double()]
+        launch(kernels("rotations_adjoint").from_turned, (len(shapes), len(own.faces)), [*given, grads[0], *found])
         return found
 
     def by_torch(self, shapes: Tensor, weights: Tensor) -> tuple[Tensor, ...]:
         """See :class:`~torch_modal.backends.warp.function.Operation`."""
-        return (LocalRotations.forward(self.rotations, shapes, weights).movedim(0, -1),)
+        return (LocalRotations.pulls(self.rotations, shapes, weights, self.poisson),)
 
 
 class _OnTrajectory:

@@ -276,6 +276,13 @@ def turned(q: vec4, v: vec3):
     return rotated(q[0], vec3(q[1], q[2], q[3]), v)
 
 
+@wp.func
+def at_sides(surface: FaceTables, values: wp.array(dtype=real), k: int):
+    """Values of edges at the sides of a triangle."""
+    e = surface.sides[place(k, 0)]
+    return vec3(values[place(e[0], 0)], values[place(e[1], 0)], values[place(e[2], 0)])
+
+
 @wp.kernel(enable_backward=False)
 def part_turned(
     surface: FaceTables,
@@ -284,17 +291,18 @@ def part_turned(
     packed: wp.array(dtype=packed_turn),
     weights: wp.array(dtype=wp.vec2d),
     shares: wp.array(dtype=vec3),
-    edges: wp.array(dtype=vec3),
+    stiffness: wp.array(dtype=real),
+    pulls: wp.array(dtype=vec3),
     threads: int,
 ):
-    """Edge vectors between two shapes from the sides of all triangles, of turns whose signs are known.
+    """Pulls of the edge vectors between two shapes on their vertices, of turns whose signs are known.
 
-    A side has a share of its edge vector, with its sense.
+    A side of a triangle has a share of its edge vector, which is pulled at with a stiffness.
     """
     i = wp.tid()
     s = i // threads
     w = weights[s]
-    to = s * surface.n_edges
+    to = s * surface.n_vertices
     for k in range(i - s * threads, surface.sides.shape[0], threads):
         at = place(s * surface.sides.shape[0], k)
         c = packed[at]
@@ -306,11 +314,14 @@ def part_turned(
         z = w[0] * c[8] + w[1] * c[11]
         first = x * one + y * two
         second = HALF * first + HEIGHT * (y * one + z * two)
-        of = surface.sides[place(k, 0)]
-        share = shares[place(k, 0)]
-        wp.atomic_add(edges, place(to, of[0]), share[0] * first)
-        wp.atomic_add(edges, place(to, of[1]), share[1] * (second - first))
-        wp.atomic_add(edges, place(to, of[2]), -share[2] * second)
+        f = surface.faces[place(k, 0)]
+        pull = wp.cw_mul(shares[place(k, 0)], at_sides(surface, stiffness, k))
+        s1 = pull[0] * first
+        s2 = pull[1] * (second - first)
+        s3 = -pull[2] * second
+        wp.atomic_add(pulls, place(to, f[0]), s3 - s1)
+        wp.atomic_add(pulls, place(to, f[1]), s1 - s2)
+        wp.atomic_add(pulls, place(to, f[2]), s2 - s3)
 
 
 @wp.kernel(enable_backward=False)

@@ -14,6 +14,7 @@ from torch_modal.backends.warp.kernels.rotations import (
     FaceTables,
     Triangle,
     about,
+    at_sides,
     half_turn,
     quaternion,
     sinc,
@@ -92,7 +93,8 @@ def from_turned(
     weights: wp.array(dtype=wp.vec2d),
     sign: wp.array(dtype=real),
     shares: wp.array(dtype=vec3),
-    to_edges: wp.array(dtype=vec3),
+    stiffness: wp.array(dtype=real),
+    to_pulls: wp.array(dtype=vec3),
     to_shapes: wp.array(dtype=vec3),
     to_weights: wp.array(dtype=wp.vec2d),
     threads: int,
@@ -101,7 +103,7 @@ def from_turned(
     i = wp.tid()
     s = i // threads
     v = 2 * s * surface.n_vertices
-    edge = s * surface.n_edges
+    at = s * surface.n_vertices
     u = weights[s][0]
     t = weights[s][1]
     to_w = wp.vec2d()
@@ -116,12 +118,15 @@ def from_turned(
         z = u * a.yy + t * b.yy
         one = turned(part, x * a.e1 + y * a.e2)
         two = HALF * one + HEIGHT * turned(part, y * a.e1 + z * a.e2)
-        # From the edges: of the sides ``one``, ``two - one`` and ``-two``.
-        of = surface.sides[place(k, 0)]
-        share = shares[place(k, 0)]
-        across = share[1] * to_edges[place(edge, of[1])]
-        to_one = share[0] * to_edges[place(edge, of[0])] - across
-        to_two = across - share[2] * to_edges[place(edge, of[2])]
+        # Of the sides ``one``, ``two - one`` and ``-two``.
+        f = surface.faces[place(k, 0)]
+        to_p = to_pulls[place(at, f[0])]
+        to_q = to_pulls[place(at, f[1])]
+        to_r = to_pulls[place(at, f[2])]
+        pull = wp.cw_mul(shares[place(k, 0)], at_sides(surface, stiffness, k))
+        across = pull[1] * (to_r - to_q)
+        to_one = pull[0] * (to_q - to_p) - across
+        to_two = across - pull[2] * (to_p - to_r)
         torque = wp.cross(one, to_one) + wp.cross(two, to_two)
         back = inverse(part)
         flat_one = turned(back, to_one + HALF * to_two)
@@ -134,7 +139,6 @@ def from_turned(
             b.xx * to_x + b.xy * to_y + b.yy * to_z + real(2.0) * wp.dot(torque, half),
         )
         whole = reached(turn, half, part, t, torque)
-        f = surface.faces[place(k, 0)]
         own = turned(back, torque) - turned(inverse(turn), whole)
         one, two = from_triangle(a, own, u * to_x, u * to_y, u * to_z)
         wp.atomic_add(to_shapes, place(v, f[0]), -(one + two))
