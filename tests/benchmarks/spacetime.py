@@ -30,7 +30,7 @@ from torch_modal.geometry.local_rotations import LocalRotations
 from torch_modal.geometry.poisson import Reconstruction
 from torch_modal.geometry.rigid import best_fit, blend
 from torch_modal.geometry.rotations import turned
-from torch_modal.geometry.triangle_frames import bend, bending_between, edge_means, sides, stretched
+from torch_modal.geometry.triangle_frames import bend, bending_between, edge_means, frames_of, sides, stretched
 from torch_modal.geometry.vectors import cross
 
 N_MODES = 50
@@ -51,7 +51,7 @@ class WarpedModes:
         self.basis, self.faces, rest = basis, faces, basis.reference[None]
         mesh = Connectivity(faces.numpy(), rest.shape[1])
         self.rotations = LocalRotations(mesh, torch.cat([rest, others]))
-        self.own = self.rotations.frames(rest)
+        self.own = frames_of(rest, faces)
         self.sides = sides(rest.movedim(-1, 0), faces)
         self.reconstruction = Reconstruction(rest[0], faces)
         self._weights = self.reconstruction.poisson.weights.sqrt()
@@ -67,7 +67,7 @@ class WarpedModes:
     def amplitudes(self, shapes: Tensor) -> Tensor:
         """Amplitudes whose gradients are nearest to those of shapes. *Shape:* ``(B, V, 3) -> (B, k)``."""
         own, turns = self.own, self.rotations.turns(self.basis.reference.expand_as(shapes), shapes)
-        turn, strain = bending_between(own, self.rotations.frames(shapes), turns)
+        turn, strain = bending_between(own, frames_of(shapes, self.faces), turns)
         moved = []
         for (x, y), rest in zip(stretched(strain, *own[3:]), self.sides, strict=True):
             moved.append(own.world(x, y) - rest + cross(turn, rest.expand_as(turn)))
