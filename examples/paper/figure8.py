@@ -1,7 +1,8 @@
 """Figure 8: between two poses of an animal, and from one animal to another.
 
 The second is the example ``morph_animals.py``, which registers one on the other. Printed is how long the tail is
-between the ends, over the mean of its length at both: in the paper, other methods twist it or make it shorter.
+between the ends, over the mean of its length at both: in the paper, other methods twist it or make it shorter. Between
+these two animals it hardly turns, and linear interpolation keeps it, too.
 """
 
 import contextlib

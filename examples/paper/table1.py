@@ -1,8 +1,9 @@
 """Table 1: sizes and times, of the samples of this package and of the bodies of Figures 2 and 7, next to the paper's.
 
-Preparing is tetrahedra and modes of all key-frames, without the cache; an update is one mid-shape of a pair whose layer
-is ready: of the paper's own solve (Eq. 4), and of what this package does by default. Processor seconds of this machine,
-one core; the paper's are of an Intel Core i7-3370 of 3.4 GHz.
+The paper's columns: vertices of the surface (#V) and of the tetrahedra (#N), key-frames (#K), dimension of the space
+(#D). IT is tetrahedra and modes of all key-frames, without the cache; UT is one mid-shape of a pair whose layer is
+ready: of the paper's own solve (Eq. 4), and of what this package does by default. Processor seconds of one core of this
+machine; the paper's are of an Intel Core i7-3370 of 3.4 GHz.
 """
 
 import threading
@@ -43,7 +44,7 @@ def key_poses(name: str) -> tuple[torch.Tensor, torch.Tensor]:
 
 def main(out: Path, overwrite: bool = True, names: Sequence[str] = tuple(PAPER)) -> list[str]:
     """A row for each body."""
-    head = "| model | vertices | vertices of tetrahedra | key-frames | dimension | prepare, s | update, s |"
+    head = "| model | #V | #N | #K | #D | IT, s | UT, s |"
     lines = [head, "|---" * 7 + "|"]
     for name in names:
         x, faces = key_poses(name)

@@ -1,4 +1,4 @@
-"""How much of the mode space of a fine reference other settings hold; a part of precompute.py."""
+"""Modes against those of a fine reference: the space that they hold, and eigenvalues; parts of precompute.py."""
 
 import threading
 import time
@@ -16,6 +16,7 @@ from solids import eigenmodes, element_hessian, embed_surface, lumped_mass
 import torch_modal as tm
 from torch_modal.geometry.connectivity import vertex_areas
 from torch_modal.io.cache import Arrays, Cache
+from torch_modal.modes.extract import MESHERS
 from torch_modal.modes.stiffness import arap_hessian, mass_matrix
 from torch_modal.modes.surface import CanonicalSurface
 from torch_modal.modes.tetrahedra import Mesher, Tetrahedra
@@ -23,7 +24,7 @@ from torch_modal.modes.tetrahedra import Mesher, Tetrahedra
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-N_MODES = 30
+N_MODES, N_FIRST = 30, 3
 ASKED = 0.95
 EXACT = {"stop_energy": 10.0, "max_surface_faces": 10**8, "timeout": 3600.0}
 FULL = tm.TetWild(0.03, 2e-3, **EXACT)
@@ -148,6 +149,27 @@ def table(meshes: Sequence[tuple[str, FloatArray, IntArray]], runs: int, keep: P
             if number == 0:
                 least = min(least, *by_quadratic, *by_linear)
     print(f"\nthe default captures {least:.3f} or more in {runs} runs on each mesh [at least {ASKED}]")
+
+
+def stiffness(name: str, vertices: FloatArray, faces: IntArray, most: float, keep: Path | None) -> None:
+    """Print the first eigenvalues by every mesher over those of quadratic tetrahedra, of a body hard to fill."""
+    surface = CanonicalSurface.of(vertices, faces)
+
+    def compute() -> Arrays:
+        return {"eigenvalues": quadratic_modes(FULL.fill(surface, threading.Event()), N_FIRST).eigenvalues}
+
+    content = {"points": surface.points, "faces": surface.faces}
+    wanted = Cache(keep).get("stiffness", content, asdict(FULL), compute)["eigenvalues"]
+    for mesher, form in (("auto", "edge"), ("lattice", "edge"), ("tetwild", "edge"), ("lattice", "vertex")):
+        start = time.perf_counter()
+        tetrahedra = MESHERS[mesher]().fill(surface, threading.Event())
+        seconds = time.perf_counter() - start
+        k, mass = arap_hessian(tetrahedra, form), mass_matrix(tetrahedra)  # type: ignore[arg-type]
+        ratios = eigenmodes(k, mass, tetrahedra.vertices, N_FIRST).eigenvalues[-N_FIRST:] / wanted
+        asked = f" [at most {most}]" if mesher == "auto" else ""
+        shown = " ".join(f"{ratio:.3f}" for ratio in ratios)
+        size = f"{len(tetrahedra.vertices)} vertices in {seconds:.1f} s"
+        print(f"{name}, {mesher}, {form} form, {size}: eigenvalues over the reference {shown}{asked}", flush=True)
 
 
 def spread(values: Sequence[float], digits: int) -> str:

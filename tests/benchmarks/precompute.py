@@ -3,7 +3,8 @@
     python tests/benchmarks/precompute.py [--samples DIR] [--data DIR] [--parts PART ...]
 
 Each line says what is asked for, in brackets. ``--parts capture`` prints the table of modes against fine references:
-half an hour, most of it for the references, which ``--keep DIR`` keeps for the next time. Times are wall-clock and
+half an hour, most of it for the references, which ``--keep DIR`` keeps for the next time. ``--parts stiffness`` prints
+the first eigenvalues of bodies that are hard to fill, over a reference. Times are wall-clock and
 processor seconds of this run and its children; compare the ratios, and the processor seconds if the machine is shared.
 """
 
@@ -20,8 +21,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
+import motions  # noqa: F401 (the examples are found from here on)
 import numpy as np
-from capture import table
+from _bipeds import biped
+from capture import stiffness, table
 from numpy.typing import NDArray
 from timing import limit_threads
 
@@ -32,7 +35,7 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 ROOT = Path(__file__).parents[2]
 BARE = {"edge_length_fac": 0.03, "epsilon": 2e-3}
-PARTS = ("speed", "threads", "memory", "capture")
+PARTS = ("speed", "threads", "memory", "stiffness", "capture")
 MORE = {"hand": "mh-hand-path", "woman": "mh-woman"}
 
 
@@ -174,6 +177,12 @@ def main() -> None:
         threads(arguments.samples / "creature", arguments.mesher)
     if "memory" in arguments.parts:
         memory(*creature)
+    if "stiffness" in arguments.parts:
+        if arguments.data.is_dir():
+            keyframes, faces = sample(arguments.data / MORE["hand"], "08*")
+            stiffness("closed fist alone", keyframes[0], faces, 1.25, arguments.keep)
+        bird = biped("wader", None)
+        stiffness("slender leg", bird.pose(0.0), bird.faces, 1.1, arguments.keep)
     if "capture" in arguments.parts:
         meshes = [("creature", creature[0][0], creature[1])]
         if arguments.data.is_dir():

@@ -15,10 +15,12 @@ import trimesh
 from conftest import COARSE
 from solids import as_it_is, box, together
 
+from torch_modal.data.samples import load_sample
 from torch_modal.modes import tetwild
+from torch_modal.modes.lattice import Lattice
 from torch_modal.modes.surface import CanonicalSurface
 from torch_modal.modes.tetrahedra import Tetrahedra, TetrahedralizationError, oriented, tet_volumes, without_debris
-from torch_modal.modes.tetwild import TetWild
+from torch_modal.modes.tetwild import EDGE_RANGE, Auto, TetWild
 
 Mesh = tuple[np.ndarray, np.ndarray]
 
@@ -208,3 +210,36 @@ def test_debris_is_dropped_and_pieces_are_kept() -> None:
 def test_settings_out_of_range(name: str, value: float) -> None:
     with pytest.raises(ValueError, match=name):
         TetWild(**{name: value})
+
+
+def test_auto_takes_the_lattice_unless_parts_touch(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[CanonicalSurface] = []
+
+    def fails(self: TetWild, surface: CanonicalSurface, stop: threading.Event) -> Tetrahedra:
+        asked.append(surface)
+        raise TetrahedralizationError("it failed")
+
+    monkeypatch.setattr(TetWild, "fill", fails)
+    keyframes, faces, *_ = load_sample("hand")
+    for x, touching in zip(keyframes.numpy(), (False, True), strict=True):
+        surface = CanonicalSurface.of(x, faces.numpy())
+        filled, lattice = (mesher.fill(surface, threading.Event()) for mesher in (Auto(), Lattice()))
+        assert [one is surface for one in asked] == [True] * touching
+        np.testing.assert_array_equal(filled.vertices, lattice.vertices)
+        np.testing.assert_array_equal(filled.tets, lattice.tets)
+
+
+def test_edges_follow_the_thinnest_part(monkeypatch: pytest.MonkeyPatch) -> None:
+    given: list[float] = []
+
+    def stopped(points: np.ndarray, faces: np.ndarray, settings: TetWild, stop: threading.Event) -> Tetrahedra:
+        given.append(settings.edge_length_fac)  # type: ignore[arg-type]
+        raise TetrahedralizationError("stopped")
+
+    monkeypatch.setattr(tetwild, "_run_worker", stopped)
+    ball = trimesh.creation.icosphere(subdivisions=3)
+    wire = trimesh.creation.cylinder(0.05, 4.0, sections=16).apply_translation([2.0, 0, 0])  # a tenth of the area
+    for mesh in (ball, trimesh.util.concatenate([ball, wire])):
+        with pytest.raises(TetrahedralizationError, match="stopped"):
+            TetWild().fill(CanonicalSurface.of(mesh.vertices, mesh.faces), threading.Event())
+    assert given == [EDGE_RANGE[1], EDGE_RANGE[0]]

@@ -57,8 +57,8 @@ def add_modes(sub: argparse.ArgumentParser) -> None:
     add("--modes", type=number(int, 1), default=30, metavar="N", help=text)
     text = f"modes of the solid inside, of the surface itself (sheets, thin and open bodies), or what fits {default}"
     add("--method", choices=("auto", "solid", "shell"), default="auto", help=text)
-    text = f"what fills solids: a lattice of cubes (deterministic, takes every surface), or fTetWild {default}"
-    add("--mesher", choices=("lattice", "tetwild"), default="lattice", help=text)
+    text = f"what fills solids: a lattice of cubes (deterministic), fTetWild, or what fits {default}"
+    add("--mesher", choices=("auto", "lattice", "tetwild"), default="auto", help=text)
 
 
 def add_registration(sub: argparse.ArgumentParser) -> None:

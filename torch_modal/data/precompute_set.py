@@ -33,7 +33,8 @@ from torch_modal.io.files import write_file
 from torch_modal.keyframes.arrays import checked_times
 from torch_modal.modes.extract import Method, extract_bases
 from torch_modal.modes.processes import describe_exit, end_process, last_line
-from torch_modal.modes.tetwild import TetWild
+from torch_modal.modes.tetrahedra import Mesher
+from torch_modal.modes.tetwild import Auto, TetWild
 from torch_modal.registration.load import load_keyframes
 
 DONE, FAILED, UNFINISHED = "done", "failed", "unfinished"
@@ -60,7 +61,7 @@ class Options:
 
     n_modes: int = 30
     method: Method = "auto"
-    mesher: str = "lattice"
+    mesher: str = "auto"
     cache_dir: str | None = None
     """None: no cache."""
     timeout: float = 600.0
@@ -251,13 +252,15 @@ def compute(source: Path, target: Path, record: Record, options: Options) -> Non
         times = _times(source / TIMES_FILE, len(files)) if options.sequence else None
         if options.key(files) != record.key:
             raise RuntimeError("its files were written to while they were read; start again")
+        # Half of the time leaves some to report a failure, or for a second mesher.
+        tetwild = TetWild(timeout=options.timeout / 2)
+        meshers: dict[str, Mesher] = {"auto": Auto(tetwild), "tetwild": tetwild}
         bases = extract_bases(
             keyframes,
             faces,
             options.n_modes,
             method=options.method,
-            # Half of the time leaves some to report a failure, or for a second mesher.
-            mesher=TetWild(timeout=options.timeout / 2) if options.mesher == "tetwild" else options.mesher,
+            mesher=meshers.get(options.mesher, options.mesher),
             cache_dir=options.cache_dir,
             cache=options.cache_dir is not None,
             progress=False,

@@ -27,12 +27,12 @@ from torch_modal.modes.solid import Solid
 from torch_modal.modes.stiffness import HESSIAN_FORMS, HessianForm
 from torch_modal.modes.surface import CanonicalSurface, self_proximity
 from torch_modal.modes.tetrahedra import Mesher, TetrahedralizationError
-from torch_modal.modes.tetwild import TetWild
+from torch_modal.modes.tetwild import Auto, TetWild
 from torch_modal.progress import Progress, ProgressReport, logger
 
 Method = Literal["auto", "solid", "shell"]
 METHODS: tuple[Method, ...] = ("auto", "solid", "shell")
-MESHERS: dict[str, Callable[[], Mesher]] = {"lattice": Lattice, "tetwild": TetWild}
+MESHERS: dict[str, Callable[[], Mesher]] = {"auto": Auto, "lattice": Lattice, "tetwild": TetWild}
 """Constructors of meshers by name."""
 
 THIN = 0.01
@@ -65,7 +65,7 @@ def extract_bases(
     *,
     method: Method = "auto",
     form: HessianForm = "edge",
-    mesher: Mesher | str = "lattice",
+    mesher: Mesher | str = "auto",
     cache_dir: str | None = None,
     cache: bool = True,
     progress: Progress = None,
@@ -90,7 +90,8 @@ def extract_bases(
         form: Form of the solid's Hessian: ``"edge"``, or ``"vertex"``, the paper's
             (:func:`~torch_modal.modes.stiffness.arap_hessian`).
         mesher: Fills the surface with tetrahedra: ``"lattice"``, which is deterministic, finer where the body is thin,
-            and accepts every surface; ``"tetwild"``, fTetWild in a child process; or an object with settings,
+            and accepts every surface; ``"tetwild"``, fTetWild in a child process; ``"auto"``, the lattice unless parts
+            of every key-frame touch, which it would fuse; or an object with settings,
             :class:`~torch_modal.modes.lattice.Lattice`, :class:`~torch_modal.modes.tetwild.TetWild` or
             another :class:`~torch_modal.modes.tetrahedra.Mesher`.
         cache_dir: Folder of the cache; by default ``TORCH_MODAL_CACHE`` or the user's cache folder.
@@ -119,7 +120,7 @@ def bases_of_checked(
     n_modes: int,
     method: Method = "auto",
     form: HessianForm = "edge",
-    mesher: Mesher | str = "lattice",
+    mesher: Mesher | str = "auto",
     cache: Cache | None = None,
     progress: Progress = None,
 ) -> list[ModalBasis]:

@@ -19,8 +19,8 @@ def arap_hessian(tetrahedra: Tetrahedra, form: HessianForm = "edge") -> sp.csc_m
     """Hessian of the as-rigid-as-possible energy at rest, in the displacements ``u`` of the vertices.
 
     Both forms measure ``min_W ∫ |∇u - W|²`` over infinitesimal rotations ``W`` (skew matrices), with one rotation for
-    each edge or vertex; both are positive semi-definite, with the rigid motions in the null space, and in the same
-    units, so that their eigenvalues can be compared.
+    each edge or vertex; both are positive semi-definite, with the rigid motions in the null space. Their modes are
+    alike, their eigenvalues are not: those of the vertex form are 1.9 to 5.6 times the others on lattices.
 
     - ``"edge"``: ``sum_e vol_e |sym ∇u_e|²``, where ``∇u_e`` is the mean of ``∇u`` over the tetrahedra around an edge
       and ``vol_e`` a sixth of their volume (edge-based smoothed finite elements; Cazes and Meschke 2013 for

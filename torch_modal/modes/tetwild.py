@@ -17,17 +17,23 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from torch_modal.arrays import FloatArray, IntArray
+from torch_modal.modes.lattice import Lattice
 from torch_modal.modes.parallel import StoppedError
 from torch_modal.modes.processes import describe_exit, end_process, last_line
-from torch_modal.modes.surface import CanonicalSurface
+from torch_modal.modes.surface import CanonicalSurface, clearances, self_proximity
 from torch_modal.modes.tetrahedra import Tetrahedra, TetrahedralizationError, oriented, without_debris
+from torch_modal.progress import logger
 
 WORKER = Path(__file__).resolve().with_name("_tetwild_worker.py")
 BOX_DIAGONAL = 100.0
 """Bounding-box diagonal of the surfaces that fTetWild gets."""
 EDGES_PER_THICKNESS = 0.65
-EDGE_RANGE = (0.018, 0.04)
+EDGE_RANGE = (0.012, 0.04)
 """Range of default edge lengths: one tetrahedron across a limb is far too stiff, bulky bodies need no finer ones."""
+THIN_PART = 0.05
+"""Part of the area with the least thickness, which gives the default edge length."""
+TOUCHING = 0.03
+"""Self-proximity above which a lattice fuses so much that modes are too stiff: closed fists have 0.037 and more."""
 
 MESHER_RAISED = 3
 """Exit code of the worker if the mesher itself raised an exception."""
@@ -38,14 +44,15 @@ memory or threads run out."""
 
 @dataclass(frozen=True)
 class TetWild:
-    """The mesher ``"tetwild"``: fTetWild in a child process. The defaults take about 2 s on meshes of 3k to 27k faces.
+    """The mesher ``"tetwild"``: fTetWild in a child process.
 
     fTetWild remeshes the surface within its tolerance, and is not deterministic. In a process of its own, crashes and
     hangs become exceptions, and threads and data-loader workers may use it.
 
     Attributes:
-        edge_length_fac: Ideal edge length as a fraction of the bounding-box diagonal; None takes about two
-            thirds of the mean thickness (twice the volume over the area), from 0.018 to 0.04.
+        edge_length_fac: Ideal edge length as a fraction of the bounding-box diagonal; None takes about two thirds of
+            the mean thickness (twice the volume over the area), or of that of the thinnest 5 % of the area unless parts
+            touch, from 0.012 to 0.04.
         epsilon: Largest distance of the tetrahedra's surface from the input, as a fraction of the diagonal.
         stop_energy: Quality at which fTetWild stops improving; lower is better and slower (its own default is 10).
         max_surface_faces: The surface is decimated to about this many faces first.
@@ -92,7 +99,13 @@ class TetWild:
         points = (surface.points - center) * scale
         edge_length_fac = self.edge_length_fac
         if edge_length_fac is None:
-            edges = EDGES_PER_THICKNESS * surface.thickness / np.linalg.norm(high - low)
+            thickness = surface.thickness
+            if self_proximity(surface) <= TOUCHING:  # otherwise, that of the overlap of two parts is measured
+                thin = clearances(surface)[0]
+                corners, order = surface.points[surface.faces], np.argsort(thin)
+                areas = np.linalg.norm(np.cross(*np.moveaxis(np.diff(corners, axis=1), 1, 0)), axis=1)[order].cumsum()
+                thickness = min(thickness, thin[order][np.searchsorted(areas, THIN_PART * areas[-1])])
+            edges = EDGES_PER_THICKNESS * thickness / np.linalg.norm(high - low)
             edge_length_fac = float(np.clip(edges, *EDGE_RANGE))
         settings = replace(self, edge_length_fac=edge_length_fac)
         try:
@@ -102,6 +115,30 @@ class TetWild:
             mesh = f"a mesh of {len(points)} vertices and {len(surface.faces)} faces"
             raise TetrahedralizationError(f"cannot fill {mesh} with tetrahedra: {error}", error.lasting) from error
         return Tetrahedra(tetrahedra.vertices / scale + center, tetrahedra.tets)
+
+
+@dataclass(frozen=True)
+class Auto:
+    """The mesher ``"auto"``: a lattice, but fTetWild where parts of the surface touch, unless it fails.
+
+    Attributes:
+        tetwild: Settings of fTetWild.
+    """
+
+    tetwild: TetWild = TetWild()
+
+    def key(self) -> dict[str, Any]:
+        """Those of both."""
+        return {**Lattice().key(), **{f"touching_{name}": value for name, value in self.tetwild.key().items()}}
+
+    def fill(self, surface: CanonicalSurface, stop: threading.Event) -> Tetrahedra:
+        """Fill a surface with tetrahedra."""
+        if self_proximity(surface) > TOUCHING:
+            try:
+                return self.tetwild.fill(surface, stop)
+            except TetrahedralizationError as error:
+                logger.info("a lattice, in which parts that touch are joined: %s", error)
+        return Lattice().fill(surface, stop)
 
 
 def _run_worker(points: FloatArray, faces: IntArray, settings: TetWild, stop: threading.Event) -> Tetrahedra:
