@@ -75,13 +75,13 @@ def bake(
         raise ValueError(f"tolerance must be a positive part of the diagonal, such as 0.001; got {tolerance}.")
     when = None if times is None else torch.as_tensor(times, dtype=torch.float64)
     if when is not None and (
-        when.shape not in ((n,), (n + 1,)) or not (when.isfinite().all() and (when.diff() > 0).all())
+        when.shape not in ((n,), (n + 1,)) or not (when.diff().isfinite() & (when.diff() > 0)).all()
     ):
         raise ValueError(f"times must be {n} ascending numbers, one for each frame; got {tuple(when.shape)}.")
     diagonal = float(diagonals(shapes[:1])[0])
     if diagonal == 0:
         raise ValueError("frame 0, the rest shape, is a single point; bones need a shape.")
-    like = torch.as_tensor(frames).detach()
+    like = frames.detach() if isinstance(frames, Tensor) else torch.from_numpy(np.array(frames))
     like = like if like.is_floating_point() else like.double()
     copies = merge_seams(shapes, triangles)
     first = np.unique(copies, return_index=True)[1]

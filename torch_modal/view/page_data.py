@@ -81,10 +81,9 @@ def pack_sequence(
 ) -> dict[str, Any]:
     """Shapes ``(N, V, 3)``, also in steps of the grid, as frames or as a skin of at most so many bones."""
     plain: dict[str, Any] = {"frames": pack_frames(numbers)}
-    if not bones or len(shapes) < 2 or shapes.shape[1] < max(bones, 4) or not np.ptp(shapes[0], axis=0).any():
-        return plain
-    skin = bake(shapes, faces, bones)
-    if skin.error > FOLLOWED:
+    usable = bones and len(shapes) > 1 and shapes.shape[1] >= max(bones, 4) and np.ptp(shapes[0], axis=0).any()
+    skin = bake(shapes, faces, bones) if usable else None
+    if skin is None or skin.error > FOLLOWED:
         return plain
     weights, transforms = (skin.weights.numpy() * STEPS).round(), skin.transforms.numpy()[:, :, :3]
     # From steps of the grid to steps of the grid.
