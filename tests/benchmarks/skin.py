@@ -94,7 +94,11 @@ def draw(out: Path, folder: Path) -> None:
     """Draw the gallop as morph targets, as bones, and as principal shapes."""
     _, frames, faces, _ = list(cases())[1]
     few = read_shapes([tm.save_animation(frames, faces, folder / "few.glb", targets=TARGETS)])[0]
-    rows = {"morph targets": frames, "bones": tm.bake(frames, faces, BONES).shapes().numpy(), "principal": few}
+    rows = {
+        "morph targets": frames,
+        f"{BONES} bones": tm.bake(frames, faces, BONES).shapes().numpy(),
+        f"{TARGETS} targets": few,
+    }
     shown = {name: torch.tensor(row[4::8][:5]) for name, row in rows.items()}
     view = load_sample("creature").view
     tm.render_sequence(shown, faces, out, columns=5, keyframe_indices=[], view=view, overwrite=True)

@@ -25,7 +25,7 @@ ROUNDS = 20  # at most; fewer where one lowers the error by less than a hundredt
 SWEEPS = 2  # over the bones in a round
 LEAST = 4  # vertices of a new bone; fewer leave its rotation undetermined
 EQUAL = 1e-5  # distance of motions that count as one, over the diagonal
-CHUNK = 4096  # vertices whose weights are computed together
+CHUNK = 2**22  # products of bones at vertices, in memory at a time
 TINY, RIDGE = 1e-30, 1e-10
 
 
@@ -169,7 +169,7 @@ class _Decomposition:
         columns = bones.transpose(1, 2).reshape(3 * n_frames, 4 * n)
         grams = (columns.mT @ columns).reshape(n, 4, n, 4).transpose(1, 2).reshape(n * n, 16)
         weights, errors = self.rest.new_zeros(len(self.rest), n), []
-        for part in torch.arange(len(self.rest), device=bones.device).split(CHUNK):
+        for part in torch.arange(len(self.rest), device=bones.device).split(max(1, CHUNK // n**2)):
             p, x = self.rest[part], self.rows[:, part]
             squares = ((p[:, :, None] * p[:, None]).flatten(1) @ grams.mT).unflatten(1, (n, n))
             products = ((columns.mT @ x).unflatten(0, (n, 4)) * p.mT).sum(1).mT
