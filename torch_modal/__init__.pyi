@@ -26,6 +26,7 @@ from .energy.term import PeriodicTerm as PeriodicTerm
 from .energy.term import Term as Term
 from .errors import MeshError as MeshError
 from .errors import MeshWarning as MeshWarning
+from .geometry.skin import Skin as Skin
 from .geometry.vectors import vertex_normals as vertex_normals
 from .inbetween.results import ConvergenceError as ConvergenceError
 from .inbetween.results import InBetweenResult as InBetweenResult
@@ -52,6 +53,7 @@ from .modes.tetwild import TetWild as TetWild
 from .motion.decoder import ModalDecoder as ModalDecoder
 from .motion.editor import PathEditor as PathEditor
 from .motion.path import Path as Path
+from .motion.skin import bake as bake
 from .motion.subdivide import frame_times as frame_times
 from .motion.subdivide import keyframe_places as keyframe_places
 from .motion.subdivide import linear_sequence as linear_sequence

@@ -59,6 +59,10 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
     group.add_argument("--fps", type=positive, metavar="X", help=text)
     group.add_argument("--ping-pong", action="store_true", help="there and back again")
     group.add_argument("--ease", action="store_true", help="slow at both ends")
+    text = "GLB: a skin of at most N bones, a tenth of the size, for engines (40 are usual)"
+    group.add_argument("--bones", type=number(int, 1), metavar="N", help=text)
+    text = "GLB: N principal shapes as the only morph targets"
+    group.add_argument("--targets", type=number(int, 1), metavar="N", help=text)
     text = "the meshes have different connectivity: lay the first onto the others"
     add("--register", action="store_true", help=text)
     add_registration(sub)
@@ -106,6 +110,9 @@ def run(args: argparse.Namespace) -> None:
         )
     single = is_file(args, ANIMATION_FORMATS)
     animation = args.out if single else args.out / "animation.glb"
+    if args.bones or args.targets:
+        if animation.suffix.lower() != ".glb" or (args.bones and args.targets):
+            args.fail("--bones and --targets are two forms of a .glb file; take one of them")
     fmt = args.format or {".gltf": "glb"}.get(args.meshes[0].suffix.lower(), args.meshes[0].suffix.lower()[1:])
     earlier = [] if single else sorted(args.out.glob(f"frame-*.{fmt}"))
     check_output([animation, *([args.picture] if args.picture else []), *earlier], args.meshes, args.overwrite)
@@ -166,6 +173,8 @@ def run(args: argparse.Namespace) -> None:
         ease=args.ease,
         times=when,
         asset=asset,
+        bones=args.bones,
+        targets=args.targets,
         progress=progress,
     )
     report(f"animation: {animation}")

@@ -13,6 +13,7 @@ from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.progress import Progress
 
 if TYPE_CHECKING:
+    from torch_modal.geometry.skin import Skin
     from torch_modal.io.asset import Asset
 
 SECONDS_OF_A_PAIR = 2.0
@@ -181,3 +182,7 @@ class Animation(NamedTuple):
     asset: Asset | None
     max_targets: int
     progress: Progress
+    skin: Skin | None = None
+    """The motion as bones, in the place of morph targets."""
+    targets: int | None = None
+    """Number of principal shapes, in the place of a morph target for each frame."""

@@ -6,13 +6,17 @@ import warnings
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.geometry.connectivity import merge_seams
+from torch_modal.geometry.rigid import best_fit
+from torch_modal.geometry.rotations import quaternion
+from torch_modal.geometry.skin import Skin
 from torch_modal.geometry.vectors import vertex_normals
 from torch_modal.io.asset import Asset, Material, Part
 from torch_modal.io.formats import GLB_HOLDS, Animation
-from torch_modal.io.gltf import ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER, Document, Json
+from torch_modal.io.gltf import ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER, Document, Json, world_transforms
 from torch_modal.io.gltf_asset import GltfAsset
 from torch_modal.io.normals import carry_together
 
@@ -30,48 +34,57 @@ def write_glb(animation: Animation, path: Path) -> None:
 
     Key-frames are kept when frames are left out, and named in the animation's extras. Materials, textures and texture
     coordinates come from the asset; from a GLB or GLTF file also its nodes and everything else.
+
+    A skin, or the mean and principal shapes, replace the morph targets where the animation has them.
     """
     shapes, asset, timing, keyframes = animation.shapes, animation.asset, animation.timing, animation.keyframes
     name, max_targets = animation.name, animation.max_targets
     if max_targets < 1:
         raise ValueError(f"max_targets must be at least 1, got {max_targets}.")
-    kept = thinned(len(shapes), max_targets + 1, keyframes)
+    skin, n_targets = animation.skin, animation.targets
+    kept = np.arange(len(shapes)) if skin or n_targets else thinned(len(shapes), max_targets + 1, keyframes)
     if len(kept) < len(shapes):
         warnings.warn(
             f"{name} holds {len(kept)} of the {len(shapes)} frames (max_targets={max_targets}); "
             "players interpolate linearly between them.",
             stacklevel=3,
         )
-    move_normals = shapes[kept].size * 4 <= LARGEST_FILE_WITH_NORMALS
+    drawn, weights = shapes[kept], np.eye(len(kept))[:, 1:]
+    if skin is not None:
+        drawn = skin.rest[None].double().cpu().numpy()
+    elif n_targets:
+        drawn, weights = _principal(shapes, n_targets)
+    move_normals = drawn.size * 4 <= LARGEST_FILE_WITH_NORMALS
     if not move_normals:
         warnings.warn(f"{name} is large: its normals stay those of frame 0.", stacklevel=3)
     if asset is not None:
         asset.warn_lost(name, asset.keeps if isinstance(asset, GltfAsset) else GLB_HOLDS)
     if isinstance(asset, GltfAsset):
-        document = asset.rebuilt(shapes[kept], move_normals)
+        document = asset.rebuilt(drawn, move_normals)
     else:
-        document = _document(shapes[kept], animation.faces, asset, Path(name).stem, move_normals)
+        document = _document(drawn, animation.faces, asset, Path(name).stem, move_normals)
     if len(kept) > 1:
         times, shown = timing.knots(kept)
         steps = len(shapes) if timing.cyclic else len(shapes) - 1
         extras: Json = {"fps": steps / timing.duration, "frames": kept.tolist(), "keyframes": keyframes}
         if timing.ping_pong:
             extras["ping_pong"] = True
-        weights = np.eye(len(kept), dtype=np.float32)[:, 1:][shown]
-        sampler = {
-            "input": document.add(times.astype(np.float32), "SCALAR", bounds=True),
-            "output": document.add(weights.reshape(-1), "SCALAR"),
-            "interpolation": "LINEAR",
-        }
-        for mesh in document.get("meshes"):
-            mesh["weights"] = [0.0] * (len(kept) - 1)
-            mesh["extras"] = {**mesh.get("extras", {}), "targetNames": [f"frame-{n:03d}" for n in kept[1:]]}
-        channels = [
-            {"sampler": 0, "target": {"node": number, "path": "weights"}}
-            for number, node in enumerate(document.get("nodes"))
-            if "mesh" in node
-        ]
-        played = {"name": "sequence", "samplers": [sampler], "channels": channels, "extras": extras}
+        inputs = document.add(times.astype(np.float32), "SCALAR", bounds=True)
+        if skin is not None:
+            samplers, channels = _add_skin(document, skin, asset, inputs, shown)
+        else:
+            outputs = document.add(weights[shown].astype(np.float32).reshape(-1), "SCALAR")
+            samplers = [{"input": inputs, "output": outputs, "interpolation": "LINEAR"}]
+            names = [f"principal-{n}" if n_targets else f"frame-{kept[n]:03d}" for n in range(1, len(drawn))]
+            for mesh in document.get("meshes"):
+                mesh["weights"] = weights[0].tolist()
+                mesh["extras"] = {**mesh.get("extras", {}), "targetNames": names}
+            channels = [
+                {"sampler": 0, "target": {"node": number, "path": "weights"}}
+                for number, node in enumerate(document.get("nodes"))
+                if "mesh" in node
+            ]
+        played = {"name": "sequence", "samplers": samplers, "channels": channels, "extras": extras}
         document.append("animations", played)
     path.write_bytes(document.to_glb())
 
@@ -88,6 +101,77 @@ def thinned(n_frames: int, most: int, wanted: list[int]) -> IntArray:
         pieces[np.argmax(gaps / pieces)] += 1  # the widest step is shortened
     inside = [np.linspace(a, b, n + 1) for a, b, n in zip(fixed[:-1], fixed[1:], pieces, strict=True)]
     return np.unique(np.concatenate(inside).round().astype(np.int64))
+
+
+def _principal(shapes: FloatArray, n: int) -> tuple[FloatArray, FloatArray]:
+    """The mean, with each of the first n principal shapes added, and their weights in the frames, within -1 and 1.
+
+    *Shape:* ``(N, V, 3) -> (1 + n, V, 3), (N, n)``; n is smaller where fewer give the frames exactly.
+    """
+    mean = shapes.mean(0)
+    moved = (shapes - mean).reshape(len(shapes), -1)
+    values, vectors = np.linalg.eigh(moved @ moved.T)
+    used = np.flatnonzero(values >= 1e-14 * values[-1])[::-1][:n]
+    weights = vectors[:, used] / np.abs(vectors[:, used]).max(0)
+    return np.concatenate([mean[None], mean + np.tensordot(np.linalg.pinv(weights), shapes - mean, 1)]), weights
+
+
+def _add_skin(
+    document: Document, skin: Skin, asset: Asset | None, inputs: int, shown: IntArray
+) -> tuple[list[Json], list[Json]]:
+    """Bind the meshes to joints below a root that carries the rigid motion; samplers and channels of the joints.
+
+    Skinned meshes ignore the transforms of their nodes, which therefore go into the inverse bind matrices.
+    """
+    given = skin.weights, skin.rest, skin.transforms, skin.shapes()
+    weights, rest, transforms, shapes = (array.double().cpu() for array in given)
+    primitives = [primitive for mesh in document.get("meshes") for primitive in mesh["primitives"]]
+    vertices = [np.arange(len(rest))] if asset is None else [part.vertices for part in asset.parts()]
+    for primitive, own in zip(primitives, vertices, strict=True):
+        primitive["attributes"] |= document.add_influences(weights.numpy()[own])
+    fit = best_fit(rest, shapes, torch.ones_like(rest[:, 0]))
+    # The root, then the joints, each at the mean of its vertices.
+    bind = torch.eye(4, dtype=torch.float64).repeat(1 + weights.shape[1], 1, 1)
+    bind[0, :3, 3], bind[1:, :3, 3] = fit.source, weights.mT @ rest / weights.sum(0)[:, None]
+    root = bind[:1].repeat(len(shapes), 1, 1)
+    root[:, :3, :3], root[:, :3, 3] = fit.rotation, fit.target
+    local = torch.cat([root[:, None], torch.linalg.solve(root[:, None], transforms @ bind[1:])], 1)[shown]
+    turns = quaternion(local[..., :3, :3].movedim((2, 3), (0, 1)))
+    turns[:, 1:] *= torch.where((turns[:, 1:] * turns[:, :-1]).sum(0) < 0, -1, 1).cumprod(0)  # never the long way round
+    rotations = (turns[[1, 2, 3, 0]] * 32_767).round().permute(2, 1, 0).numpy().astype("<i2", order="C")
+    translations = local[..., :3, 3].transpose(0, 1).numpy().astype("<f4", order="C")
+    first = len(document.get("nodes"))
+    joints = list(range(first + 1, first + len(bind)))
+    document.append("nodes", {"name": "root", "translation": bind[0, :3, 3].tolist(), "children": joints})
+    for number, place in enumerate((bind[1:, :3, 3] - bind[0, :3, 3]).tolist()):
+        document.append("nodes", {"name": f"bone-{number:02d}", "translation": [float(f"{x:.7g}") for x in place]})
+    top: list[int] = document.get("scenes", document.root.get("scene", 0))["nodes"] if document.get("scenes") else []
+    top.append(first)
+    for number, world in world_transforms(document).items():
+        node = document.get("nodes", number)
+        if "mesh" in node:
+            inverse = (torch.linalg.inv(bind[1:]).numpy() @ world).transpose(0, 2, 1).reshape(-1, 16)
+            matrices = document.add(inverse.astype("<f4"), "MAT4")
+            found = {"inverseBindMatrices": matrices, "joints": joints, "skeleton": first}
+            skinned = {"mesh": node.pop("mesh"), "skin": document.append("skins", found)}
+            if np.linalg.det(world[:3, :3]) < 0:
+                skinned["scale"] = [-1, 1, 1]  # its sign alone counts, for the winding
+            if number in top and np.array_equal(world, np.eye(4)):
+                node.update(skinned)
+            else:
+                top.append(document.append("nodes", {"name": node.get("name", "mesh"), **skinned}))
+    samplers: list[Json] = []
+    channels = []
+    for path, tracks, kind in (
+        ("rotation", rotations, {"componentType": 5122, "normalized": True, "type": "VEC4"}),
+        ("translation", translations, {"componentType": 5126, "type": "VEC3"}),
+    ):
+        view = document.add_bytes(tracks.tobytes())
+        for number, track in enumerate(tracks):
+            place = {"bufferView": view, "byteOffset": number * track.nbytes, "count": len(track)}
+            channels.append({"sampler": len(samplers), "target": {"node": first + number, "path": path}})
+            samplers.append({"input": inputs, "output": document.append("accessors", {**place, **kind})})
+    return samplers, channels
 
 
 def _document(

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from trimesh.transformations import quaternion_matrix
 
 from torch_modal.arrays import FloatArray
+from torch_modal.geometry.skin import STEPS
 
 Json = dict[str, Any]
 
@@ -188,6 +189,15 @@ class Document:
             for attributes, x in zip(added, _differences(_unit(normals)), strict=False):
                 attributes["NORMAL"] = self.add(x, "VEC3", ARRAY_BUFFER)
         return added
+
+    def add_influences(self, weights: FloatArray) -> Json:
+        """Add the largest four weights of bones at points, as attributes. *Shape:* ``(P, J)``."""
+        wide = np.pad(weights, ((0, 0), (0, max(0, 4 - weights.shape[1]))))
+        joints = np.argsort(-wide, axis=1, kind="stable")[:, :4]
+        parts = np.rint(np.take_along_axis(wide, joints, axis=1) * STEPS).astype("<u2")
+        joints = np.where(parts > 0, joints, 0).astype("<u1" if weights.shape[1] <= 256 else "<u2")
+        added = self.add(parts, "VEC4", ARRAY_BUFFER, normalized=True)
+        return {"JOINTS_0": self.add(joints, "VEC4", ARRAY_BUFFER), "WEIGHTS_0": added}
 
     def to_glb(self) -> bytes:
         """The document as a GLB file."""

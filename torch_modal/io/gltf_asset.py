@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.errors import MeshError
@@ -105,6 +106,32 @@ class GltfAsset(Asset):
                     moved = moved + self.document.floats(target["POSITION"]) @ linear
                 shapes[number, primitive.points] = moved
         return shapes
+
+    def played(self) -> FloatArray:
+        """The shapes at the key times of an animation that this package wrote. *Shape:* ``(T, V, 3)``."""
+        document, (animation,) = self.document, self.document.get("animations")
+        tracks = [document.floats(sampler["output"]) for sampler in animation["samplers"]]
+        if not document.get("skins"):
+            first, *others = self.morphs()
+            return first + np.tensordot(tracks[0].reshape(-1, len(others)), np.array(others) - first, 1)
+        # Rotations of the root and the joints, then their translations.
+        rotations, translations = np.split(np.array([track[:, :3] for track in tracks]), 2)
+        turns = [Rotation.from_quat(track).as_matrix() for track in tracks[: len(rotations)]]
+        local = np.zeros((*rotations.shape[:2], 4, 4))
+        local[..., :3, :3], local[..., :3, 3], local[..., 3, 3] = turns, translations, 1
+        frames = np.empty((local.shape[1], *self.positions.shape))
+        for primitive in self._primitives:
+            skin, read = (
+                document.get("skins", document.get("nodes", primitive.node)["skin"]),
+                primitive.json["attributes"],
+            )
+            inverse = document.floats(skin["inverseBindMatrices"]).reshape(-1, 1, 4, 4).swapaxes(2, 3)
+            bones = (local[0] @ local[1:] @ inverse)[:, :, :3].swapaxes(0, 1)
+            joints, weights = document.accessor(read["JOINTS_0"]), document.floats(read["WEIGHTS_0"])
+            points = np.pad(document.floats(read["POSITION"]), ((0, 0), (0, 1)), constant_values=1)
+            for shape, moved in zip(frames[:, primitive.points], bones, strict=True):
+                shape[:] = np.einsum("pk,pkab,pb->pa", weights, moved[joints], points, optimize=True)
+        return frames
 
     # ------------------------------------------------------------------------------------------------ the file again
     def with_positions(self, positions: FloatArray) -> bytes:

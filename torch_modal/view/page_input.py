@@ -56,14 +56,13 @@ def read_shapes(paths: Sequence[str | os.PathLike[str]]) -> tuple[FloatArray, In
 
 
 def _animation(path: Path, asset: GltfAsset) -> tuple[FloatArray, dict[str, Any]] | None:
-    """The frames of a GLB, its mesh and each morph target, and the options of `show`; None without targets."""
+    """The frames of a GLB, by targets or bones, and the options of `show`; None without an animation of shapes."""
     document = asset.document
     try:
-        frames = asset.morphs()
-        n = len(frames)
-        if n == 1:
+        own = document.root["asset"].get("generator") == GENERATOR
+        if len(asset.morphs()) == 1 and not (own and document.get("skins")):
             return None
-        if document.root["asset"].get("generator") != GENERATOR or len(document.get("animations")) != 1:
+        if not own or len(document.get("animations")) != 1:
             raise MeshError(
                 f"{path}: morph targets that save_animation did not write, so their times are not known; export one "
                 "mesh a frame instead"
@@ -74,9 +73,10 @@ def _animation(path: Path, asset: GltfAsset) -> tuple[FloatArray, dict[str, Any]
         kept = [int(number) for number in extras["frames"]]
         keyframes = [kept.index(number) for number in extras["keyframes"] if number in kept]
         back = bool(extras.get("ping_pong"))
+        frames, n = asset.played(), len(kept)
         closed = len(seconds) == n + 1 and not back
-        if len(kept) != n or len(seconds) != (2 * n - 1 if back else n + closed):
-            raise ValueError(f"{n} shapes, {len(kept)} frames, {len(seconds)} times")
+        if len(frames) != len(seconds) or len(seconds) != (2 * n - 1 if back else n + closed):
+            raise ValueError(f"{len(frames)} shapes, {n} frames, {len(seconds)} times")
         rate = float(extras["fps"])
     except MeshError:
         raise
@@ -91,4 +91,4 @@ def _animation(path: Path, asset: GltfAsset) -> tuple[FloatArray, dict[str, Any]
         options["fps"] = float((n - 1) / times[-1])
     if not even:
         options["times"] = times.tolist()
-    return frames, options
+    return frames[:n], options

@@ -1,0 +1,244 @@
+r"""A motion as linear blend skinning: smooth skinning decomposition (Le and Deng 2012).
+
+The squared error needs few sums. With :math:`p = (x, 1)` at rest and bones :math:`T_{tj}`: for new weights
+:math:`\sum_t T_{tj}^T T_{tk}` and :math:`\sum_t T_{tj}^T x_{tv}`, for new bones
+:math:`\sum_v w_{vj} w_{vk}\, p_v p_v^T` and :math:`\sum_v w_{vj}\, x_{tv}\, p_v^T`.
+"""
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torch_modal.arrays import Array
+from torch_modal.errors import MeshWarning
+from torch_modal.geometry.connectivity import merge_seams
+from torch_modal.geometry.inspect import diagonals
+from torch_modal.geometry.rigid import best_rotation
+from torch_modal.geometry.skin import STEPS, Skin
+from torch_modal.io.write import check_frames
+
+ROUNDS = 20  # at most; fewer where one lowers the error by less than a hundredth
+SWEEPS = 2  # over the bones in a round
+LEAST = 4  # vertices of a new bone; fewer leave its rotation undetermined
+EQUAL = 1e-5  # distance of motions that count as one, over the diagonal
+CHUNK = 2**22  # products of bones at vertices, in memory at a time
+TINY, RIDGE = 1e-30, 1e-10
+
+
+@torch.no_grad()
+def bake(
+    frames: Array,
+    faces: Array,
+    bones: int = 40,
+    influences: int = 4,
+    times: Sequence[float] | Tensor | None = None,
+    tolerance: float | None = None,
+) -> Skin:
+    """A motion as linear blend skinning: bones that move rigidly, and their weights at each vertex.
+
+    Bones start from clusters of vertices that move alike, split where the error is largest; then weights and bones are
+    fitted in turns (Le and Deng 2012, Smooth Skinning Decomposition with Rigid Bones). Bones that move as one are
+    merged. Copies of a vertex along seams have equal weights.
+
+    Args:
+        frames: Vertex positions, two frames or more. Frame 0 is the rest shape. *Shape:* ``(T, V, 3)``.
+        faces: Vertex indices. *Shape:* ``(F, 3)``.
+        bones: Most bones.
+        influences: Most bones of a vertex, 1 to 4.
+        times: When the frames are, ascending, for :func:`torch_modal.save_animation`; of a cycle, with the time when it
+            begins again.
+        tolerance: Take the fewest bones with an error, the root mean square distance over the bounding-box diagonal, of
+            at most this. The search makes several fits.
+
+    Returns:
+        The skin, in the coordinates, dtype and device of the frames; without gradients.
+
+    Raises:
+        ValueError: An argument cannot be used; the message says why.
+
+    Warns:
+        MeshWarning: That many bones do not meet the tolerance.
+    """
+    shapes, triangles = check_frames(frames, faces)
+    n, n_vertices = shapes.shape[:2]
+    if n < 2 or n_vertices < LEAST:
+        raise ValueError(f"bones need 2 frames and {LEAST} vertices or more, got {n} of {n_vertices}.")
+    if not isinstance(bones, int) or not 1 <= bones <= n_vertices:
+        raise ValueError(f"bones must be a whole number from 1 to that of the vertices, {n_vertices}; got {bones!r}.")
+    if influences not in (1, 2, 3, 4):
+        raise ValueError(f"influences must be 1, 2, 3 or 4 bones of a vertex, got {influences!r}.")
+    if tolerance is not None and not 0 < tolerance < np.inf:
+        raise ValueError(f"tolerance must be a positive part of the diagonal, such as 0.001; got {tolerance}.")
+    when = None if times is None else torch.as_tensor(times, dtype=torch.float64)
+    if when is not None and (
+        when.shape not in ((n,), (n + 1,)) or not (when.diff().isfinite() & (when.diff() > 0)).all()
+    ):
+        raise ValueError(f"times must be {n} ascending numbers, one for each frame; got {tuple(when.shape)}.")
+    diagonal = float(diagonals(shapes[:1])[0])
+    if diagonal == 0:
+        raise ValueError("frame 0, the rest shape, is a single point; bones need a shape.")
+    like = frames.detach() if isinstance(frames, Tensor) else torch.from_numpy(np.array(frames))
+    like = like if like.is_floating_point() else like.double()
+    copies = merge_seams(shapes, triangles)
+    first = np.unique(copies, return_index=True)[1]
+    centres = shapes.mean(1, keepdims=True)
+    fit = _Decomposition(torch.from_numpy((shapes[:, first] - centres) / diagonal).to(like.device), influences)
+
+    def skin(most: int) -> Skin:
+        weights, made = (found.cpu() for found in fit.solve(most))
+        after = torch.from_numpy(centres)
+        transforms = torch.eye(4, dtype=torch.float64).repeat(*made.shape[:2], 1, 1)
+        transforms[..., :3, :3] = made[..., :3]
+        transforms[..., :3, 3] = made[..., 3] * diagonal + after - made[..., :3] @ after[0, 0]
+        found = Skin(like[0], weights[copies].to(like), transforms.to(like), 0.0, when)
+        off = (found.shapes().double().cpu() - torch.from_numpy(shapes)).square().sum(-1).mean().sqrt()
+        return replace(found, error=float(off) / diagonal)
+
+    best = skin(bones)
+    low, high = 0, best.weights.shape[1]
+    if tolerance is not None and best.error > tolerance:
+        warnings.warn(
+            f"{high} bones leave an error of {best.error:.2g} of the diagonal, above the tolerance of {tolerance:g}",
+            MeshWarning,
+            stacklevel=2,
+        )
+        low = high
+    while tolerance is not None and high - low > 1:
+        found = skin(middle := (low + high) // 2)
+        low, high = (low, middle) if found.error <= tolerance else (middle, high)
+        best = found if found.error <= tolerance else best
+    return best
+
+
+class _Decomposition:
+    """Fits bones ``(T, J, 3, 4)`` and weights ``(V, J)`` to shapes ``(T, V, 3)``."""
+
+    def __init__(self, x: Tensor, influences: int) -> None:
+        self.influences = influences
+        self.rest = torch.nn.functional.pad(x[0], (0, 1), value=1)
+        self.rows = x.mT.flatten(0, 1)
+        self.still = torch.eye(3, 4).to(x).repeat(len(x), 1, 1, 1)
+
+    def solve(self, most: int) -> tuple[Tensor, Tensor]:
+        """Weights in whole parts of :data:`STEPS`, and bones."""
+        bones = self._clusters(most)
+        weights, error = self._weights(bones, self.influences)
+        for _ in range(ROUNDS):
+            last, bones = error.mean(), self._moved(bones, weights)
+            weights, error = self._weights(bones, self.influences)
+            if error.mean() > 0.98 * last:
+                break
+        weights, bones = self._merged(weights, bones)
+        whole = (weights * STEPS).floor()
+        rank = (weights * STEPS - whole).argsort(1, descending=True).argsort(1)
+        weights = (whole + (rank < STEPS - whole.sum(1, keepdim=True))) / STEPS
+        return weights, self._moved(bones, weights)
+
+    def _clusters(self, most: int) -> Tensor:
+        """Bones of clusters of vertices that move alike; those with the largest errors are halved."""
+        weights = torch.ones_like(self.rest[:, :1])
+        bones = self._moved(self.still, weights)
+        weights, error = self._weights(bones, 1)
+        while (n := bones.shape[1]) < most:
+            label = weights.argmax(1)
+            total, halves = error.new_zeros(n).index_add(0, label, error), []
+            for j in total.argsort(descending=True)[: most - n].tolist():
+                own = (label == j).nonzero()[:, 0]
+                if len(own) >= 2 * LEAST and total[j] > EQUAL**2 * len(own):
+                    away = (self.rest[own] - self.rest[own[error[own].argmax()]]).norm(dim=1)
+                    halves.append(torch.zeros_like(error).index_fill(0, own[away <= away.median()], 1))
+            if not halves:
+                break
+            split = self._moved(self.still.repeat(1, len(halves), 1, 1), torch.stack(halves, 1))
+            bones = torch.cat([bones, split], 1)
+            for _ in range(4):
+                weights, error = self._weights(bones, 1)
+                bones = self._moved(bones, weights)
+        return bones
+
+    def _weights(self, bones: Tensor, influences: int) -> tuple[Tensor, Tensor]:
+        """Weights of least squared distance, and its mean over the frames at each vertex.
+
+        Bones are added one by one: that towards which a straight step lowers the distance most.
+        """
+        n_frames, n = bones.shape[:2]
+        columns = bones.transpose(1, 2).reshape(3 * n_frames, 4 * n)
+        grams = (columns.mT @ columns).reshape(n, 4, n, 4).transpose(1, 2).reshape(n * n, 16)
+        weights, errors = self.rest.new_zeros(len(self.rest), n), []
+        for part in torch.arange(len(self.rest), device=bones.device).split(max(1, CHUNK // n**2)):
+            p, x = self.rest[part], self.rows[:, part]
+            squares = ((p[:, :, None] * p[:, None]).flatten(1) @ grams.mT).unflatten(1, (n, n))
+            products = ((columns.mT @ x).unflatten(0, (n, 4)) * p.mT).sum(1).mT
+            own = squares.diagonal(dim1=1, dim2=2)
+            chosen = (own - 2 * products).argmin(1, keepdim=True)
+            found, error = _convex(squares, products, chosen)
+            for _ in range(1, min(influences, n)):
+                towards = (found[:, :, None] * squares.gather(1, chosen[:, :, None].expand(-1, -1, n))).sum(1)
+                here = (found * towards.gather(1, chosen)).sum(1, keepdim=True)
+                slope = products - (found * products.gather(1, chosen)).sum(1, keepdim=True) - towards + here
+                length = (own - 2 * towards + here).clamp_min(TINY)
+                step = (slope / length).clamp(0, 1)
+                gain = (step * (2 * slope - step * length)).scatter(1, chosen, -1)
+                chosen = torch.cat([chosen, gain.argmax(1, keepdim=True)], 1)
+                found, error = _convex(squares, products, chosen)
+            weights[part] = weights[part].scatter(1, chosen, found)
+            errors.append((error + x.square().sum(0)).clamp_min(0) / n_frames)
+        return weights, torch.cat(errors)
+
+    def _moved(self, bones: Tensor, weights: Tensor) -> Tensor:
+        """Bones one after the other, each by the best rigid motion for its part of the vertices."""
+        n_frames, n = bones.shape[:2]
+        weighted = (weights[:, :, None] * self.rest[:, None]).flatten(1)
+        sums, moments = weighted.mT @ weighted, self.rows @ weighted
+        columns = bones.transpose(1, 2).reshape(3 * n_frames, 4 * n).clone()
+        for own in [slice(4 * j, 4 * j + 4) for j in range(n)] * SWEEPS:
+            *_, mass = middle = sums[own, own][3]
+            if mass > TINY:
+                part = moments[:, own] - columns @ sums[:, own] + columns[:, own] @ sums[own, own]
+                part, middle = part.unflatten(0, (n_frames, 3)) / mass, middle[:3] / mass
+                rotation = best_rotation(part[..., :3] - part[..., 3:] * middle)
+                shift = part[..., 3] - rotation @ middle
+                columns[:, own] = torch.cat([rotation, shift[..., None]], 2).flatten(0, 1)
+        return columns.reshape(n_frames, 3, n, 4).transpose(1, 2)
+
+    def _merged(self, weights: Tensor, bones: Tensor) -> tuple[Tensor, Tensor]:
+        """Without bones that move nothing, or as another one does."""
+        kept = weights.sum(0) * STEPS >= 1
+        while True:
+            weights, bones = weights[:, kept], bones[:, kept]
+            weighted = weights[:, :, None] * self.rest[:, None]
+            sums = torch.einsum("vja,vjb->jab", weighted, weighted)
+            apart = bones[:, :, None] - bones[:, None]
+            off = torch.einsum("tjkia,jab,tjkib->jk", apart, sums, apart) / (len(bones) * sums[:, 3, 3, None])
+            j, k = divmod(int(off.fill_diagonal_(torch.inf).argmin()), len(off))
+            if off[j, k] > EQUAL**2:
+                return weights, bones
+            weights[:, k] += weights[:, j]
+            kept = torch.arange(len(off), device=off.device) != j
+
+
+def _convex(squares: Tensor, products: Tensor, chosen: Tensor) -> tuple[Tensor, Tensor]:
+    """Convex weights ``w`` of k bones of least ``w^T K w - 2 c^T w``, of all 2^k - 1 supports, and that.
+
+    *Shape:* ``(n, J, J), (n, J), (n, k) -> (n, k), (n,)``.
+    """
+    k = chosen.shape[1]
+    square = squares.gather(1, chosen[:, :, None].expand(-1, -1, squares.shape[1]))
+    square = square.gather(2, chosen[:, None].expand(-1, k, -1))
+    product = products.gather(1, chosen)[:, None]
+    supports = (torch.arange(1, 2**k)[:, None] >> torch.arange(k) & 1).to(square)
+    # [K 1; 1^T 0] [w; m] = [c; 1], with rows of the unit matrix for bones that are not in the support.
+    system = square.new_zeros(len(square), len(supports), k + 1, k + 1)
+    ridge = RIDGE * square.diagonal(dim1=1, dim2=2).mean(1) + TINY  # bones may move as one
+    regular = square + ridge[:, None, None] * torch.eye(k).to(square)
+    system[..., :k, :k] = regular[:, None] * supports[:, :, None] * supports[:, None] + torch.diag_embed(1 - supports)
+    system[..., :k, k] = system[..., k, :k] = supports
+    right = torch.cat([product * supports, torch.ones_like(system[..., :1, 0])], 2)
+    weights = torch.linalg.solve_ex(system, right[..., None]).result[..., :k, 0] * supports
+    error = ((weights @ square - 2 * product) * weights).sum(2)
+    error, best = error.masked_fill(~(weights >= 0).all(2), torch.inf).min(1)
+    return weights.gather(1, best[:, None, None].expand(-1, 1, k))[:, 0], error
