@@ -34,7 +34,7 @@ def test_segments_are_connected_and_regions_are_the_worst_of_them(layer: MidShap
     space, references = layer.space, layer.in_between.core.alignment.references
     coarse, segment = space.first.coarse, torch.from_numpy(segments(space, references, 6))
     assert segment.unique().tolist() == list(range(6))
-    edges = Mesh.of(coarse.faces, coarse.n_vertices).edges
+    edges = coarse.mesh.edges
     within = edges[segment[edges[:, 0]] == segment[edges[:, 1]]]
     assert len(set(Mesh.of(torch.cat([within, within[:, :1]], 1), coarse.n_vertices).connectivity.vertex_pieces)) == 6
     error = torch.from_numpy(fitting_error(space, references))[coarse.clusters]
