@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from errors import edge_error, vertex_error
 from figure5 import around_vertices
+from spacetime import spacetime
 from torch import Tensor
 
 import torch_modal as tm
@@ -28,7 +29,7 @@ METHODS: dict[str, Callable[[Tensor, Tensor, list[ModalBasis]], Tensor]] = {
         tm.subdivide(keys, faces, LEVELS, cyclic=True, bases=bases, preset="paper", progress=False)
     ),
     "torch_modal": lambda keys, faces, bases: _every(tm.subdivide(keys, faces, LEVELS, cyclic=True, progress=False)),
-    # one line for each further method: key-frames, faces, bases -> key-frames and shapes half-way, in turn
+    "Hildebrandt 2012": lambda keys, faces, bases: spacetime(keys, faces, torch.arange(12.0) / 2, cyclic=True),
 }
 
 
@@ -53,7 +54,7 @@ def main(out: Path, overwrite: bool = True) -> list[str]:
         seconds, middles = time.process_time() - start, x[1::2]
         local = np.mean([edge_error(y, t, some) for y, t, some in zip(middles, truth, inside, strict=True)])
         errors = edge_error(middles, truth, faces), local, vertex_error(middles, truth)
-        lines.append(f"{name:12s} {' '.join(f'{value:6.2f} %' for value in errors)} {seconds:6.1f} s")
+        lines.append(f"{name:16s} {' '.join(f'{value:6.2f} %' for value in errors)} {seconds:6.1f} s")
     motion = tm.encode(frames, faces, list(range(0, 12, 2)), 60, cyclic=True, progress=False)
     apart = (motion.decode() - frames)[1::2].norm(dim=-1).mean() / motion.decoder.size
     lines.append(f"vertices, the spline with 60 amplitudes a frame: {100 * float(apart):.3f} % of the diagonal")
