@@ -123,7 +123,7 @@ def test_local_interpolation_mends_the_worst_regions(tmp_path: Path) -> None:
     lines = load_example("paper/figure5").main(tmp_path)
     plain, local, own = ([float(word) for word in line.split()[-6::2]] for line in lines[1:])
     assert local[1] < 0.7 * plain[1] and own[1] < 0.5 * local[1]  # in the regions
-    assert own[0] < 0.5 * local[0] < 0.5 * plain[0]
+    assert own[0] < 0.7 * local[0] < 0.5 * plain[0]
     assert (tmp_path / "paper-figure5.png").stat().st_size > 50_000
 
 
