@@ -8,6 +8,7 @@ from torch import Tensor
 from torch_modal.energy.term import Mesh
 from torch_modal.geometry.canonical import CANONICAL_SIZE, size
 from torch_modal.geometry.connectivity import Connectivity
+from torch_modal.geometry.rotations import exp, log
 from torch_modal.inbetween.alignment import KeyframeAlignment
 from torch_modal.inbetween.coarse import CoarseMesh
 from torch_modal.inbetween.subspace import elastic_subspace
@@ -101,3 +102,16 @@ def test_all_the_weight_is_the_pose_of_a_key_frame(frame: tuple[KeyframeAlignmen
     for k, weights in enumerate(torch.eye(2, dtype=DOUBLE)):
         shapes, pose, _ = alignment(moved, weights[None])
         torch.testing.assert_close(alignment.restore(shapes[:, k], pose), moved[:, k], atol=1e-10, rtol=0)
+
+
+def test_the_pose_of_two_takes_the_short_way(bars: Shapes, generator: torch.Generator) -> None:
+    """Whatever signs their quaternions have: 20 pairs of poses, most of them far from each other."""
+    x = bars.keyframes[0]
+    alignment = frame_of(x.expand(2, -1, -1), bars.faces)[0]
+    x = x - (alignment.weights[:, None] * x).sum(0)
+    first = torch.stack([random_rotation(generator) for _ in range(20)])
+    step = 0.5 * log(torch.stack([random_rotation(generator) for _ in range(20)]))
+    keyframes = torch.stack([x @ first.mT, x @ exp(2 * step).mT @ first.mT], 1)
+    shapes, pose, _ = alignment(keyframes, torch.full((20, 2), 0.5, dtype=DOUBLE))
+    found = alignment.restore(shapes[:, 0], pose)
+    torch.testing.assert_close(found, x @ exp(step).mT @ first.mT, atol=1e-9, rtol=0)
