@@ -1,4 +1,4 @@
-"""The preset "paper" half-way between pairs whose middle is known: the table of docs/paper.md.
+"""The preset "paper" half-way between pairs whose middle is known.
 
     python tests/benchmarks/paper.py [--modes 30] [--mu X] [--regions N] [--only TEXT ...]
 
@@ -15,17 +15,17 @@ import cases
 import torch
 from cases import Case
 from methods import linear
+from results import Table, add_keep
 from shapes import edge_lengths
-from tables import head, number, percent
-from timing import limit_threads, timed
+from tables import number, percent
+from timing import limit_threads
 from torch import Tensor
 
 import torch_modal as tm
 from torch_modal.energy.energy import RestShapes
 
 DECREASE = 1e-10
-COLUMNS = ("pair", "floor", "linear", "Eq. 4", "paper", "over linear")
-IN_REGIONS = ("regions: area", "floor", "Eq. 4", "paper", "over Eq. 4", "steps", "s")
+COLUMNS = ["pair", "floor", "linear", "Eq. 4", "the paper", "over linear", "in the regions, over Eq. 4", "steps"]
 
 
 def error(lengths: Tensor, truth: Tensor) -> float:
@@ -50,25 +50,22 @@ def steps(layer: tm.MidShape, case: Case) -> int:
     return n
 
 
-def line(case: Case, n_modes: int, options: dict[str, Any]) -> str:
+def cells(case: Case, n_modes: int, options: dict[str, Any]) -> list[str]:
     """One row of the table."""
     ends, faces = (case.x_a, case.x_b), case.faces
     layer = tm.MidShape(case.bases(n_modes), faces, preset="paper", **options)
     plain = tm.MidShape(case.bases(n_modes), faces, preset="paper", **{**options, "regions": 0})
     with torch.no_grad():
-        result, seconds = timed(lambda: layer.solve(*ends))
-        shapes = [linear(case).frames[0], plain.solve(*ends).shapes, result.shapes]
+        shapes = [linear(case).frames[0], plain.solve(*ends).shapes, layer.solve(*ends).shapes]
     core, errors = layer.in_between.core, []
     region = core.local.region
     for some in (faces, faces[region[faces].all(1)]):
         truth = edge_lengths(case.truths[cases.HALF], some)
         middle = sum(edge_lengths(x, some) for x in ends) / 2
         errors.append([error(middle, truth), *(error(edge_lengths(x, some), truth) for x in shapes)])
-    (floor, straight, eq_4, paper), (floor_in, _, eq_4_in, paper_in) = errors
-    cells = [case.name, *map(percent, (floor, straight, eq_4, paper)), number(paper / straight, ".3f")]
-    cells += [percent(float(core.alignment.weights[region].sum())), *map(percent, (floor_in, eq_4_in, paper_in))]
-    cells += [number(paper_in / eq_4_in, ".3f"), str(steps(layer, case)), number(seconds, ".2f")]
-    return f"| {' | '.join(cells)} |"
+    (floor, straight, eq_4, paper), (_, _, eq_4_in, paper_in) = errors
+    found = [case.name, *map(percent, (floor, straight, eq_4, paper)), number(paper / straight, ".3f")]
+    return [*found, number(paper_in / eq_4_in, ".3f"), str(steps(layer, case))]
 
 
 def main() -> None:
@@ -78,13 +75,14 @@ def main() -> None:
     parser.add_argument("--mu", type=float, help="weight of the similarity (default: the preset's)")
     parser.add_argument("--regions", type=int, help="segments that are interpolated locally (default: the preset's)")
     parser.add_argument("--only", nargs="+", default=[""], metavar="TEXT", help="pairs whose names hold one of these")
+    add_keep(parser)
     given = parser.parse_args()
     limit_threads()
     options = {name: value for name, value in (("mu", given.mu), ("regions", given.regions)) if value is not None}
-    print(head(*COLUMNS, *IN_REGIONS))
-    for case in chain(cases.samples(), cases.hand_path()):
-        if cases.HALF in case.truths and any(text in case.name for text in given.only):
-            print(line(case, given.modes, options), flush=True)
+    with Table("paper-pairs", COLUMNS, given.keep, check="--only 'hand 0/1'") as table:
+        for case in chain(cases.samples(), cases.hand_path()):
+            if cases.HALF in case.truths and any(text in case.name for text in given.only):
+                table.add(*cells(case, given.modes, options))
 
 
 if __name__ == "__main__":

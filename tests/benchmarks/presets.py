@@ -3,10 +3,9 @@
     python tests/benchmarks/presets.py [--only TEXT ...]
     python tests/benchmarks/presets.py --modes 10 30 80 --coarse-faces 300 1000 3000
 
-Prints the table of docs/benchmarks.md: in-betweens at t = 1/2 with 30 modes of each key-frame, their mean relative
-error of edge lengths where a truth is known, their energy over that of linear interpolation, the time of one, alone and
-with its gradient to both key-frames, and what the layer's ``state_dict`` holds. Times are
-processor time on one thread, best of several: what to read are the ratios, to the first line of the case.
+In-betweens at t = 1/2 with 30 modes of each key-frame, their mean relative error of edge lengths where a truth is
+known, their energy over that of linear interpolation, and the time of one, alone and with its gradient to both
+key-frames: of the processor, on one thread, best of several, over that of the first line of the case.
 """
 
 import argparse
@@ -20,12 +19,14 @@ import torch
 from cases import Case
 from measures import Yardstick
 from methods import linear
-from tables import geometric_mean, head, number, percent
+from results import Table, add_keep
+from tables import percent
 from timing import limit_threads, timed
 from torch import Tensor
 
 import torch_modal as tm
 
+FEW = ["creature 1/2", "sample hand", "00/08", "woman 00/02"]
 WAYS = {"local steps": tm.Solver(), "modal solve alone": tm.Solver(local_steps=0)}
 
 
@@ -68,48 +69,40 @@ def with_gradient(layer: tm.InBetween, case: Case) -> Callable[[], tuple[Tensor,
     return run
 
 
-def compare(only: list[str], compared: dict[str, tuple[int, dict[str, Any]]]) -> None:
-    """Print a line for each of them on each case, and their means."""
-    found: dict[str, list[tuple[float, ...]]] = {name: [] for name in compared}
-    columns = "", "preset", "edge error", "energy over linear", "ms", "over first", "with gradient", "over first", "MiB"
-    print(head(*columns))
+def compare(only: list[str], compared: dict[str, tuple[int, dict[str, Any]]], table: Table) -> None:
+    """Add a line for each of them on each case."""
     for case in chosen(only):
         yardstick = Yardstick(case)
         straight = linear(case).frames[0]
-        true = cases.HALF in case.truths
-        of_lines = yardstick.edge_error(straight, cases.HALF) if true else math.nan
-        print(f"| {case.name}, {len(case.x_a)} vertices | linear | {percent(of_lines)} | 1.000 | | | | | |")
+        name, true = f"{case.name}, {len(case.x_a):,} vertices", cases.HALF in case.truths
+        table.add(
+            name, "linear", percent(yardstick.edge_error(straight, cases.HALF) if true else math.nan), "1", "", ""
+        )
         first: list[float] = []
-        for name, (n_modes, options) in compared.items():
+        for preset, (n_modes, options) in compared.items():
             layer = tm.InBetween(case.bases(n_modes), case.faces, **options)
             shape, seconds = timed(alone(layer, case))
             _, both = timed(with_gradient(layer, case))
             first = first or [seconds, both]
             error = yardstick.edge_error(shape, cases.HALF) if true else math.nan
             energy = yardstick.energy(shape) / yardstick.energy(straight)
-            held = sum(value.numel() * value.element_size() for value in layer.state_dict().values()) / 2**20
-            found[name].append((error / of_lines, energy, seconds / first[0], both / first[1]))
-            print(
-                f"| | {name} | {percent(error)} | {energy:.3f} | {1e3 * seconds:.0f} | {seconds / first[0]:.2f} | "
-                f"{1e3 * both:.0f} | {both / first[1]:.2f} | {held:.1f} |",
-                flush=True,
-            )
-    columns = "geometric means", "edge error over linear", "energy over linear", "time over first", "with gradient"
-    print(f"\n{head(*columns)}")
-    for name, rows in found.items():
-        means = [geometric_mean(list(column)) for column in zip(*rows, strict=True)]
-        print(f"| {name} | " + " | ".join(number(mean, ".3f") for mean in means) + " |")
+            ratios = [f"{spent / of:.2f}" for spent, of in zip((seconds, both), first, strict=True)]
+            table.add(name, preset, percent(error), f"{energy:.3f}", *ratios)
 
 
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", nargs="+", default=[""], metavar="TEXT", help="only cases with one of these in them")
+    parser.add_argument("--only", nargs="+", default=FEW, metavar="TEXT", help="cases with one of these in their names")
     parser.add_argument("--modes", nargs="+", type=int, default=[], help="of each key-frame")
     parser.add_argument("--coarse-faces", nargs="+", type=int, default=[])
-    arguments = parser.parse_args()
+    add_keep(parser)
+    given = parser.parse_args()
     limit_threads()
-    compare(arguments.only, settings(arguments.modes, arguments.coarse_faces))
+    timed_columns = ["time", "with gradient"]
+    columns = ["", "preset", "edge error", "energy over linear", *timed_columns]
+    with Table("presets", columns, given.keep, timed_columns, "--only 'creature 1/2'", labels=2) as table:
+        compare(given.only, settings(given.modes, given.coarse_faces), table)
 
 
 if __name__ == "__main__":
