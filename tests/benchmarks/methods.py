@@ -46,6 +46,8 @@ class Outcome(NamedTuple):
     """Processor seconds of one call for all T; NaN where there is nothing to time."""
     note: str = ""
     """What a reader should know: that it did not converge, for instance."""
+    making: float = float("nan")
+    """Seconds of what is made once for a mesh, where that was timed."""
 
 
 class Method(NamedTuple):
@@ -223,7 +225,7 @@ def by_peer(case: Case, limit: float = PEER_SECONDS) -> Outcome:
         if run.returncode != 0:
             raise UnavailableError((run.stderr.strip() or f"exit code {run.returncode}").splitlines()[-1][:120])
         given = np.load(answer)
-        frames, seconds = torch.from_numpy(given["frames"]).to(case.x_a.dtype), float(given["seconds"])
+        frames = torch.from_numpy(given["frames"]).to(case.x_a.dtype)
     whole = torch.lerp(case.x_a, case.x_b, HALF).repeat(len(case.times), 1, 1)
     whole[:, used] = frames  # vertices of no face stay where they are
-    return Outcome(whole, seconds)
+    return Outcome(whole, float(given["seconds"]), making=float(given["making"]))

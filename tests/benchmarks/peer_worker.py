@@ -1,8 +1,8 @@
 """In-betweens by morphomatics, in a process of its own: ``python peer_worker.py request.npz answer.npz``.
 
 The Python that runs this needs morphomatics, not torch or torch_modal. The shape space (gradient and divergence of the
-reference, factors of its Poisson system, compiled geodesic) is made before the clock starts; what is timed goes from
-key-frames to in-betweens. The geodesic is compiled by ``jax.jit``.
+reference, factors of its Poisson system) is timed for itself; what else is timed goes from key-frames to in-betweens.
+The geodesic is compiled by ``jax.jit``, before any clock starts.
 """
 
 import sys
@@ -46,7 +46,7 @@ def main(request: str, answer: str) -> None:
     """Read key-frames, write frames and seconds."""
     given = np.load(request)
     x_a, x_b, faces = given["x_a"], given["x_b"], given["faces"]
-    made = PinnedCoords(Surface(x_a.copy(), faces))
+    made, making = timed(lambda: PinnedCoords(Surface(x_a.copy(), faces)))
 
     @jax.jit
     def geodesic(a: jax.Array, b: jax.Array, t: float) -> jax.Array:
@@ -58,7 +58,7 @@ def main(request: str, answer: str) -> None:
         return np.stack([made.centred(x, (1 - t) * x_a + t * x_b) for x, t in zip(shapes, given["times"], strict=True)])
 
     result, seconds = timed(frames)
-    np.savez(answer, frames=result, seconds=seconds)
+    np.savez(answer, frames=result, seconds=seconds, making=making)
 
 
 if __name__ == "__main__":

@@ -1,141 +1,123 @@
-"""How fast in-betweens are: kernels against torch, against other versions of this package, and against morphomatics.
+"""How fast in-betweens are: over morphomatics, or over another version of this package.
 
-    python tests/benchmarks/speed.py [--before CHECKOUT] [--peer-python FILE] [--rounds 3]
+    python tests/benchmarks/speed.py [--peer-python FILE] [--rounds 2] [--only TEXT ...]
+    python tests/benchmarks/speed.py --before CHECKOUT
     python tests/benchmarks/speed.py --parts growth first
     python tests/benchmarks/speed.py --parts batches [--device cuda]
 
 Each side runs in processes of its own, on one thread, in turns; what is told are ratios of processor seconds, the best
-of all rounds, so that what else a machine does slows all sides. ``--before`` names the folder of another checkout, for
-example of an earlier commit. Bases are there before the clock starts, but for ``--parts first``: from two new
-key-frames to a sequence with nothing cached, on the clock. ``--parts batches`` compares batches, forward and with their
-gradients, with single calls.
+of all rounds, so that what else a machine does slows all sides. In-betweens, with gradients too, are over theirs
+without; making a layer is over the set-up of their shape space. ``--before`` names the folder of another checkout, for
+example of an earlier commit, which each column is then compared with. Bases are there before the clock starts, but for
+``--parts first``: from two new key-frames to a sequence with nothing cached, on the clock. ``--parts batches`` compares
+batches, forward and with their gradients, with single calls.
 """
 
 import argparse
 import json
+import math
 import os
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from statistics import median
 from typing import Any
 
 import numpy as np
 import torch
 import trimesh
-from cases import Case, samples, shared
-from methods import UnavailableError, by_peer, peer_python
+from cases import Case, KeyframeSet, divided, samples, shared
+from methods import by_peer
+from results import Table, add_keep
+from tables import geometric_mean
 from timing import limit_threads, timed
 
 import torch_modal as tm
-from torch_modal.data.samples import load_sample
 
-WORK = ("whole", "without local steps", "forward and backward", "making a layer")
-MOTION = ("193 shapes", "making a path")
-BASELINE = "torch"
+WORK = ("whole", "no local steps", "fast", "torch alone", "forward and backward", "making a layer")
+DIVIDED = ("sample creature", "mh-hand", "mh-woman")
 
 
 def all_cases() -> dict[str, Case]:
-    """One case of each mesh."""
+    """One case of each mesh, and some with triangles divided in four."""
     meshes: dict[int, Case] = {}
     for case in [*samples(), *shared()]:
         meshes.setdefault(len(case.x_a), case)
-    return {case.name: case for case in meshes.values() if len(case.x_a) > 1000}
+    cases = [case for case in meshes.values() if len(case.x_a) > 1000]
+    for case in [case for case in cases if case.name.startswith(DIVIDED)]:
+        ends, faces = divided(torch.stack([case.x_a, case.x_b]), case.faces)
+        cases.append(Case(f"{case.name}, divided", KeyframeSet(ends, faces), 0, 1, {}))
+    return {case.name: case for case in cases if len(case.x_a) > 2000}
 
 
-def solvers(backend: str) -> list[tm.Solver]:
-    """The default, and that without local steps."""
-    chosen = {} if backend == "before" else {"backend": backend}
-    return [tm.Solver(**chosen), tm.Solver(local_steps=0, **chosen)]
+def layers(case: Case) -> dict[str, Callable[[], tm.InBetween]]:
+    """The layers that are compared, to be made."""
+    bases = case.bases()
+    options: dict[str, dict[str, Any]] = {
+        "whole": {},
+        "no local steps": {"solver": tm.Solver(local_steps=0)},
+        "fast": {"preset": "fast"},
+        "torch alone": {"solver": tm.Solver(backend="torch")},
+    }
+    return {name: partial(tm.InBetween, bases, case.faces, **own) for name, own in options.items()}
 
 
-def worker(name: str, backend: str, answer: str) -> None:
-    """One side of one case: seconds, and what came out."""
+def worker(name: str, answer: str) -> None:
+    """Seconds of one side of one case."""
     limit_threads()
-    if name == "motion":
-        sample = load_sample("creature")
-        faces = sample.faces
-        bases = tm.extract_bases(sample.keyframes, faces)
-        path = tm.Path(bases, faces, cyclic=True, solver=solvers(backend)[0])
-        t = torch.arange(193, dtype=torch.float64) / 193 * len(sample.keyframes)
-
-        def make() -> Any:
-            return tm.Path(bases, faces, cyclic=True, solver=solvers(backend)[0])
-
-        with torch.no_grad():
-            found = {"193 shapes": timed(lambda: path(sample.keyframes, t))[1], "making a path": timed(make)[1]}
-            np.savez(answer, shape=path(sample.keyframes, t).numpy(), gradient=0, **found)
-        return
     case = all_cases()[name]
-    bases, x_a, x_b = case.bases(), case.x_a, case.x_b
-    layer, modal = (tm.InBetween(bases, case.faces, solver=solver) for solver in solvers(backend))
+    makes, half = layers(case), torch.tensor(0.5, dtype=torch.float64)
+    whole = makes["whole"]()
 
     def backward() -> torch.Tensor:
-        leaf = x_a.clone().requires_grad_()
-        (found,) = torch.autograd.grad(layer(leaf, x_b, 0.5).square().sum(), leaf)
+        leaf = case.x_a.clone().requires_grad_()
+        (found,) = torch.autograd.grad(whole(leaf, case.x_b, half).square().sum(), leaf)
         return found
 
-    found: dict[str, Any] = {
-        "forward and backward": timed(backward)[1],
-        "making a layer": timed(lambda: tm.InBetween(bases, case.faces, solver=solvers(backend)[0]))[1],
-    }
-    with torch.no_grad():
-        found["whole"] = timed(lambda: layer(x_a, x_b, 0.5))[1]
-        found["without local steps"] = timed(lambda: modal(x_a, x_b, 0.5))[1]
-        shape = layer(x_a, x_b, 0.5).numpy() / float((x_a.amax(0) - x_a.amin(0)).norm())
-    np.savez(answer, shape=shape, gradient=backward().numpy(), **found)
+    found = {"forward and backward": timed(backward)[1], "making a layer": timed(makes["whole"])[1]}
+    for part, make in makes.items():
+        layer = make()
+        with torch.no_grad():
+            found[part] = timed(lambda: layer(case.x_a, case.x_b, half))[1]  # noqa: B023
+    Path(answer).write_text(json.dumps(found))
 
 
-def run(name: str, side: str, before: Path | None) -> dict[str, np.ndarray]:
-    """A worker in a process of its own."""
-    root = Path(tm.__file__).parents[1] if side != "before" or before is None else before
+def run(name: str, root: Path) -> dict[str, float]:
+    """A worker in a process of its own, with the package of a checkout."""
     with tempfile.TemporaryDirectory() as scratch:
-        answer = Path(scratch) / "answer.npz"
-        command = [sys.executable, __file__, "--worker", name, side, str(answer)]
-        environment = {**os.environ, "PYTHONPATH": str(root)}  # whose package is measured
+        answer = Path(scratch) / "answer.json"
+        command = [sys.executable, __file__, "--worker", name, str(answer)]
+        environment = {**os.environ, "PYTHONPATH": str(root)}
         subprocess.run(command, check=True, env=environment, stderr=subprocess.DEVNULL)
-        return dict(np.load(answer))
+        return json.loads(answer.read_text())
 
 
-def compare(arguments: argparse.Namespace) -> None:
-    """Kernels, torch, another checkout, morphomatics."""
-    sides = ["warp", BASELINE, *(["before"] if arguments.before else [])]
-    ratios: dict[tuple[str, str], list[float]] = {}
-    peers = []
-    for name, case in [*all_cases().items(), ("motion", None)]:
-        rounds = [{side: run(name, side, arguments.before) for side in sides} for _ in range(arguments.rounds)]
-        work = MOTION if name == "motion" else WORK
-        best = {(side, part): min(float(each[side][part]) for each in rounds) for side in sides for part in work}
-        print(f"\n{name}" + ("" if case is None else f", {len(case.x_a)} vertices"))
-        for part in work:
-            line = f"  {part:<22}" + "".join(f"{side} {1e3 * best[side, part]:7.1f} ms  " for side in sides)
-            for side in sides[1:]:
-                ratios.setdefault((part, side), []).append(best[side, part] / best["warp", part])
-                line += f"  {side}/warp {ratios[part, side][-1]:.2f}"
-            print(line)
-        ours, truth = rounds[0]["warp"], rounds[0][BASELINE]
-        scale = max(float(np.abs(truth["gradient"]).max()), 1e-300)
-        print(
-            f"  warp against torch: shape {np.abs(ours['shape'] - truth['shape']).max():.1e} of the diagonal, gradient "
-            f"{np.abs(ours['gradient'] - truth['gradient']).max() / scale:.1e} of the largest",
-            flush=True,
-        )
-        if case is not None and peer_python():
-            try:
-                theirs = min(by_peer(case).seconds for _ in range(arguments.rounds))
-            except UnavailableError as error:
-                print(f"  morphomatics: {error}")
+def theirs(case: Case) -> dict[str, float]:
+    """Their seconds for each column."""
+    found = by_peer(case.at([0.5]))
+    return dict.fromkeys(WORK, found.seconds) | {"making a layer": found.making}
+
+
+def compare(given: argparse.Namespace) -> None:
+    """Ratios of all meshes, and their geometric means."""
+    own, means = Path(tm.__file__).parents[1], []
+    name = "speed" if given.before is None else "speed-before"
+    with Table(name, ["mesh", "vertices", *WORK], given.keep, WORK) as table:
+        for name, case in all_cases().items():
+            if not any(text in name for text in given.only):
                 continue
-            peers.append(best["warp", "whole"] / theirs)
-            print(f"  morphomatics {1e3 * theirs:.1f} ms: whole takes {peers[-1]:.2f} of that")
-    print("\nmedians")
-    for (part, side), found in ratios.items():
-        print(f"  {part:<22} {side}/warp {median(found):.2f}   ({min(found):.2f} to {max(found):.2f}, of {len(found)})")
-    if peers:
-        print(f"  whole / morphomatics   {median(peers):.2f}   ({min(peers):.2f} to {max(peers):.2f})")
+            ours, others = {}, {}
+            for _ in range(given.rounds):
+                other = theirs(case) if given.before is None else run(name, given.before)
+                for best, found in ((ours, run(name, own)), (others, other)):
+                    best.update({part: min(found[part], best.get(part, math.inf)) for part in WORK})
+            ratios = [ours[part] / others[part] for part in WORK]
+            means.append(ratios)
+            table.add(name, f"{len(case.x_a):,}", *(f"{ratio:.3f}" for ratio in ratios))
+        table.add("geometric mean", "", *(f"{geometric_mean(list(each)):.3f}" for each in zip(*means, strict=True)))
 
 
 def growth(arguments: argparse.Namespace) -> None:
@@ -146,7 +128,8 @@ def growth(arguments: argparse.Namespace) -> None:
     for _ in range(3):
         bases = tm.extract_bases(shapes, faces)
         for backend in ("warp", "torch"):
-            both = [tm.InBetween(bases, faces, solver=solver) for solver in solvers(backend)]
+            solvers = [tm.Solver(backend=backend), tm.Solver(backend=backend, local_steps=0)]
+            both = [tm.InBetween(bases, faces, solver=solver) for solver in solvers]
             with torch.no_grad():
                 whole, modal = (timed(lambda: layer(*shapes, 0.5))[1] for layer in both)  # noqa: B023
             print(
@@ -228,9 +211,13 @@ def main() -> None:
     parser.add_argument("--parts", nargs="+", choices=list(PARTS), default=["compare"])
     parser.add_argument("--before", type=Path, metavar="CHECKOUT")
     parser.add_argument("--peer-python", type=Path, metavar="FILE", help="a Python that has morphomatics")
-    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--rounds", type=int, default=2)
+    parser.add_argument(
+        "--only", nargs="+", default=[""], metavar="TEXT", help="meshes with one of these in their names"
+    )
     parser.add_argument("--device", default="cpu", help="of the batches")
-    parser.add_argument("--worker", nargs=3, metavar=("CASE", "SIDE", "ANSWER"), help=argparse.SUPPRESS)
+    parser.add_argument("--worker", nargs=2, metavar=("CASE", "ANSWER"), help=argparse.SUPPRESS)
+    add_keep(parser)
     arguments = parser.parse_args()
     if arguments.worker:
         worker(*arguments.worker)
