@@ -14,8 +14,10 @@ from torch_modal.autograd import lasting
 from torch_modal.energy.term import Mesh, Term
 from torch_modal.geometry.vectors import pick
 
-# Roundings of an energy, relative to it, that say nothing about a step.
-ENERGY_ROUNDING = 64.0
+
+def energy_rounding(dtype: torch.dtype) -> float:
+    """Difference of energies, relative to them, that says nothing about a step."""
+    return 64.0 * torch.finfo(dtype).eps
 
 
 class Rest(NamedTuple):

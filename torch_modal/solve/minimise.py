@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torch_modal import trees
-from torch_modal.energy.energy import ENERGY_ROUNDING
+from torch_modal.energy.energy import energy_rounding
 from torch_modal.energy.modal_energy import Derivatives
 
 # Evaluations of the gradient with one Hessian of Gauss and Newton. Samples that need more get another.
@@ -84,13 +84,15 @@ class Solution(NamedTuple):
         return self.status == Status.CONVERGED
 
 
-class _State(NamedTuple):
+class State(NamedTuple):
     """The state of each sample. Vectors have a last dimension of 1, for matrix products."""
 
     row: Tensor
     """Which sample of the batch it is. *Shape:* ``(B,)``."""
     a: Tensor
     """*Shape:* ``(B, n, 1)``."""
+    there: Tensor
+    """Where the next step leads. *Shape:* ``(B, n, 1)``."""
     energy: Tensor
     """*Shape:* ``(B,)``."""
     gradient: Tensor
@@ -137,15 +139,17 @@ def minimise(
         derivatives = energy.derivatives(found[rows], some, second_order=False)
         own_norm = derivatives.gradient.norm(dim=-1)
         if not used:
-            start, goal = own_norm, torch.maximum(tolerance * own_norm, derivatives.floor)
+            start, goal = own_norm.clone(), torch.maximum(tolerance * own_norm, derivatives.floor)
         factor, info = torch.linalg.cholesky_ex(ridged(derivatives.gauss_newton))
         regular = (info == 0) & own_norm.isfinite() & reached[rows].isfinite()
-        inverse = torch.cholesky_inverse(torch.where(regular[:, None, None], factor, eye))
-        own = found[rows, :, None], reached[rows], derivatives.gradient[..., None], own_norm, inverse
+        inverse = torch.cholesky_inverse(torch.where(regular[:, None, None], factor, eye)).contiguous()
         length, before = (regular & (own_norm > goal[rows])).to(a), n_steps[rows]
         stiffest = derivatives.gauss_newton.diagonal(dim1=-2, dim2=-1).amax(-1)
         rounding = derivatives.resolution / stiffest.clamp_min(torch.finfo(a.dtype).tiny).sqrt()
-        state = _State(rows, *own, length, goal[rows], rounding, before, some)
+        own, slope = found[rows, :, None], derivatives.gradient[..., None]
+        there = own - length[:, None, None] * torch.bmm(inverse, slope)
+        given = reached[rows], slope, own_norm, inverse, length, goal[rows], rounding, before.clone(), some
+        state = State(rows, own, there, *given)
         whole = found, reached, norm, n_steps, drowned
         for _ in range(min(MOST_EVALUATIONS, max_steps - used)):
             n_active = int(torch.count_nonzero(state.length))
@@ -167,7 +171,7 @@ def minimise(
     return Solution(found, reached, norm / start.clamp_min(torch.finfo(start.dtype).tiny), n_steps, status)
 
 
-def _put(whole: tuple[Tensor, ...], state: _State) -> None:
+def _put(whole: tuple[Tensor, ...], state: State) -> None:
     """Write the amplitudes, energies, gradient norms and numbers of steps of some samples into those of all.
 
     The last says where all that is left to gain is less than the rounding of the energy: nothing compares steps then.
@@ -176,47 +180,49 @@ def _put(whole: tuple[Tensor, ...], state: _State) -> None:
     # At a start that has converged there is nothing to gain, and perhaps only rounding to follow.
     ended = ((state.norm <= state.goal) & (state.n_steps > 0))[:, None, None]
     gain = 0.5 * (state.gradient * step).sum((1, 2))
-    drowned = gain <= ENERGY_ROUNDING * torch.finfo(gain.dtype).eps * state.energy.abs()
+    drowned = gain <= energy_rounding(gain.dtype) * state.energy.abs()
     a = torch.where(ended, state.a - step, state.a).squeeze(-1)
     for values, own in zip(whole, (a, state.energy, state.norm, state.n_steps, drowned), strict=True):
         values[state.row] = own
 
 
-def _advanced(energy: AmplitudeEnergy, state: _State) -> _State:
+def _advanced(energy: AmplitudeEnergy, state: State) -> State:
     """One evaluation: a step where the energy falls, a shorter one next where it does not."""
-    a, gradient, inverse, length = state.a, state.gradient, state.inverse, state.length
-    move = torch.bmm(inverse, gradient).mul_(-length[:, None, None])
-    there = a + move
-    value, slope = energy.value_and_gradient(there.squeeze(-1), state.placement)
-    slope = slope[..., None]
+    value, slope = energy.value_and_gradient(state.there.squeeze(-1), state.placement)
+    by_kernel = getattr(energy, "quasi_newton", None)
+    if by_kernel is None or value.device.type != "cpu":
+        return updated(state, value, slope[..., None])
+    return by_kernel(state, SHORTEST, value, slope)
+
+
+def updated(state: State, value: Tensor, slope: Tensor) -> State:
+    """The state after an evaluation at its next place. *Shape:* ``(B,), (B, n, 1)``."""
+    a, there, gradient, inverse, length = state.a, state.there, state.gradient, state.inverse, state.length
     norm = torch.linalg.vector_norm(slope, dim=(1, 2))
     # Energies are sums of squares. They may rise by their rounding, and where the gradient falls, by that of positions.
-    bound = state.energy * (1 + ENERGY_ROUNDING * torch.finfo(value.dtype).eps)
+    bound = state.energy * (1 + energy_rounding(value.dtype))
     bound = torch.where(norm < state.norm, bound + state.rounding * state.energy.clamp_min(0).sqrt(), bound)
     better = (length > 0) & (value <= bound)
-    change = slope - gradient
-    if bool(better.all()):
-        length = torch.ones_like(length)
-    else:
-        taken = better[:, None, None]
-        there, move, change = torch.where(taken, there, a), move * taken, torch.where(taken, change, 0)
-        value, slope = torch.where(better, value, state.energy), torch.where(taken, slope, gradient)
-        norm = torch.where(better, norm, state.norm)
-        shorter = torch.where(length > SHORTEST, 0.5 * length, 0)
-        length = torch.where(better, 1, shorter)
+    taken = better[:, None, None]
+    move, change = torch.where(taken, there - a, 0), torch.where(taken, slope - gradient, 0)
+    a, gradient = torch.where(taken, there, a), torch.where(taken, slope, gradient)
+    value, norm = torch.where(better, value, state.energy), torch.where(better, norm, state.norm)
+    length = torch.where(better, 1, torch.where(length > SHORTEST, 0.5 * length, 0)) * (norm > state.goal)
     # The update keeps the inverse positive definite where the gradient grows along the step; elsewhere it is left out.
     pushed, across = torch.bmm(inverse, change), change.mT
     curvature = torch.bmm(across, move)
     share = torch.where(curvature > 0, curvature.reciprocal(), 0)
     half = torch.bmm(across, pushed).mul_(share).add_(1).mul_(0.5)
     other, scaled = torch.addcmul(pushed, half, move, value=-1), move * share
+    inverse = inverse.baddbmm_(scaled, other.mT, alpha=-1).baddbmm_(other, scaled.mT, alpha=-1)
     return state._replace(
-        a=there,
+        a=a,
+        there=a - length[:, None, None] * torch.bmm(inverse, gradient),
         energy=value,
-        gradient=slope,
+        gradient=gradient,
         norm=norm,
-        inverse=inverse.baddbmm_(scaled, other.mT, alpha=-1).baddbmm_(other, scaled.mT, alpha=-1),
-        length=length * (norm > state.goal),
+        inverse=inverse,
+        length=length,
         n_steps=state.n_steps + better,
     )
 

@@ -1,6 +1,7 @@
 """The parts of an in-between in torch."""
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 from torch import Tensor
 
@@ -21,6 +22,9 @@ class TorchBackend:
     This is the reference: it serves all dtypes, devices, gradients and transforms. Another backend overrides the parts
     that it is faster at, and returns to these where it cannot serve; both give the same numbers, up to rounding.
     """
+
+    quasi_newton: Callable[..., Any] | None = None
+    """Does what :func:`torch_modal.solve.minimise.updated` does."""
 
     def load(self) -> None:
         """Load what takes long, so that nobody waits for it later."""

@@ -6,7 +6,7 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor, nn
 
-from torch_modal.energy.energy import ENERGY_ROUNDING, Energy, Linearised, Reference, RestShapes
+from torch_modal.energy.energy import Energy, Linearised, Reference, RestShapes, energy_rounding
 from torch_modal.energy.shell import N_SHELL_TERMS
 from torch_modal.energy.term import Mesh, Term
 from torch_modal.geometry.canonical import CANONICAL_SIZE
@@ -174,7 +174,7 @@ def step_length(before: Tensor, slope: Tensor, after: Tensor, largest: Tensor) -
         *Shape:* ``(B,)``.
     """
     half, finite = -0.5 * slope, after.isfinite()
-    rounding = ENERGY_ROUNDING * torch.finfo(before.dtype).eps * before.detach().abs()
+    rounding = energy_rounding(before.dtype) * before.detach().abs()
     surplus = (torch.where(finite, after, 0) - before + half - rounding).clamp_min(0)
     counts = ((largest / SLIGHT - 1) / 9).clamp(0, 1)
     shorter = (surplus > 0) & (counts > 0)

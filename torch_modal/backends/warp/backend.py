@@ -16,6 +16,7 @@ from torch_modal.backends.warp.distortion import WarpDistortion
 from torch_modal.backends.warp.fine_steps import WarpFineEnergy
 from torch_modal.backends.warp.launch import kernels, load_kernels
 from torch_modal.backends.warp.modal_energy import WarpModalEnergy
+from torch_modal.backends.warp.quasi_newton import update
 from torch_modal.backends.warp.rotations import WarpRotations
 from torch_modal.energy.bend import Bend
 from torch_modal.energy.energy import Energy
@@ -34,6 +35,8 @@ class WarpBackend(TorchBackend):
     Raises:
         MissingPackageError: Warp is not installed.
     """
+
+    quasi_newton = staticmethod(update)
 
     def __init__(self) -> None:
         if importlib.util.find_spec("warp") is None:

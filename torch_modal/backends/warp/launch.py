@@ -17,9 +17,9 @@ from torch import Tensor
 from torch_modal.energy.term import Mesh
 from torch_modal.progress import ProgressReport
 
-Module = Literal["shell", "modal", "steps", "rotations", "rotations_adjoint", "adjoints", "crossings"]
+Module = Literal["shell", "modal", "quasi_newton", "steps", "rotations", "rotations_adjoint", "adjoints", "crossings"]
 PACKAGE = "torch_modal.backends.warp.kernels"
-IN_BETWEENS: tuple[Module, ...] = ("rotations", "shell", "modal", "steps")
+IN_BETWEENS: tuple[Module, ...] = ("rotations", "shell", "modal", "quasi_newton", "steps")
 """The modules for in-betweens without gradients."""
 NO_DRIVER = b"Warp CUDA warning: Could not find or load the NVIDIA CUDA driver"
 """What Warp says where there is no GPU, with no setting that turns it off: in every run, it looks like an error."""
