@@ -69,6 +69,9 @@ class Hinge:
     b: vec3
     n1: vec3
     n2: vec3
+    per1: real
+    """One over the square of a normal."""
+    per2: real
     flat: bool
 
 
@@ -88,6 +91,8 @@ def hinge_of(x: wp.array(dtype=vec3), at: int, q: wp.vec4i):
     h.b = x[place(at, q[3])] - origin
     h.n1 = wp.cross(h.e, h.a)
     h.n2 = wp.cross(h.b, h.e)
+    h.per1 = real(1.0) / wp.max(wp.dot(h.n1, h.n1), TINIEST)
+    h.per2 = real(1.0) / wp.max(wp.dot(h.n2, h.n2), TINIEST)
     h.flat = is_flat(h.e, h.n1) or is_flat(h.e, h.n2)
     return h
 
@@ -95,7 +100,7 @@ def hinge_of(x: wp.array(dtype=vec3), at: int, q: wp.vec4i):
 @wp.func
 def phase_of(h: Hinge):
     """Cosine and sine of the dihedral angle of a hinge that is not flat."""
-    scale = real(1.0) / wp.sqrt(wp.dot(h.n1, h.n1) * wp.dot(h.n2, h.n2))
+    scale = wp.sqrt(h.per1 * h.per2)
     return wp.vec2d(scale * wp.dot(h.n1, h.n2), -scale * length_of(h.e) * wp.dot(h.n1, h.b))
 
 
@@ -109,8 +114,8 @@ def doubled(p: wp.vec2d):
 def angle_gradients(h: Hinge):
     """Gradients of the dihedral angle in the edge and in both tips, of a hinge that is not flat."""
     length = length_of(h.e)
-    ga = (-length / wp.dot(h.n1, h.n1)) * h.n1
-    gb = (-length / wp.dot(h.n2, h.n2)) * h.n2
+    ga = (-length * h.per1) * h.n1
+    gb = (-length * h.per2) * h.n2
     ge = (real(-1.0) / wp.dot(h.e, h.e)) * (wp.dot(h.a, h.e) * ga + wp.dot(h.b, h.e) * gb)
     return ge, ga, gb
 
@@ -138,9 +143,9 @@ class Turn:
 
 @wp.func
 def turn_to(p: wp.vec2d, w: rested):
-    size = wp.sqrt(wp.max(w[3] * w[3] + w[4] * w[4], TINIEST))
-    c = w[3] / size
-    s = w[4] / size
+    per_size = real(1.0) / wp.sqrt(wp.max(w[3] * w[3] + w[4] * w[4], TINIEST))
+    c = w[3] * per_size
+    s = w[4] * per_size
     off = p - wp.vec2d(c, s)
     mean = doubled(wp.vec2d(c, s))
     turn = Turn()

@@ -216,13 +216,11 @@ def linearise(
         slope = w[0] * (length - w[1])
         own += slope * (length - w[1])
         unit = per_length * e
-        width = SLACKNESS * w[0] * length
-        across = HALF * (slope + wp.sqrt(slope * slope + width * width + TINIEST)) / length
-        along = w[0] - across
         ge = vec3()
         ga = vec3()
         gb = vec3()
         stiffness = real(0.0)
+        moment = real(0.0)
         if q[2] >= 0:
             h = hinge_of(x, v, q)
             if h.flat:
@@ -234,25 +232,22 @@ def linearise(
                     ge, ga, gb = angle_gradients(h)
                     stiffness = w[2]
                     moment = bend_slope(p, w)
-                    gi = -(ge + ga + gb)
-                    q2 = place(v, q[2])
-                    q3 = place(v, q[3])
-                    wp.atomic_add(gradient, q0, moment * gi)
-                    wp.atomic_add(gradient, q1, moment * ge)
-                    wp.atomic_add(gradient, q2, moment * ga)
-                    wp.atomic_add(gradient, q3, moment * gb)
+                    wp.atomic_add(gradient, place(v, q[2]), moment * ga)
+                    wp.atomic_add(gradient, place(v, q[3]), moment * gb)
                     if diagonal:
-                        wp.atomic_add(diagonal, q0, stiffness * squared(gi))
-                        wp.atomic_add(diagonal, q1, stiffness * squared(ge))
-                        wp.atomic_add(diagonal, q2, stiffness * squared(ga))
-                        wp.atomic_add(diagonal, q3, stiffness * squared(gb))
+                        wp.atomic_add(diagonal, place(v, q[2]), stiffness * squared(ga))
+                        wp.atomic_add(diagonal, place(v, q[3]), stiffness * squared(gb))
+        gi = ge + ga + gb
         if gradient:
-            wp.atomic_add(gradient, q0, -slope * unit)
-            wp.atomic_add(gradient, q1, slope * unit)
+            wp.atomic_add(gradient, q0, -slope * unit - moment * gi)
+            wp.atomic_add(gradient, q1, slope * unit + moment * ge)
         if diagonal:
+            width = SLACKNESS * w[0] * length
+            across = HALF * (slope + wp.sqrt(slope * slope + width * width + TINIEST)) / length
+            along = w[0] - across
             block = along * squared(unit) + symmetric(across, real(0.0), real(0.0), across, real(0.0), across)
-            wp.atomic_add(diagonal, q0, block)
-            wp.atomic_add(diagonal, q1, block)
+            wp.atomic_add(diagonal, q0, block + stiffness * squared(gi))
+            wp.atomic_add(diagonal, q1, block + stiffness * squared(ge))
             factors[place(s * mesh.record.shape[0], k)] = linearised(
                 unit[0],
                 unit[1],
