@@ -1,5 +1,6 @@
 """Loading of Warp's kernels, their constants, and their launch on torch tensors."""
 
+import ctypes
 import importlib
 import inspect
 import os
@@ -165,77 +166,103 @@ def launch(
     """
     if 0 in dim:
         return
-    device = next(x.device for x in given if isinstance(x, Tensor))
+    for x in given:
+        if isinstance(x, Tensor):
+            device = x.device
+            break
     n_threads = dim[0]
     if len(dim) == 2:
         given = [*given, 1 if device.type == "cpu" else dim[1]]
         n_threads *= given[-1]
     if n_threads > MOST_ENTRIES:
         raise ValueError(f"{n_threads} threads are more than a kernel counts, {MOST_ENTRIES}: pass fewer samples")
-    given = [x.on(device) if isinstance(x, Constants) else x for x in given]
     key = kernel, device, len(adjoints) > 0
-    if key not in _COMMANDS.known:
-        _COMMANDS.known[key] = _Command(*key, given)
-    _COMMANDS.known[key](n_threads, given, adjoints)
+    command = _COMMANDS.known.get(key)
+    if command is None:
+        command = _COMMANDS.known[key] = _Command(*key, given)
+    command(n_threads, given, adjoints)
 
 
 class _Command:
     """A launch that Warp has recorded, repeated with other arguments in a fraction of the time of a new one.
 
-    Tensors are written into its descriptions of arrays, which do not hold them.
+    Tensors are written into its descriptions of arrays, which do not hold them. On a CPU, they are those in the struct
+    that the compiled function is called with.
     """
 
     def __init__(self, kernel: Any, device: torch.device, back: bool, given: Sequence[Any]) -> None:
         import warp as wp
 
-        self.device, self.entries, self.last, self.n_threads = device, _entries(kernel), list(given), 1
+        self.device, self.n_threads, entries, own = device, 1, _entries(kernel), _device(device)
         described: Any = type(wp.from_torch(torch.zeros(1), return_ctype=True))
+        given = [x.on(device) if isinstance(x, Constants) else x for x in given]
 
         def nothing() -> list[Any]:
-            pairs = zip(self.entries, given, strict=True)
+            pairs = zip(entries, given, strict=True)
             return [described(0, 0, 1, (0,), (e[0] * e[1].itemsize,)) if e else x for e, x in pairs]
 
         adjoints = nothing() if back else []
-        own = _device(device)
         self.recorded = wp.launch(
             kernel, 1, inputs=nothing(), adj_inputs=adjoints, device=own, adjoint=back, record_cmd=True
         )
-        n = len(self.entries)
-        self.arrays, self.adjoints = self.recorded.params[1 : 1 + n], self.recorded.params[1 + n :]
+        n = len(entries)
+        both = [part for part in (self.recorded.params[1 : 1 + n], self.recorded.params[1 + n :]) if part]
+        self.structs = [_struct(part) for part in both]
+        self.on_cpu, self.called = device.type == "cpu", [ctypes.byref(struct) for struct in self.structs]
+        self.function = self.recorded.hooks.backward if back else self.recorded.hooks.forward
+        self.last: dict[int, Any] = {i: None for i, entry in enumerate(entries) if entry is None}
+        self.arrays: list[list[tuple[Any, ...]]] = []
+        for struct, part in zip(self.structs, both, strict=True):
+            own = [getattr(struct, name) for name, _ in struct._fields_] if self.on_cpu else part
+            self.arrays.append([(i, own[i], own[i].shape, *entry) for i, entry in enumerate(entries) if entry])
 
     def __call__(self, n_threads: int, given: Sequence[Any], adjoints: Sequence[Any]) -> None:
-        import warp as wp
-
-        for i, (entry, x) in enumerate(zip(self.entries, given, strict=True)):
-            if entry is not None:
-                _describe(self.arrays[i], x, *entry)
-            elif x is not self.last[i]:
-                self.recorded.set_param_at_index(i, x)
+        for i, before in self.last.items():
+            x = given[i]
+            if x is not before:
                 self.last[i] = x
-        for described, entry, x in zip(self.adjoints, self.entries, adjoints, strict=False):  # not all have one
-            if entry is not None:
-                _describe(described, x, *entry)
+                self._set(i, x)
+        for arrays, tensors in zip(self.arrays, (given, adjoints), strict=False):
+            for i, array, shape, width, dtype in arrays:
+                x = tensors[i] if i < len(tensors) else None  # not all have an adjoint
+                if x is None:
+                    array.data = shape[0] = 0
+                    continue
+                if x.dtype is not dtype or not x.is_contiguous():
+                    raise RuntimeError(
+                        f"a kernel needs contiguous tensors of {dtype}; got {x.dtype}, strides {x.stride()}"
+                    )
+                shape[0] = length = x.numel() // width
+                array.data = x.data_ptr()
+                if length > MOST_ENTRIES:
+                    raise ValueError(
+                        f"a tensor of shape {tuple(x.shape)} has {length} entries, and a kernel counts to "
+                        f"{MOST_ENTRIES}: pass fewer samples at a time"
+                    )
         if n_threads != self.n_threads:
             self.recorded.set_dim(n_threads)
             self.n_threads = n_threads
-        on_cpu = self.device.type == "cpu"
-        self.recorded.launch(None if on_cpu else wp.stream_from_torch(torch.cuda.current_stream(self.device)))
+        if self.on_cpu:
+            self.function(ctypes.byref(self.recorded.bounds), *self.called)
+        else:
+            import warp as wp
+
+            self.recorded.launch(wp.stream_from_torch(torch.cuda.current_stream(self.device)))
+
+    def _set(self, i: int, x: Any) -> None:
+        """Write an argument that is no array."""
+        if self.on_cpu and not isinstance(x, Constants):
+            setattr(self.structs[0], f"a{i}", x)
+            return
+        self.recorded.set_param_at_index(i, x.on(self.device) if isinstance(x, Constants) else x)
+        if self.on_cpu:
+            setattr(self.structs[0], f"a{i}", self.recorded.params[1 + i])
 
 
-def _describe(array: Any, x: Tensor | None, width: int, dtype: torch.dtype) -> None:
-    """Write a tensor into Warp's description of an array, of vectors of a width."""
-    if x is None:
-        array.data = array.shape[0] = 0
-        return
-    if x.dtype is not dtype or not x.is_contiguous():
-        raise RuntimeError(f"a kernel needs a contiguous tensor of {dtype}; got {x.dtype}, strides {x.stride()}")
-    length = x.numel() // width
-    if length > MOST_ENTRIES:
-        raise ValueError(
-            f"a tensor of shape {tuple(x.shape)} has {length} entries, and a kernel counts to {MOST_ENTRIES}: "
-            "pass fewer samples at a time"
-        )
-    array.data, array.shape[0] = x.data_ptr(), length
+def _struct(arguments: Sequence[Any]) -> Any:
+    """The arguments of a function that Warp has compiled for a CPU, as it takes them."""
+    fields = [(f"a{i}", type(x)) for i, x in enumerate(arguments)]
+    return type("Arguments", (ctypes.Structure,), {"_fields_": fields})(*arguments)
 
 
 class _Commands(threading.local):
