@@ -30,6 +30,14 @@ def transformed(x: Tensor) -> bool:
     return forward_ad._current_level >= 0 and forward_ad.unpack_dual(x).tangent is not None  # the first alone is fast
 
 
+def plain(*given: Tensor) -> bool:
+    """True for tensors that all have numbers, which are all that there is to them: neither traced nor transformed."""
+    if torch.compiler.is_compiling():
+        return False
+    within = torch._C._functorch.peek_interpreter_stack() is not None or forward_ad._current_level >= 0
+    return not any(traced(x) or (within and transformed(x)) for x in given)
+
+
 def mapped(x: Tensor) -> bool:
     """True where ``vmap`` maps a tensor, so that no number of it is one number."""
     inner = torch.func.debug_unwrap(x, recurse=False)
@@ -238,10 +246,8 @@ def applied(function: Any, *given: Any) -> Any:
     Without recording it calls ``forward`` directly: torch inspects the signature at every call, which takes as long as
     a small kernel.
     """
-    plain = not torch.is_grad_enabled() and not any(
-        isinstance(value, Tensor) and (traced(value) or transformed(value)) for value in given
-    )
-    return function.forward(*given) if plain else function.apply(*given)
+    alone = not torch.is_grad_enabled() and plain(*(value for value in given if isinstance(value, Tensor)))
+    return function.forward(*given) if alone else function.apply(*given)
 
 
 def pushed(function: Callable[..., Any], given: Sequence[Tensor], tangents: Sequence[Tensor | None]) -> Any:

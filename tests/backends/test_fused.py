@@ -149,6 +149,7 @@ def test_steps_that_would_go_uphill_are_shortened(small_bars: Shapes) -> None:
     lengths = torch.stack([step.length for step in taken])
     assert float(lengths.min()) < 0.5 < float(lengths.max()), "no step is shortened, or all are"
     torch.testing.assert_close(found, case.by_torch(*case.given), rtol=0, atol=1e-8 * CANONICAL_SIZE)
+    assert_alike(gradients(case.by_warp, case.given), gradients(case.by_torch, case.given), 1e-6)
 
 
 def test_gradient_where_the_steps_start(small_bars: Shapes) -> None:

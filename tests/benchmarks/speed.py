@@ -31,7 +31,7 @@ import torch
 import trimesh
 from cases import Case, KeyframeSet, divided, samples, shared
 from methods import by_peer
-from results import Table, add_keep
+from results import ROOT, Table, add_keep
 from tables import geometric_mean
 from timing import limit_threads, timed
 
@@ -103,9 +103,9 @@ def theirs(case: Case) -> dict[str, float]:
 
 def compare(given: argparse.Namespace) -> None:
     """Ratios of all meshes, and their geometric means."""
-    own, means = Path(tm.__file__).parents[1], []
-    name = "speed" if given.before is None else "speed-before"
-    with Table(name, ["mesh", "vertices", *WORK], given.keep, WORK) as table:
+    own, means = ROOT, []
+    kept = "speed" if given.before is None else "speed-before"
+    with Table(kept, ["mesh", "vertices", *WORK], given.keep, WORK) as table:
         for name, case in all_cases().items():
             if not any(text in name for text in given.only):
                 continue

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from torch_modal.autograd import traced, transformed
+from torch_modal.autograd import plain
 from torch_modal.errors import MeshWarning
 from torch_modal.geometry.canonical import CANONICAL_SIZE, size
 from torch_modal.geometry.connectivity import Connectivity, vertex_areas
@@ -112,7 +112,7 @@ class KeyframeAlignment(nn.Module):
         sizes = (rows.amax(-1) - rows.amin(-1)).norm(dim=-1) * self.scale
         usable = sizes.isfinite() & (sizes > SMALLEST_SIZE * CANONICAL_SIZE)  # what is not finite has no extent
         self._warn_of_size(sizes)
-        if not traced(usable) and not transformed(usable) and usable.all():
+        if plain(usable) and usable.all():
             return keyframes, usable
         return torch.where(usable[..., None, None], keyframes, self.reference.mT / self.scale), usable
 
@@ -161,7 +161,7 @@ class KeyframeAlignment(nn.Module):
         volumes = (a * cross(b, c)).sum((0, -1))
         heaviest = weights.argmax(1, keepdim=True)
         turned = volumes * volumes.gather(1, heaviest) < 0
-        if not traced(turned) and not transformed(turned) and not turned.any():
+        if plain(turned) and not turned.any():
             return turned
         first = shapes.take_along_dim(heaviest[..., None, None], 1).expand_as(shapes)
         own, of = first.flatten(0, 1).mT, shapes.flatten(0, 1).mT
@@ -169,7 +169,7 @@ class KeyframeAlignment(nn.Module):
 
     def _warn_of_size(self, sizes: Tensor) -> None:
         """Say, once for a layer, that key-frames and bases seem to be in different units."""
-        if self.size_warned or traced(sizes) or transformed(sizes):
+        if self.size_warned or not plain(sizes):
             return
         ratios = sizes / self.extent
         if bool(((ratios < OTHER_SIZE) & (ratios > 1 / OTHER_SIZE)).all()):

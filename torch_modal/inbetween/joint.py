@@ -121,8 +121,8 @@ class JointSpace(nn.Module):
         """Energy and gradient at ``a``. *Shape:* ``(B, n) -> (B,), (B, n)``."""
         found = [part.value_and_gradient(a.to(own.base.dtype), own) for part, own in self._each(placement)]
         values, gradients = zip(*found, strict=True)
-        value = reduce(torch.add, values) + 0.5 * self.anchor * a.square().sum(-1)
-        return value, reduce(torch.add, gradients) + self.anchor * a
+        value = torch.add(reduce(torch.add, values), a.square().sum(-1), alpha=0.5 * self.anchor)
+        return value, torch.add(reduce(torch.add, gradients), a, alpha=self.anchor)
 
     def gradient(self, a: Tensor, placement: Sequence[Placement]) -> Tensor:
         """Gradient at ``a``, to be differentiated. *Shape:* ``(B, n) -> (B, n)``."""

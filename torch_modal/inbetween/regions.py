@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from torch_modal.arrays import FloatArray, IntArray
-from torch_modal.autograd import traced, transformed
+from torch_modal.autograd import plain
 from torch_modal.backends.torch.fine_steps import relax
 from torch_modal.energy.energy import Energy, Rest, RestShapes
 from torch_modal.energy.shell import N_SHELL_TERMS
@@ -186,7 +186,7 @@ class LocalInterpolation(nn.Module):
             relax, energy, reference=reference, n_steps=1, n_products=N_PRODUCTS, free=self.region[self.used]
         )
         # Where gradients are recorded, steps are computed twice: they would take ten times the memory.
-        again = torch.is_grad_enabled() and not (traced(ends[0]) or transformed(ends[0]))
+        again = torch.is_grad_enabled() and plain(ends[0])
         found = []
         for x in ends:
             own = x[:, self.used]

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torch_modal.autograd import made_outside, traced, transformed
+from torch_modal.autograd import made_outside, plain, traced, transformed
 from torch_modal.inbetween.settings import Solver
 from torch_modal.solve.implicit import ConvergenceWarning
 from torch_modal.solve.minimise import Solution, Status
@@ -115,7 +115,7 @@ def with_exact_keyframes(shapes: Tensor, keyframes: Tensor, weights: Tensor) -> 
         weights: *Shape:* ``(..., K)``.
     """
     shapes = shapes.to(keyframes.dtype)
-    if not traced(weights) and not transformed(weights) and not bool((weights == 1).any()):
+    if plain(weights) and not bool((weights == 1).any()):
         return shapes
     alone = (weights != 0).sum(-1, keepdim=True) == 1
     for x, there in zip(keyframes.unbind(-3), ((weights == 1) & alone).unbind(-1), strict=True):

@@ -9,7 +9,7 @@ import torch
 from scipy import sparse
 from torch import Tensor, nn
 
-from torch_modal.autograd import full_precision, lasting, traced, transformed
+from torch_modal.autograd import full_precision, lasting, plain
 from torch_modal.geometry.rigid import best_rotation
 from torch_modal.geometry.vectors import cross, inverse, norm, pick
 from torch_modal.keyframes.arrays import as_faces
@@ -175,7 +175,7 @@ class Passengers(nn.Module):
 
     def _mixed(self, values: Tensor) -> Tensor:
         """Weighted sums over the vertices that points follow. *Shape:* ``(B, V, n) -> (B, P, n)``."""
-        if traced(values) or transformed(values):  # sparse products know neither
+        if not plain(values):  # sparse products know neither
             counts = self.starts.diff().long()
             row = torch.arange(len(self), device=values.device).repeat_interleave(counts, output_size=len(self.values))
             each = values[:, self.columns.long()] * self.values[:, None]

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torch_modal.autograd import traced, transformed
+from torch_modal.autograd import plain
 from torch_modal.backends.torch.distortion import Distortion
 from torch_modal.backends.warp.launch import Constants, kernels, launch, records
 from torch_modal.energy.energy import Energy, RestShapes
@@ -26,7 +26,7 @@ class WarpDistortion(Distortion):
     def of_shell(self, shapes: Sequence[Tensor], rests: RestShapes) -> Tensor:
         """Overrides the base class."""
         values = *shapes, rests.shapes, rests.weights, *rests.stiffness[:2]
-        if torch.is_grad_enabled() or any(traced(x) or transformed(x) for x in values):
+        if torch.is_grad_enabled() or not plain(*values):
             return super().of_shell(shapes, rests)
         given = [x.double().contiguous() for x in (torch.stack([*shapes]), rests.shapes, rests.weights)]
         stiffness = [x.double().contiguous() for x in self.on_elements(rests.stiffness)]

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torch_modal.autograd import traced, transformed
+from torch_modal.autograd import plain
 from torch_modal.backends.torch.fine_steps import FineEnergy, FurtherEnergy, FurtherTerms, relax, step_length
 from torch_modal.backends.warp.function import fused
 from torch_modal.backends.warp.launch import kernels, launch
@@ -31,7 +31,7 @@ class WarpFineEnergy(FineEnergy):
     ) -> Tensor:
         """Overrides the base class. With further terms or energies, gradients are left to torch."""
         alone = self.further is None and not beside
-        if not alone and ((torch.is_grad_enabled() and x.requires_grad) or traced(x) or transformed(x)):
+        if not alone and ((torch.is_grad_enabled() and x.requires_grad) or not plain(x)):
             return super().relax_chunk(x, rests, stages, beside)
         others = [*beside, *([] if self.further is None else [FurtherTerms(self.further, rests)])]
         to, moved = self.steps.reference(rests), x
@@ -47,7 +47,7 @@ class WarpFineEnergy(FineEnergy):
     ) -> Tensor:
         """Overrides the base class. Gradients are left to torch."""
         gradient = torch.is_grad_enabled() and x.requires_grad
-        if self.further is not None or gradient or traced(x) or transformed(x):
+        if self.further is not None or gradient or not plain(x):
             return super().towards(x, reference, n_steps, n_products, beside)
         to = self.steps.packed(reference)
         return self.steps.descend(x.double().contiguous(), to, list(beside), n_steps, n_products).to(x)
@@ -90,7 +90,7 @@ class WarpSteps(WarpShell):
             energy = self.value(reached, to) if there is None else there.energy
             length = step_length(at.energy, _slope(at, solution), energy, solution.abs().amax((1, 2)))
             if taken is not None:
-                taken.append(_Taken(x, at, length, *kept))
+                taken.append(_Taken(x, at, solution, length, *kept))
             if bool((length < 1).any()):
                 reached = x + length[:, None, None] * solution
                 there = None if there is None else self.at(reached, to)
@@ -143,7 +143,7 @@ class WarpSteps(WarpShell):
         return solution, kept, scalars
 
     def step_back(self, step: "_Taken", to: ShellReference, to_reached: Tensor, to_reference: ShellReference) -> Tensor:
-        """The gradient at the start of a whole step from that at its end; the reference's is added.
+        """The gradient at the start of a step from that at its end; the reference's is added.
 
         Args:
             step: The step.
@@ -151,28 +151,54 @@ class WarpSteps(WarpShell):
             to_reached: Gradient in the shapes at the end. *Shape:* ``(B, V, 3)``.
             to_reference: Is added to.
         """
-        x, at, _, kept, scalars = step
+        x, at, solution, length, kept, scalars = step
+        to_x, to_solution, to_energy, to_gradient = to_reached.clone(), to_reached, None, 0
+        if bool((length < 1).any()):
+            to_solution, to_energy, to_slope = self._length_back(step, to, to_x, to_reference)
+            to_gradient = to_slope[:, None, None] * solution
         module, (b, n), n_products = kernels("steps"), x.shape[:2], kept.shape[1]
         force, (residual, direction, to_volume) = torch.empty_like(kept[0]), x.new_zeros(3, *x.shape)
         to_diagonal, received = torch.zeros_like(at.diagonal), x.new_zeros(n_products, b, 3)
-        launch(module.inner, (b, n), [to_reached, kept[1, -1], n, received[-1]])
+        launch(module.inner, (b, n), [to_solution, kept[1, -1], n, received[-1]])
         for k in reversed(range(n_products)):
             common = [at.normal, to.stiffness, k, n_products, n, kept, scalars]
-            given = [*common, to_reached, residual, force, direction, received]
+            given = [*common, to_solution, residual, force, direction, received]
             launch(module.back_to_direction, (b, n), given)
             given = [self.constants, force, k * b * n, at.factors, direction, 0, None, 0]
             launch(kernels("shell").product, (b, self.n_edges), given)
             launch(module.back_to_normal, (b, n), [*common, force, direction, to_volume, received])
-            given = [*common, at.diagonal, to_reached, direction, residual, to_diagonal, received]
+            given = [*common, at.diagonal, to_solution, direction, residual, to_diagonal, received]
             launch(module.back_to_residual, (b, n), given)
         to_factors = torch.empty_like(at.factors)
         given = [self.constants, kept, force, at.factors, b, n_products, to_factors]
         launch(module.back_to_factors, (b, self.n_edges), given)
-        to_x = to_reached.clone()
         # The right side is the gradient's opposite.
-        self.from_point(x, at, to, -residual, to_x, to_reference, (to_diagonal, to_factors), to_volume)
+        received_by_gradient = to_gradient - residual
+        others = to_diagonal, to_factors
+        self.from_point(x, at, to, received_by_gradient, to_x, to_reference, others, to_volume, to_energy)
         to_reference.stiffness.add_((scalars[:-1, :, 1] * received[..., 2]).sum(0))
         return to_x
+
+    def _length_back(
+        self, step: "_Taken", to: ShellReference, to_x: Tensor, to_reference: ShellReference
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Gradients of the lengths of steps that were shortened: in the solution, the energy before, and the slope.
+
+        Those through the energy after the whole step are added to the gradients in the shape, on entry those at the
+        end of the step, and in the reference. *Shape:* ``(B, V, 3), (B,), (B,)``.
+        """
+        to_reached, at, whole = to_x.clone(), step.at, step.x + step.solution
+        there = self.at(whole, to)
+        with torch.enable_grad():
+            given = step.solution, at.energy, there.energy, _slope(at, step.solution)
+            solution, before, after, slope = leaves = [value.detach().requires_grad_() for value in given]
+            along = slope + _slope(at, solution - step.solution)
+            length = step_length(before, along, after, solution.abs().amax((1, 2)))
+            taken = length[:, None, None] * solution
+        to_solution, to_before, to_after, to_slope = torch.autograd.grad(taken, leaves, to_reached)
+        nothing = torch.zeros_like(to_x)
+        self.from_point(whole, there, to, nothing, to_x, to_reference, to_energy=to_after)
+        return to_solution + (to_x - to_reached), to_before, to_slope
 
 
 def _slope(at: ShellPoint, direction: Tensor) -> Tensor:
@@ -187,6 +213,8 @@ class _Taken(NamedTuple):
     """Where it started. *Shape:* ``(B, V, 3)``."""
     at: ShellPoint
     """The energy there, its diagonal inverted."""
+    solution: Tensor
+    """The whole step. *Shape:* ``(B, V, 3)``."""
     length: Tensor
     """*Shape:* ``(B,)``."""
     kept: Tensor
@@ -211,8 +239,6 @@ class _Relaxed:
         """See :class:`~torch_modal.backends.warp.function.Operation`."""
         if not kept:
             self.run(kept, x, *to)
-        if any(bool((step.length < 1).any()) for step in kept):  # the lengths of steps that were shortened are torch's
-            return tuple(torch.func.vjp(self.by_torch, x, *to)[1](tuple(grads)))
         to_x, reference = grads[0], self._reference(*to)
         to_reference = ShellReference(*map(torch.zeros_like, reference))
         for step in reversed(kept):

@@ -230,7 +230,7 @@ class _Command:
                     continue
                 if x.dtype is not dtype or not x.is_contiguous():
                     raise RuntimeError(
-                        f"a kernel needs contiguous tensors of {dtype}; got {x.dtype}, strides {x.stride()}"
+                        f"a kernel needs a contiguous tensor of {dtype}; got {x.dtype}, strides {x.stride()}"
                     )
                 shape[0] = length = x.numel() // width
                 array.data = x.data_ptr()

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from torch_modal import trees
-from torch_modal.autograd import traced, transformed
+from torch_modal.autograd import plain
 from torch_modal.backends.warp.function import fused
 from torch_modal.backends.warp.launch import kernels, launch
 from torch_modal.backends.warp.shell import ShellReference, WarpShell
@@ -70,7 +70,7 @@ class WarpModalEnergy(ModalEnergy):
         if not isinstance(placement.reference, ShellReference):
             return placement
         values = placement.base, *placement.reference
-        if torch.is_grad_enabled() or any(traced(x) or transformed(x) for x in values):
+        if torch.is_grad_enabled() or not plain(*values):
             return self.unpacked(placement)
         return None
 

@@ -10,7 +10,7 @@ from torch_modal.energy.energy import energy_rounding
 
 def update(state: Any, shortest: float, value: Tensor, slope: Tensor) -> Any:
     """:func:`torch_modal.solve.minimise.updated` in float64 on the CPU, in place: one thread serves each sample."""
-    n = state.a.shape[1]
+    n_samples, n = state.a.shape[:2]
     given = [
         n,
         value,
@@ -23,5 +23,5 @@ def update(state: Any, shortest: float, value: Tensor, slope: Tensor) -> Any:
         state.there,
     ]
     given += [state.energy, state.gradient, state.norm, state.inverse, state.length, state.n_steps]
-    launch(kernels("quasi_newton").update, (len(value),), [*given, value.new_empty(len(value), n)])
+    launch(kernels("quasi_newton").update, (n_samples,), [*given, value.new_empty(n_samples, n)])
     return state

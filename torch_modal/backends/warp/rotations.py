@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torch_modal.autograd import traced, transformed
+from torch_modal.autograd import plain, traced
 from torch_modal.backends.warp.function import fused
 from torch_modal.backends.warp.launch import Constants, kernels, launch
 from torch_modal.geometry.connectivity import Connectivity
@@ -72,7 +72,7 @@ class WarpRotations(LocalRotations):
     def sign(self, quaternions: Tensor, areas: Tensor) -> Tensor:
         """Overrides the base class."""
         # The walk down the tree is one thread's.
-        if areas.device.type != "cpu" or traced(areas) or transformed(areas):
+        if areas.device.type != "cpu" or not plain(areas):
             return super().sign(quaternions, areas)
         given, weights = quaternions.double().contiguous(), areas.double().contiguous()
         sign, vote = torch.empty_like(weights), weights.new_zeros(len(weights), self.n_pieces)

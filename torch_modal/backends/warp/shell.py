@@ -160,12 +160,13 @@ class WarpShell(nn.Module):
 
     def _linearised(self, x: Tensor, to: ShellReference, *results: Tensor | None) -> tuple[Tensor, Tensor]:
         """The energy but for its constant, and the volume's moment; derivatives go to the results."""
-        totals = x.new_zeros(len(x), 2)
-        given = [self.constants, x, to.elements, len(to.volume), self.centre(x), totals, *results]
-        launch(kernels("shell").linearise, (len(x), max(self.n_edges, self.n_faces)), given)
+        n, n_references = x.shape[0], to.volume.shape[0]
+        totals = x.new_zeros(n, 2)
+        given = [self.constants, x, to.elements, n_references, self.centre(x), totals, *results]
+        launch(kernels("shell").linearise, (n, max(self.n_edges, self.n_faces)), given)
         energy, volume = totals.unbind(1)
-        if len(x) != len(to.volume):
-            energy, volume = (value.unflatten(0, (-1, len(to.volume))) for value in (energy, volume))
+        if n != n_references:
+            energy, volume = (value.unflatten(0, (-1, n_references)) for value in (energy, volume))
         off = volume - to.volume
         moment = to.stiffness * off
         return torch.addcmul(energy, moment, off, value=0.5), moment
@@ -197,6 +198,7 @@ class WarpShell(nn.Module):
         to_reference: ShellReference,
         others: Sequence[Tensor | None] = (None, None),
         to_normal: Tensor | None = None,
+        to_energy: Tensor | None = None,
     ) -> None:
         """Adjoint of :meth:`at`: add the gradients of shapes and references.
 
@@ -209,9 +211,11 @@ class WarpShell(nn.Module):
             to_reference: Is added to.
             others: In the diagonal and in the factors.
             to_normal: In the volume's gradient beyond that. *Shape:* ``(B, V, 3)``.
+            to_energy: In the energy. *Shape:* ``(B,)``.
         """
         to_moment = (to_gradient * at.normal).sum((1, 2))
-        to_volume = to.stiffness * to_moment
+        to_energy = torch.zeros_like(to_moment) if to_energy is None else to_energy
+        to_volume = to.stiffness * to_moment + to_energy * at.moment
         own = at.moment[:, None, None] * to_gradient
         to_normal = own if to_normal is None else own.add_(to_normal)
         if not self.closed:  # the adjoint of _through_centre()
@@ -222,12 +226,12 @@ class WarpShell(nn.Module):
         taken = [None if other is None else own for own, other in zip(at[2:4], others, strict=True)]
         given = [self.constants, x, to.elements, len(x), centre, x.new_zeros(len(x), 2), at.gradient]
         adjoints = [None, to_x, to_reference.elements, None, to_centre]
-        adjoints += [torch.stack([torch.zeros_like(to_volume), to_volume], 1), to_gradient, to_normal, *others]
+        adjoints += [torch.stack([to_energy, to_volume], 1), to_gradient, to_normal, *others]
         dim = len(x), max(self.n_edges, self.n_faces)
         launch(kernels("adjoints").linearise, dim, [*given, torch.empty_like(at.normal), *taken], adjoints)
         self.spread(to_centre, to_x)
         off = at.moment * inverse(to.stiffness, to.stiffness <= 0)
-        to_reference.stiffness.add_(to_moment * off)
+        to_reference.stiffness.add_(to_moment * off + 0.5 * to_energy * off**2)
         to_reference.volume.sub_(to_volume)
 
 
