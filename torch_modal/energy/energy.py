@@ -95,9 +95,15 @@ class OnMesh(nn.Module):
         """Weights of vertices on the elements: means of their corners. *Shape:* ``(..., V) -> (..., M or 1)``."""
         return weights.mean(-1, keepdim=True) if self.term.total else weights[..., self.corners].mean(-2)
 
-    def to_corners(self, on_edge_vectors: Tensor) -> Tensor:
-        """From the edge vectors to the vertices of the elements. *Shape:* ``(n-1, 3, ..., M) -> (3, ..., n M)``."""
-        return torch.cat([-on_edge_vectors.sum(0), *on_edge_vectors], -1)
+    def on_corners(self, on_edge_vectors: Tensor) -> list[Tensor]:
+        """From the edge vectors to each vertex of the elements. *Shape:* ``(n-1, 3, ..., M)``; ``(3, ..., M)`` each."""
+        return [-on_edge_vectors.sum(0), *on_edge_vectors]
+
+    def scattered(self, out: Tensor, on_edge_vectors: Tensor) -> Tensor:
+        """Values of the vertices, and what the edge vectors give to them. *Shape:* ``(3, ..., V)``."""
+        for corner, own in zip(self.corners, self.on_corners(on_edge_vectors), strict=True):
+            out = out.index_add(-1, corner, own)
+        return out
 
 
 class Energy(nn.Module):
@@ -112,7 +118,6 @@ class Energy(nn.Module):
 
     parts: Any
     used: Tensor
-    corners: Tensor
     vertices: Tensor
 
     def __init__(self, mesh: Mesh, terms: Sequence[Term], sampled: bool = False) -> None:
@@ -151,10 +156,6 @@ class Energy(nn.Module):
         self.register_buffer("vertices", vertices, persistent=False)
         used = torch.arange(self.n_vertices) if sampled else torch.tensor(mesh.connectivity.used)
         self.register_buffer("used", used, persistent=False)
-        local = [part.corners.flatten() for part in parts if not part.term.total]
-        corners = torch.cat(local) if local else torch.zeros(0, dtype=torch.int64)
-        #: The vertices of all elements of terms that are not totals.
-        self.register_buffer("corners", corners, persistent=False)
 
     @property
     def anchors(self) -> Tensor | None:
@@ -253,8 +254,7 @@ class Energy(nn.Module):
             measures = part.measures(edge_vectors)
             gradients = part.term.gradients(edge_vectors)
             if part.term.total:
-                corners = part.to_corners(gradients)
-                gradients = torch.zeros_like(extended).index_add(-1, part.corners.flatten(), corners)
+                gradients = part.scattered(torch.zeros_like(extended), gradients)
             slope = part.term.slopes(measures, rest, weight)
             curvatures = part.term.curvatures(measures, rest, weight)
             found.append(Linearised(edge_vectors, measures, gradients, slope, *curvatures))
@@ -287,17 +287,10 @@ class Energy(nn.Module):
         Returns:
             *Shape:* ``(3, B, V)``, extended.
         """
-        out: Any = None
-        corners = []
+        out = on_elements[0].new_zeros(*at[0].gradients.shape[-3:-1], self.n_extended)
         for part, one, received in zip(self.parts, at, on_elements, strict=True):
-            if part.term.total:
-                own = received * one.gradients
-                out = own if out is None else out + own
-            else:
-                corners.append(part.to_corners(received))
-        if out is None:
-            out = corners[0].new_zeros(*corners[0].shape[:-1], self.n_extended)
-        return out.index_add(-1, self.corners, torch.cat(corners, -1)) if corners else out
+            out = out + received * one.gradients if part.term.total else part.scattered(out, received)
+        return out
 
     def gradient(self, at: Sequence[Linearised]) -> Tensor:
         """Gradient of the energy. *Shape:* ``(3, B, V)``, extended."""

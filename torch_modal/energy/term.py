@@ -209,33 +209,34 @@ class PeriodicTerm(Term):
         """K rest angles by their first two trigonometric moments; arguments as in the base class."""
         whole = pulls.sum(-2)
         shares = pulls * inverse(whole, whole <= 0)[..., None, :]
-        # From the heaviest, for the sake of rounding.
-        first = measures.gather(-2, pulls.argmax(-2, keepdim=True)).squeeze(-2)
-        off = measures - first[..., None, :]
-        parts = _versine(off), off.sin(), _versine(2 * off), (2 * off).sin()
-        rows = torch.stack([first, *((shares * part).sum(-2) for part in parts)], -2)
+        # From the heaviest, for the sake of rounding; elementwise, at a tenth of what argmax takes over few long rows.
+        first, heaviest = measures[..., 0, :], pulls[..., 0, :]
+        for own, pull in zip(measures.unbind(-2)[1:], pulls.unbind(-2)[1:], strict=True):
+            first, heaviest = torch.where(pull > heaviest, own, first), torch.maximum(pull, heaviest)
+        rows = [first, *((shares * part).sum(-2) for part in _turns(measures - first[..., None, :]))]
+        rows = torch.stack(rows, -2)
         return rows, torch.where(whole > 0, whole, 0), torch.zeros_like(whole)
 
     def energies(self, measures: Tensor, rest: Tensor, weights: Tensor) -> Tensor:
         """Overrides the square."""
         angle, a, b, c, d = rest.unbind(-2)
-        off = measures - angle
-        first, second = a * off.cos() - b * off.sin(), c * (2 * off).cos() - d * (2 * off).sin()
-        return weights * (periodic_square(off) + 8 / 3 * first - second / 6)
+        v, s, v2, s2 = _turns(measures - angle)
+        first, second = a * (1 - v) - b * s, c * (1 - v2) - d * s2
+        return weights * (v * (2 + v / 3) + 8 / 3 * first - second / 6)
 
     def slopes(self, measures: Tensor, rest: Tensor, weights: Tensor) -> Tensor:
         """First derivative of :meth:`energies` in the measures. *Shape:* ``(..., M)``."""
         angle, a, b, c, d = rest.unbind(-2)
-        off = measures - angle
-        first, second = a * off.sin() + b * off.cos(), c * (2 * off).sin() + d * (2 * off).cos()
-        return weights * (off.sin() * (2 + 2 / 3 * _versine(off)) - 8 / 3 * first + second / 3)
+        v, s, v2, s2 = _turns(measures - angle)
+        first, second = a * s + b * (1 - v), c * s2 + d * (1 - v2)
+        return weights * (s * (2 + 2 / 3 * v) - 8 / 3 * first + second / 3)
 
     def curvatures(self, measures: Tensor, rest: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
         """The largest second derivative, which is that of the square, and what the true one lacks of it."""
         angle, a, b, c, d = rest.unbind(-2)
-        off = measures - angle
-        first, second = a * off.cos() - b * off.sin(), c * (2 * off).cos() - d * (2 * off).sin()
-        lacking = weights * (-4 / 3 * _versine(off).square() - 8 / 3 * first + 2 / 3 * second)
+        v, s, v2, s2 = _turns(measures - angle)
+        first, second = a * (1 - v) - b * s, c * (1 - v2) - d * s2
+        lacking = weights * (-4 / 3 * v.square() - 8 / 3 * first + 2 / 3 * second)
         return 2 * weights.expand_as(measures), lacking
 
     def on_one_branch(self, measures: Tensor, pulls: Tensor) -> Tensor:
@@ -247,13 +248,16 @@ class PeriodicTerm(Term):
 
 def periodic_square(difference: Tensor) -> Tensor:
     """The function of :class:`PeriodicTerm`."""
-    versine = _versine(difference)
+    versine = _turns(difference)[0]
     return versine * (2 + versine / 3)
 
 
-def _versine(angle: Tensor) -> Tensor:
-    """``1 - cos``, without cancellation."""
-    return 2 * (0.5 * angle).sin().square()
+def _turns(angle: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """``1 - cos``, without cancellation, and ``sin`` of an angle, and those of twice the angle."""
+    half = 0.5 * angle
+    s, c = half.sin(), half.cos()
+    versine, sine = 2 * s * s, 2 * s * c
+    return versine, sine, 2 * sine * sine, 2 * sine * (1 - versine)
 
 
 def wrap_angle(angle: Tensor) -> Tensor:

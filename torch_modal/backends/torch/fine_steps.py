@@ -14,8 +14,8 @@ from torch_modal.geometry.canonical import CANONICAL_SIZE
 # Added to the diagonal blocks, relative to their trace: a vertex in a flat fan has no stiffness along its normal.
 RIDGE = 1e-6
 
-# A symmetric block from its upper triangle.
-_UNPACKED = [0, 1, 2, 1, 3, 4, 2, 4, 5]
+# Rows and columns of the upper triangle of a symmetric block.
+_ROWS, _COLUMNS = [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]
 
 # Where steps are small, the curvature along them is rounding of energies.
 SLIGHT = 1e-5 * CANONICAL_SIZE
@@ -81,32 +81,29 @@ class ConvexHessian:
         return self.energy.scatter(self.at, received)
 
     def diagonal(self) -> Tensor:
-        """The 3 x 3 blocks of all vertices. *Shape:* ``(3, 3, B, V)``, extended."""
-        on_corners = []
+        """The blocks of all vertices, the upper triangle of each. *Shape:* ``(6, B, V)``, extended."""
+        like = self.at[0].gradients
+        summed = like.new_zeros(6, like.shape[-2], self.energy.n_extended)
         for part, one, tension in zip(self.energy.parts, self.at, self.tensions, strict=True):
             if part.term.total:
                 continue  # of rank one: it couples all vertices, and adds little to each
-            ends = part.to_corners(one.gradients)
-            n = len(part.corners)
             along = one.curvature if tension is None else one.curvature - tension
-            blocks = (along.repeat(1, n) * ends)[:, None] * ends
-            if tension is not None:
-                eye = torch.eye(3, dtype=ends.dtype, device=ends.device)[..., None, None]
-                blocks = blocks + eye * tension.repeat(1, n)
-            on_corners.append(blocks)
-        blocks = torch.cat(on_corners, -1)
-        summed = blocks.new_zeros(*blocks.shape[:-1], self.energy.n_extended)
-        return summed.index_add(-1, self.energy.corners, blocks)
+            for corner, end in zip(part.corners, part.on_corners(one.gradients), strict=True):
+                blocks = (along * end)[_ROWS] * end[_COLUMNS]
+                if tension is not None:
+                    eye = torch.eye(3, dtype=end.dtype, device=end.device)[_ROWS, _COLUMNS]
+                    blocks = blocks + eye[:, None, None] * tension
+                summed = summed.index_add(-1, corner, blocks)
+        return summed
 
 
 def inverse_of_symmetric(blocks: Tensor) -> Tensor:
-    """Inverse by cofactors, with a ridge. *Shape:* ``(3, 3, ...)``."""
-    trace = blocks[0, 0] + blocks[1, 1] + blocks[2, 2]
+    """Inverse by cofactors, with a ridge. *Shape:* ``(6, ...) -> (3, 3, ...)``."""
+    trace = blocks[0] + blocks[3] + blocks[5]
     # Vertices that no face uses have no stiffness at all, and no gradient either.
     trace = torch.where(trace > 0, trace, 1)
-    scaled = blocks / trace
-    a, d, f = (scaled[i, i] + RIDGE for i in range(3))
-    b, c, e = scaled[0, 1], scaled[0, 2], scaled[1, 2]
+    a, b, c, d, e, f = blocks / trace
+    a, d, f = a + RIDGE, d + RIDGE, f + RIDGE
     aa, bb, cc = d * f - e * e, c * e - b * f, b * e - c * d
     determinant = a * aa + b * bb + c * cc
     cofactors = torch.stack([aa, bb, cc, bb, a * f - c * c, b * c - a * e, cc, b * c - a * e, a * d - b * b])
@@ -193,7 +190,7 @@ def _solved(
     """An approximate solution. *Shape:* ``(3, B, V)``."""
     blocks = hessian.diagonal()[..., : right.shape[-1]]
     for one in more:
-        blocks = blocks + one.diagonal.movedim(-1, 0)[_UNPACKED].unflatten(0, (3, 3))
+        blocks = blocks + one.diagonal.movedim(-1, 0)
     inverse = inverse_of_symmetric(blocks)
 
     def product(field: Tensor) -> Tensor:
@@ -273,7 +270,7 @@ class FurtherTerms(FurtherEnergy):
         energy, n = self.energy, x.shape[1]
         at = energy.linearise(self._extended(x), self.reference)
         hessian = ConvexHessian(energy, at)
-        packed = hessian.diagonal().flatten(0, 1)[[0, 1, 2, 4, 5, 8], ..., :n].movedim(0, -1)
+        packed = hessian.diagonal()[..., :n].movedim(0, -1)
 
         def product(field: Tensor) -> Tensor:
             rows = energy.extend(field.movedim(-1, 0).contiguous())
