@@ -4,7 +4,8 @@
     python tests/benchmarks/refresh.py --run [PAGE ...]
 
 Pages are names such as ``quality`` or ``README``; without one, all. With ``--run`` the command of each table runs and
-keeps its results, one after the other; then the pages are written.
+keeps its results, one after the other; then the pages are written. ``TORCH_MODAL_PEER_PYTHON`` names a Python that has
+morphomatics, where this one has not; without it, a new run has no results of that.
 """
 
 import argparse
