@@ -19,7 +19,7 @@ from results import PAGES, ROOT, load, names, refreshed
 def main() -> None:
     """Refresh what is asked for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    known = {path.stem: path for path in PAGES}
+    known = {path.stem: path for path in reversed(PAGES)}  # the README of docs has no table
     parser.add_argument("pages", nargs="*", choices=[[], *known], metavar="PAGE")
     parser.add_argument("--run", action="store_true", help="measure again")
     given = parser.parse_args()
