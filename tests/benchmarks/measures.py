@@ -52,11 +52,6 @@ class Yardstick:
         """Enclosed with the centroid."""
         return float(self.shell.measure(x).volume)
 
-    def normals(self, x: Tensor) -> Tensor:
-        """Of the length of twice the area. *Shape:* ``(V, 3) -> (F, 3)``."""
-        a, b, c = (x[corner] for corner in self.case.faces.T)
-        return torch.linalg.cross(b - a, c - a)
-
     def folded(self, x: Tensor) -> Tensor:
         """Which hinges are folded: their angle and both key-frames' leave more than a right angle between them.
 

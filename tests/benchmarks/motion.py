@@ -75,10 +75,9 @@ class Measured:
         return Found(distance, edges, self.corner(lambda times: self.at(times, smooth)))
 
     def true_corner(self) -> float:
-        """That of the truth; NaN where it is known at some times only."""
+        """That of the truth, where it is known at any time."""
         truth = self.motion.truth
-        if truth is None or not self.motion.known_anywhere:
-            return NAN
+        assert truth is not None
         return self.corner(lambda times: torch.stack([truth(float(t)) for t in times]))
 
     def corner(self, at: Callable[[Any], Tensor]) -> float:
@@ -123,7 +122,8 @@ def add(measured: Measured, table: Table) -> None:
         values = fmean(found.distance) if found.distance else NAN, fmean(found.edges), found.corner
         times = (f"{cost:.2f}" for cost in costs) if smooth else ("1", "1")
         table.add(name, way, *(number(value, ".3g") for value in values), *times)
-    table.add(name, "truth", "", "", number(measured.true_corner(), ".3g"), "", "")
+    if measured.motion.known_anywhere:
+        table.add(name, "truth", "", "", number(measured.true_corner(), ".3g"), "", "")
 
 
 def main() -> None:
