@@ -13,16 +13,19 @@ preset "accurate", and processor seconds of the modes of both key-frames, with n
 from __future__ import annotations
 
 import argparse
+import sys
 import warnings
 from collections.abc import Iterator, Sequence
+from functools import partial
 from itertools import chain
 from pathlib import Path
+from statistics import fmean
 
 import cases
 import torch
 from cases import HALF, Case, KeyframeSet
 from measures import Yardstick
-from methods import METHODS, add_peer, peer_python
+from methods import METHODS, UnavailableError, add_peer, peer_python
 from results import Table, add_keep
 from sheet import look
 from sheets import SHEETS, sheet
@@ -54,9 +57,14 @@ def compare_sheets(only: Sequence[str], methods: list[str], table: Table) -> Non
     for case in sheet_cases(only):
         yardstick, cells = Yardstick(case), []
         for name in methods:
-            frames = METHODS[name](case).frames
-            error = sum(yardstick.edge_error(x, t) for x, t in zip(frames, TIMES, strict=True)) / len(TIMES)
-            cells.append(f"{100 * error:.3f} %")
+            try:
+                frames = METHODS[name](case).frames
+            except UnavailableError as error:
+                print(f"{case.name}, {name}: {error}", file=sys.stderr)
+                cells.append("-")
+            else:
+                errors = [yardstick.edge_error(x, t) for x, t in zip(frames, TIMES, strict=True)]
+                cells.append(f"{100 * fmean(errors):.3f} %")
         table.add(case.name, *cells)
 
 
@@ -67,11 +75,7 @@ def compare_bodies(only: Sequence[str], table: Table) -> None:
             continue
         yardstick, ends, errors, seconds = Yardstick(case), torch.stack([case.x_a, case.x_b]), [], []
         for method in ("solid", "shell"):
-            bases, spent = timed(
-                lambda method=method, ends=ends, faces=case.faces: tm.extract_bases(  # type: ignore[misc]
-                    ends, faces, N_MODES, method=method, cache=False
-                )
-            )
+            bases, spent = timed(partial(tm.extract_bases, ends, case.faces, N_MODES, method=method, cache=False))
             with torch.no_grad():
                 x = tm.InBetween(bases, case.faces)(*ends, HALF)
             errors.append(f"{100 * yardstick.edge_error(x, HALF):.2f} %")
