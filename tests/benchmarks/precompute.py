@@ -4,8 +4,7 @@
 
 Times are those of all bases with 50 modes, with nothing cached, children included, over one call of
 ``pytetwild.tetrahedralize`` on the first key-frame in a process of its own: on the wall clock and of the processors.
-The last column is the part of the space of the first 30 modes of the first key-frame by fTetWild that the 50 by the
-lattice contain.
+The last column is the part that the spaces of the first 30 modes of the first key-frame by both meshers have in common.
 """
 
 import argparse
@@ -67,10 +66,10 @@ def bare_call(vertices: FloatArray, faces: IntArray) -> Cost:
         return measured(partial(subprocess.run, command, check=True, cwd=folder))[1]
 
 
-def contained(basis: tm.ModalBasis, other: tm.ModalBasis, n: int = 30) -> float:
-    """The part of the space of the first modes of a basis that another contains."""
-    first, theirs = (torch.linalg.qr(modes.flatten(1).mT)[0] for modes in (basis.modes[:n], other.modes))
-    return float((first.mT @ theirs).square().sum() / n)
+def shared(basis: tm.ModalBasis, other: tm.ModalBasis, n: int = 30) -> float:
+    """The part of the space of the first modes that two bases have in common."""
+    own, theirs = (torch.linalg.qr(each.modes[:n].flatten(1).mT)[0] for each in (basis, other))
+    return float((own.mT @ theirs).square().sum() / n)
 
 
 def meshes(only: list[str]) -> Iterator[tuple[str, FloatArray, IntArray]]:
@@ -90,14 +89,14 @@ def main() -> None:
     limit_threads()
     warnings.simplefilter("ignore")
     times = [f"{mesher}, {clock}" for mesher in MESHERS for clock in ("wall clock", "processors")]
-    with Table("precompute", ["", *times, "modes of fTetWild in the lattice's"], given.keep, times) as table:
+    with Table("precompute", ["", *times, "modes in common"], given.keep, times) as table:
         for name, x, faces in meshes(given.only):
             bare, cells, bases = bare_call(x[0], faces), [], []
             for mesher in MESHERS:
                 found, cost = measured(partial(tm.extract_bases, x, faces, 50, cache=False, mesher=MESHERS[mesher]))
                 cells += [f"{spent / of:.2f}" for spent, of in zip(cost, bare, strict=True)]
                 bases.append(found[0])
-            table.add(name, *cells, f"{contained(bases[1], bases[0]):.3f}")
+            table.add(name, *cells, f"{shared(*bases):.3f}")
 
 
 if __name__ == "__main__":

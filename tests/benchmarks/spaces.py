@@ -4,7 +4,7 @@
 
 Of each set, every second pose is left out in turn (every one with ``--step 1``); the others are the space. Distances
 are means over the vertices, in percent of the diagonal; edges are mean errors of length, in percent. Means over poses
-and sets are geometric. The linear span has the same unknowns without variation over the surface (a weight for each pose
+are geometric. The linear span has the same unknowns without variation over the surface (a weight for each pose
 and a rigid motion), and of seven ridges the one that is best by the truth. The nearest pose is the one that is nearest
 by the truth, moved rigidly by the 20 vertices. Seconds are of the processor, on one thread.
 """
@@ -95,12 +95,6 @@ def left_out(poses: Tensor, faces: Tensor, bases: list[tm.ModalBasis], step: int
         yield [*errors(found.shape, truth, faces), *linear(others, truth, picked, faces), *nearest, seconds]
 
 
-def add(name: str, rows: list[list[float]], table: Table) -> None:
-    """The means of several poses."""
-    *values, seconds = np.exp(np.log(np.maximum(rows, 1e-3)).mean(0))
-    table.add(name, *(f"{value:.2f}" for value in values), f"{seconds:.1f}")
-
-
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -110,15 +104,13 @@ def main() -> None:
     add_keep(parser)
     given = parser.parse_args()
     limit_threads()
-    ways, every = ("fit", "linear span", "nearest pose"), []
+    ways = "fit", "linear span", "nearest pose"
     columns = ["set, poses", *(f"{way}: {what}, %" for way in ways for what in ("distance", "edges")), "s per fit"]
     with Table("spaces", columns, given.keep, columns[-1:], "--sets creature") as table:
         for name, poses, faces in sets(given.sets):
             rows = list(left_out(poses, faces, tm.extract_bases(poses, faces, given.modes), given.step))
-            add(f"{name}, {len(poses)}", rows, table)
-            every += rows
-        if len(given.sets) > 1:
-            add(f"mean of {len(given.sets)} sets", every, table)
+            *values, seconds = np.exp(np.log(np.maximum(rows, 1e-3)).mean(0))
+            table.add(f"{name}, {len(poses)}", *(f"{value:.2f}" for value in values), f"{seconds:.1f}")
 
 
 if __name__ == "__main__":
