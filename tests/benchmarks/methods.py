@@ -28,7 +28,7 @@ import torch_modal as tm
 from torch_modal.geometry.rigid import blend
 
 PEER, PEER_SECONDS = "TORCH_MODAL_PEER_PYTHON", 180
-MOST_VERTICES = 15_000  # over all vertices: more take minutes a step
+MOST_VERTICES = 5_000  # over all vertices: more take minutes
 # One thread, as for all others. Most of the threads of NPROC only wait; of two, jax 0.10 waits for itself for ever.
 PEER_ENVIRONMENT = {
     "NPROC": "8",

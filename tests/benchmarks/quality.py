@@ -29,7 +29,7 @@ from sheet import draw_sheet
 from tables import geometric_mean, number, percent
 from timing import limit_threads
 
-FEW = ["hand-path", "hand 00/04", "woman 00/02", "face 00/01", "cube", "creature 1/2", "creature 2/3", "sample hand"]
+FEW = ["hand-path", "hand 00/04", "woman 00/02", "face 00/01", "cube 1/2", "creature 1", "creature 2", "sample hand"]
 BODIES = ["limb bent 120", "bar bent 360", "bar twisted 270", "bar twisted 360", "vessel bent 60", "gutter rolled 270"]
 OURS = "accurate"
 
@@ -38,6 +38,7 @@ def half_way(case: Case, names: list[str]) -> dict[str, Outcome]:
     """What the methods that know this case give at t = 1/2."""
     found = {}
     for name in names:
+        print(f"{case.name}, {name}", file=sys.stderr, flush=True)
         try:
             with torch.no_grad():
                 found[name] = METHODS[name](case.at([HALF]))
