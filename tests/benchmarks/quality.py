@@ -67,7 +67,7 @@ def compare(found: dict[Case, dict[str, Outcome]], table: Table) -> None:
         table.add("edge error", name, *(percent(row[method]) if method in row else "-" for method in methods))
     for title, rows in (("edge error", edges), ("energy", energies), ("time", times)):
         if len(rows) > 1 and OURS in methods:
-            table.add(f"{title} over {OURS}", f"mean of {len(rows)}", *(mean(rows, method) for method in methods))
+            table.add(f"{title} over {OURS}", f"mean of {len(rows)} pairs", *(mean(rows, method) for method in methods))
 
 
 def mean(rows: dict[str, dict[str, float]], method: str) -> str:
