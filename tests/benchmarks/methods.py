@@ -1,9 +1,10 @@
 """The ways to an in-between that are compared.
 
 A method is a function of a case that gives the frames at the case's times, and how long one call for all of them took,
-with everything that can be prepared beforehand left out. To add one, write the function under ``@method(name)``.
+with everything that can be prepared beforehand left out. ``METHODS`` has them by their names.
 """
 
+import argparse
 import importlib.util
 import os
 import subprocess
@@ -11,8 +12,9 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -25,10 +27,11 @@ from timing import timed
 import torch_modal as tm
 from torch_modal.geometry.rigid import blend
 
-PEER_SECONDS = 180
-MOST_VERTICES = 15_000  # over all vertices: more take minutes a step
-# One thread, as for all others; with more, jax 0.10 waits for itself for ever on few cores and large meshes.
+PEER, PEER_SECONDS = "TORCH_MODAL_PEER_PYTHON", 180
+MOST_VERTICES = 5_000  # over all vertices: more take minutes
+# One thread, as for all others. Most of the threads of NPROC only wait; of two, jax 0.10 waits for itself for ever.
 PEER_ENVIRONMENT = {
+    "NPROC": "8",
     "OMP_NUM_THREADS": "1",
     "OPENBLAS_NUM_THREADS": "1",
     "JAX_PLATFORMS": "cpu",
@@ -43,47 +46,15 @@ class Outcome(NamedTuple):
     frames: torch.Tensor
     """*Shape:* ``(T, V, 3)``."""
     seconds: float
-    """Processor seconds of one call for all T; NaN where there is nothing to time."""
-    note: str = ""
-    """What a reader should know: that it did not converge, for instance."""
+    """Processor seconds of one call for all T."""
     making: float = float("nan")
     """Seconds of what is made once for a mesh, where that was timed."""
-
-
-class Method(NamedTuple):
-    """A way to in-betweens."""
-
-    function: Callable[[Case], Outcome]
-    half_only: bool
-    """Whether it knows t = 1/2 alone."""
 
 
 class UnavailableError(Exception):
     """This method cannot run here, or not on this case."""
 
 
-METHODS: dict[str, Method] = {}
-
-
-def method(name: str, half_only: bool = False) -> Callable[[Callable[[Case], Outcome]], Callable[[Case], Outcome]]:
-    """Put a function into ``METHODS``."""
-
-    def register(function: Callable[[Case], Outcome]) -> Callable[[Case], Outcome]:
-        METHODS[name] = Method(function, half_only)
-        return function
-
-    return register
-
-
-@method("truth")
-def truth(case: Case) -> Outcome:
-    """The true in-betweens themselves: what a perfect guess would show in each column."""
-    if set(case.times) - set(case.truths):
-        raise UnavailableError("no truth")
-    return Outcome(torch.stack([case.truths[t] for t in case.times]), float("nan"))
-
-
-@method("linear")
 def linear(case: Case) -> Outcome:
     """Straight lines between the first key-frame and the second laid upon it; the rigid motion along its geodesic."""
     times = torch.tensor(case.times, dtype=case.x_a.dtype)
@@ -91,120 +62,67 @@ def linear(case: Case) -> Outcome:
     return Outcome(*timed(lambda: blend(case.x_a, case.x_b, times, weights)))
 
 
-@method("paired", half_only=True)
-def paired(case: Case) -> Outcome:
-    """The paper's space, with the default mu: the preset "paper"."""
+def paper(case: Case) -> Outcome:
+    """The preset "paper", which knows t = 1/2 alone."""
     layer = tm.MidShape(case.bases(30), case.faces, preset="paper")
-    result, seconds = timed(lambda: layer.solve(case.x_a, case.x_b))
-    return Outcome(result.shapes[None], seconds, convergence(result))
+    with torch.no_grad():
+        shape, seconds = timed(lambda: layer(case.x_a, case.x_b))
+    return Outcome(shape[None], seconds)
 
 
-@method("joint")
-def joint(case: Case) -> Outcome:
-    """The modes added to the blend by local rotations: as "accurate" without its local steps."""
-    return by_layer(case, 30, solver=tm.Solver(local_steps=0))
+def by_layer(case: Case, preset: Literal["accurate", "fast"]) -> Outcome:
+    """All times in one call of the layer."""
+    layer, times = tm.InBetween(case.bases(30), case.faces, preset), torch.tensor(case.times, dtype=torch.float64)
+    with torch.no_grad():
+        return Outcome(*timed(lambda: layer(case.x_a, case.x_b, times)))
 
 
-@method("fast")
-def fast(case: Case) -> Outcome:
-    """The preset "fast": the same on 300 coarse faces."""
-    return by_layer(case, 30, preset="fast")
+def optimum(case: Case) -> Outcome:
+    """The optimum over all vertices: the best of what our own in-between and linear interpolation lead to."""
+    if len(case.x_a) > MOST_VERTICES:
+        raise UnavailableError(f"{len(case.x_a)} vertices are too many")
+    starts, shapes = by_layer(case, "accurate").frames, []
+    begin = time.process_time()
+    for start, t in zip(starts, case.times, strict=True):
+        results = [full_space(case.x_a, case.x_b, case.faces, t, start=x) for x in (start, None)]
+        shapes.append(min(results, key=lambda result: result.energies[-1]).shape)
+    return Outcome(torch.stack(shapes), time.process_time() - begin)
 
 
-@method("subdivide")
-def subdivide(case: Case) -> Outcome:
-    """The preset "accurate", the default of ``subdivide``: the same, with steps on the fine mesh after it."""
-    return by_layer(case, 30, preset="accurate")
-
-
-@method("subdivide, polish 2")
-def polished(case: Case) -> Outcome:
-    """The same with two longer steps."""
-    return by_layer(case, 30, solver=tm.Solver(polish=2))
-
-
-@method("full", half_only=True)
-def full(case: Case) -> Outcome:
-    """The optimum over all vertices: the best of what a modal and a linear start lead to."""
-    starts = InBetweens(case, 30, {"solver": tm.Solver()})()
-    return by_full_space(
-        case,
-        lambda x_a, x_b, t, k: min(
-            (full_space(x_a, x_b, case.faces, t, start=start) for start in (starts.shapes[k], None)),
-            key=lambda result: result.energies[-1],
-        ),
-    )
-
-
-@method("Froehlich-Botsch", half_only=True)
 def example_based(case: Case) -> Outcome:
     """One reference with interpolated lengths and angles, on a decimated mesh, and back by deformation transfer."""
     reduced = ReducedPair(case.x_a, case.x_b, case.faces, 1000)
     return Outcome(*timed(lambda: torch.stack([froehlich_botsch(reduced, t) for t in case.times])))
 
 
-@method("geodesic")
 def isometric_geodesic(case: Case) -> Outcome:
     """As-isometric-as-possible (Kilian et al. 2007): eight steps, all optimised together, from coarse to fine."""
     begin = time.process_time()
     found = geodesic(case.x_a, case.x_b, case.faces)
     seconds = time.process_time() - begin
-    return Outcome(found.at(torch.tensor(case.times, dtype=case.x_a.dtype)), seconds, f"{sum(found.iterations)} steps")
+    return Outcome(found.at(torch.tensor(case.times, dtype=case.x_a.dtype)), seconds)
 
 
-@method("morphomatics")
-def differential_coordinates(case: Case) -> Outcome:
-    """Differential coordinates with the first key-frame as the reference, as in the library's tutorial."""
-    return by_peer(case)
+def add_peer(parser: argparse.ArgumentParser) -> None:
+    """The option that names a Python with the peers, for this process and its children."""
 
+    def named(python: str) -> str:
+        os.environ[PEER] = python
+        return python
 
-class InBetweens:
-    """A layer with these options, to be called for all times of a case."""
-
-    def __init__(self, case: Case, n_modes: int, options: dict[str, Any]) -> None:
-        self.case, self.times = case, torch.tensor(case.times, dtype=torch.float64)
-        self.layer = tm.InBetween(case.bases(n_modes), case.faces, **options)
-
-    def __call__(self) -> Any:
-        with torch.no_grad():
-            return self.layer.solve(self.case.x_a, self.case.x_b, self.times)
-
-
-def by_layer(case: Case, n_modes: int, **options: Any) -> Outcome:
-    """In-betweens by the layer with these options."""
-    result, seconds = timed(InBetweens(case, n_modes, options))
-    return Outcome(result.shapes, seconds, convergence(result))
-
-
-def by_full_space(case: Case, solve: Callable[..., Any]) -> Outcome:
-    """Over all vertices, once: it is too slow to be timed several times."""
-    if len(case.x_a) > MOST_VERTICES:
-        raise UnavailableError(f"{len(case.x_a)} vertices are too many")
-    begin = time.process_time()
-    results = [solve(case.x_a, case.x_b, t, k) for k, t in enumerate(case.times)]
-    seconds = time.process_time() - begin
-    notes = [f"{len(result.energies) - 1} steps" + ("" if result.stagnated else ", cut off") for result in results]
-    return Outcome(torch.stack([result.shape for result in results]), seconds, notes[0])
-
-
-def convergence(result: Any) -> str:
-    """The number of steps where all went well, the statuses where not."""
-    solution = result.solution
-    if bool(solution.usable.all()):
-        return f"{int(solution.n_steps.max())} steps"
-    return f"not converged: statuses {sorted(set(solution.status.reshape(-1).tolist()))}"
+    parser.add_argument("--peer-python", type=named, metavar="FILE", help="a Python that has morphomatics")
 
 
 def peer_python() -> str | None:
     """The interpreter that has the peers: ``TORCH_MODAL_PEER_PYTHON``, or this one if they are installed here."""
-    given = os.environ.get("TORCH_MODAL_PEER_PYTHON")
-    return given or (sys.executable if importlib.util.find_spec("morphomatics") else None)
+    return os.environ.get(PEER) or (sys.executable if importlib.util.find_spec("morphomatics") else None)
 
 
 def by_peer(case: Case, limit: float = PEER_SECONDS) -> Outcome:
     """In-betweens by morphomatics, in a child process: its threads and its memory are its own.
 
-    No answer within the limit, in seconds, is an :class:`UnavailableError`.
+    By differential coordinates with the first key-frame as the reference, as in the library's tutorial. No answer
+    within the limit, in seconds, is an :class:`UnavailableError`.
     """
     python = peer_python()
     if python is None:
@@ -229,3 +147,15 @@ def by_peer(case: Case, limit: float = PEER_SECONDS) -> Outcome:
     whole = torch.lerp(case.x_a, case.x_b, HALF).repeat(len(case.times), 1, 1)
     whole[:, used] = frames  # vertices of no face stay where they are
     return Outcome(whole, float(given["seconds"]), making=float(given["making"]))
+
+
+METHODS: dict[str, Callable[[Case], Outcome]] = {
+    "linear": linear,
+    "paper": paper,
+    "fast": partial(by_layer, preset="fast"),
+    "accurate": partial(by_layer, preset="accurate"),
+    "optimum": optimum,
+    "Froehlich-Botsch": example_based,
+    "geodesic": isometric_geodesic,
+    "morphomatics": by_peer,
+}

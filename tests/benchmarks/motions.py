@@ -38,8 +38,6 @@ class Motion:
     cyclic: bool = False
     known_anywhere: bool = False
     """Whether the truth is known at any time."""
-    stop: tuple[float, float] | None = None
-    """Two times of key-frames between which nothing moves."""
 
     @property
     def diagonal(self) -> float:
@@ -91,7 +89,7 @@ def grip() -> Iterator[Motion]:
 
     shapes = KeyframeSet(torch.stack([posed(t) for t in STOP_TIMES]), faces)
     measured = fractions(STOP_TIMES, 0.25, 0.5, 0.75)
-    yield Motion("hand with a stop", shapes, STOP_TIMES, measured, posed, known_anywhere=True, stop=(CLOSED, LETS_GO))
+    yield Motion("hand with a stop", shapes, STOP_TIMES, measured, posed, known_anywhere=True)
 
 
 def hand_path() -> Iterator[Motion]:

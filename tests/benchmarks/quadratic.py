@@ -8,7 +8,6 @@ import scipy.sparse as sp
 import scipy.sparse.linalg as spla
 
 from torch_modal.geometry.sparse import factorize
-from torch_modal.modes.embedding import closest_tetrahedra
 from torch_modal.modes.stiffness import hat_gradients
 from torch_modal.modes.tetrahedra import Tetrahedra, tet_volumes
 
@@ -66,16 +65,6 @@ def quadratic_modes(solid: Tetrahedra, n_modes: int) -> QuadraticModes:
     order = np.argsort(values)[N_RIGID : N_RIGID + n_modes]
     assert np.abs(values[np.argsort(values)[:N_RIGID]]).max() < 1e-6 * values[order[0]], "a rigid motion was missed"
     return QuadraticModes(values[order], vectors[:, order], nodes)
-
-
-def at_points(points: np.ndarray, solid: Tetrahedra, nodes: np.ndarray) -> sp.csr_matrix:
-    """Weights that take values at the nodes to points in or near the solid. *Shape:* ``(V, P)``."""
-    tets = closest_tetrahedra(points, solid)
-    offset = points - solid.vertices[solid.tets[tets]].mean(axis=1)
-    barycentric = 0.25 + np.einsum("vi,vai->va", offset, hat_gradients(solid)[tets])
-    weights = np.stack([_shapes(b) for b in barycentric])
-    rows = np.repeat(np.arange(len(points)), 10)
-    return sp.csr_matrix((weights.reshape(-1), (rows, nodes[tets].reshape(-1))), shape=(len(points), nodes.max() + 1))
 
 
 class _Rule(NamedTuple):

@@ -1,137 +1,120 @@
-"""How good in-betweens are: the methods of this package, linear interpolation, and peers, side by side.
+"""In-betweens half-way by this package, by linear interpolation and by other methods.
 
-    python tests/benchmarks/quality.py [FOLDER ...] [--shared] [--samples] [--bodies]
+    python tests/benchmarks/quality.py [FOLDER ...] [--only TEXT ...] [--methods NAME ...] [--peer-python FILE]
+    python tests/benchmarks/quality.py --bodies
 
-A folder holds the frames of a motion, in the order of their names: the first and the last are the key-frames, those
-between are the truth at their places. Two frames alone have no truth, and then only energies, drift and volumes are
-compared. Peers join when they are installed (pip install morphomatics), or with ``--peer-python``.
+A folder holds the frames of a motion: the first and the last are the key-frames, the others the truth at their places.
+Without one, pairs of the samples and of the data beside the repository are compared. *Edge error* is the mean of
+``|l - l_true| / l_true`` over the edges where the middle is known, *energy* that of Eq. 5 against both key-frames, on
+the fine mesh. Means are geometric, over the pairs that both methods have. Times are processor seconds of one call on
+one thread. Morphomatics joins where it is installed (``pip install morphomatics``), or with ``--peer-python``.
 
-Everything is measured at t = 1/2, and the edge error also over all times with a truth (docs/quality.md says what the
-columns mean). Times are processor seconds on one thread, best of several: compare them within one run.
+``--bodies`` compares bodies in closed form (tests/bodies.py) with their true shapes. *Folds* are hinges bent by more
+than a right angle beyond both key-frames.
 """
 
 import argparse
-import os
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
+from itertools import chain
 from pathlib import Path
 
 import cases
 import torch
 from cases import HALF, Case
-from measures import Row, Yardstick
-from methods import METHODS, Method, UnavailableError
+from measures import Yardstick
+from methods import METHODS, Outcome, UnavailableError, add_peer
+from results import Table, add_keep
 from sheet import draw_sheet
-from tables import case_table, load_rows, markdown, save_rows
-from timing import limit_threads, untimed
+from tables import geometric_mean, number, percent
+from timing import limit_threads
 
-REFERENCE = "full"
-"""The method whose optimum tells which way faces look where there is no truth; it comes first."""
-
-RETRIED = ("not available", "failed")
-"""Notes of rows that are tried again."""
+FEW = ["hand-path", "hand 00/04", "woman 00/02", "face 00/01", "cube 1/2", "creature 1", "creature 2", "sample hand"]
+BODIES = ["limb bent 120", "bar bent 360", "bar twisted 270", "bar twisted 360", "vessel bent 60", "gutter rolled 270"]
+OURS = "accurate"
 
 
-def run(case: Case, names: list[str], shapes: dict[str, torch.Tensor]) -> Iterator[Row]:
-    """All methods on one case; their shapes half-way are put into ``shapes``."""
-    yardstick = Yardstick(case)
-    upright = None
-    for name in sorted(names, key=lambda name: name != REFERENCE):
-        row = Row(case.name, name)
+def half_way(case: Case, names: list[str]) -> dict[str, Outcome]:
+    """What the methods that know this case give at t = 1/2."""
+    found = {}
+    for name in names:
+        print(f"{case.name}, {name}", file=sys.stderr, flush=True)
         try:
-            found = attempt(case, METHODS[name], row, yardstick)
-        except UnavailableError as error:
-            row.note = f"not available: {error}"
-            print(f"    {name}: {error}", file=sys.stderr)
-        except (ValueError, RuntimeError) as error:
-            row.note = f"failed: {str(error)[:100]}"
-        else:
-            shapes[name] = found
-            upright = found if name == REFERENCE else upright
-            yardstick.measure(row, found, upright)
-        yield row
+            with torch.no_grad():
+                found[name] = METHODS[name](case.at([HALF]))
+        except (UnavailableError, ValueError, RuntimeError) as error:
+            print(f"{case.name}, {name}: {error}", file=sys.stderr)
+    return found
 
 
-def attempt(case: Case, method: Method, row: Row, yardstick: Yardstick) -> torch.Tensor:
-    """Call a method: at t = 1/2, which is timed, and at all times with a truth."""
-    half = method.function(case.at([HALF]))
-    row.seconds, row.note = half.seconds, half.note
-    others = [time for time in case.truths if time != HALF]
-    if not method.half_only and case.truths:
-        errors = [yardstick.edge_error(half.frames[0], HALF)] if HALF in case.truths else []
-        if others:
-            with untimed():
-                frames = method.function(case.at(others)).frames
-            errors += [yardstick.edge_error(x, time) for x, time in zip(frames, others, strict=True)]
-        row.edge_error_all = sum(errors) / len(errors)
-    return half.frames[0]
+def chosen(folders: list[Path], only: list[str]) -> Iterator[Case]:
+    """The cases that are compared."""
+    given = chain.from_iterable(map(cases.folder, folders)) if folders else chain(cases.shared(), cases.samples())
+    return (case for case in given if folders or any(text in case.name for text in only))
 
 
-def chosen_cases(arguments: argparse.Namespace) -> Iterator[Case]:
-    """The cases that were asked for."""
-    for folder in arguments.folders:
-        yield from cases.folder(folder)
-    if arguments.shared:
-        yield from cases.shared()
-    if arguments.samples:
-        yield from cases.samples()
-    if arguments.bodies:
-        yield from cases.bodies()
-    yield from cases.bodies(arguments.body)
+def compare(found: dict[Case, dict[str, Outcome]], table: Table) -> None:
+    """Add a row for each pair and measure, and the means over the pairs."""
+    methods = table.content["columns"][2:]
+    edges, energies, times = {}, {}, {}
+    for case, outcomes in found.items():
+        yardstick = Yardstick(case)
+        if HALF in case.truths:
+            edges[case.name] = {name: yardstick.edge_error(x.frames[0], HALF) for name, x in outcomes.items()}
+        energies[case.name] = {name: yardstick.energy(x.frames[0]) for name, x in outcomes.items()}
+        times[case.name] = {name: x.seconds for name, x in outcomes.items()}
+    for name, row in edges.items():
+        table.add("edge error", name, *(percent(row[method]) if method in row else "-" for method in methods))
+    for title, rows in (("edge error", edges), ("energy", energies), ("time", times)):
+        if len(rows) > 1 and OURS in methods:
+            table.add(f"{title} over {OURS}", f"mean of {len(rows)} pairs", *(mean(rows, method) for method in methods))
 
 
-def parse(words: Sequence[str] | None) -> argparse.Namespace:
-    """The command line, or words in its place."""
+def mean(rows: dict[str, dict[str, float]], method: str) -> str:
+    """Of the ratios to our own method."""
+    return number(geometric_mean([row[method] / row[OURS] for row in rows.values() if method in row]), ".3g")
+
+
+def compare_bodies(names: list[str], table: Table) -> None:
+    """Add a row for each body."""
+    for case in cases.bodies(names):
+        yardstick, truth = Yardstick(case), case.truths[HALF]
+        straight, own = (outcome.frames[0] for outcome in half_way(case, ["linear", OURS]).values())
+        table.add(
+            case.name,
+            *(percent(yardstick.edge_error(x, HALF)) for x in (straight, own)),
+            number(yardstick.energy(own) / yardstick.energy(truth), ".3f"),
+            number(yardstick.volume(own) / yardstick.volume(truth), ".3f"),
+            str(int(yardstick.folded(own).sum())),
+        )
+
+
+def main() -> None:
+    """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folders", nargs="*", type=Path, metavar="FOLDER", help="frames of a motion, or two key-frames")
-    parser.add_argument("--shared", action="store_true", help="all data sets that are kept beside the project")
-    parser.add_argument("--samples", action="store_true", help="the samples that come with the package")
-    parser.add_argument("--bodies", action="store_true", help="bars, hollow and slender bodies, a sheet")
-    parser.add_argument("--body", nargs="+", default=[], metavar="NAME", help="others, such as 'bar bent 270'")
-    parser.add_argument("--methods", nargs="+", choices=list(METHODS), default=list(METHODS), metavar="NAME")
-    parser.add_argument("--only", nargs="+", default=[""], metavar="TEXT", help="only cases with one of these in them")
-    parser.add_argument("--peer-python", type=Path, metavar="FILE", help="a Python that has morphomatics")
-    parser.add_argument("--results", type=Path, metavar="FILE.json", help="keep results, and go on from those there")
-    parser.add_argument("--markdown", type=Path, metavar="FILE.md", help="write all tables")
+    parser.add_argument("--only", nargs="+", metavar="TEXT", help="cases with one of these in their names")
+    parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS), metavar="NAME")
+    parser.add_argument("--bodies", action="store_true", help="bodies in closed form; --only names others")
     parser.add_argument("--sheet", type=Path, metavar="FILE.png", help="draw the shapes, coloured by their edge errors")
-    arguments = parser.parse_args(words)
-    named = ("folders", "shared", "samples", "bodies", "body")
-    if not any(getattr(arguments, name) for name in named):
-        parser.error("name a folder of frames, or --shared, --samples, --bodies or --body")
-    return arguments
-
-
-def main(words: Sequence[str] | None = None) -> None:
-    """Run what is missing, print and write tables."""
-    arguments = parse(words)
-    if arguments.peer_python:
-        os.environ["TORCH_MODAL_PEER_PYTHON"] = str(arguments.peer_python)
-    rows = load_rows(arguments.results)
-    drawn: list[tuple[Case, dict[str, torch.Tensor]]] = []
-    shown: list[Row] = []
-    for case in chosen_cases(arguments):
-        if not any(text in case.name for text in arguments.only):
-            continue
-        known = {row.method: row for row in rows if row.case == case.name and not row.note.startswith(RETRIED)}
-        missing = [name for name in arguments.methods if name not in known or arguments.sheet]
-        shapes: dict[str, torch.Tensor] = {}
-        if missing:
-            with torch.no_grad():
-                known |= {row.method: row for row in run(case, missing, shapes)}
-            rows = [row for row in rows if row.case != case.name] + list(known.values())
-            save_rows(arguments.results, rows)
-        mine = [known[name] for name in METHODS if name in known and name in arguments.methods]
-        print(case_table(case.name, mine), flush=True)
-        shown += mine
-        drawn.append((case, shapes))
-    text = markdown(shown)
-    print(text)
-    if arguments.markdown:
-        arguments.markdown.write_text(text)
-    if arguments.sheet:
-        draw_sheet(drawn, arguments.sheet)
+    add_peer(parser)
+    add_keep(parser)
+    given = parser.parse_args()
+    limit_threads()
+    if given.bodies:
+        ratios = [f"{what} over the truth's" for what in ("energy", "volume")]
+        columns = ["body", "edge error, linear", "edge error", *ratios, "folds"]
+        with Table("bodies", columns, given.keep, check="--bodies --only 'limb bent 120'") as table:
+            compare_bodies(given.only or BODIES, table)
+        return
+    found = {case: half_way(case, given.methods) for case in chosen(given.folders, given.only or FEW)}
+    methods = [name for name in given.methods if any(name in outcomes for outcomes in found.values())]
+    check = f"--only 'sample hand' --methods linear {OURS}"
+    with Table("quality", ["", "pair", *methods], given.keep, check=check, labels=2) as table:
+        compare(found, table)
+    if given.sheet:
+        draw_sheet(found, given.sheet)
 
 
 if __name__ == "__main__":
-    limit_threads()
     main()

@@ -4,7 +4,8 @@
     python tests/benchmarks/refresh.py --run [PAGE ...]
 
 Pages are names such as ``quality`` or ``README``; without one, all. With ``--run`` the command of each table runs and
-keeps its results, one after the other; then the pages are written.
+keeps its results, one after the other; then the pages are written. ``TORCH_MODAL_PEER_PYTHON`` names a Python that has
+morphomatics, where this one has not; without it, a new run has no results of that.
 """
 
 import argparse
@@ -18,7 +19,7 @@ from results import PAGES, ROOT, load, names, refreshed
 def main() -> None:
     """Refresh what is asked for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    known = {path.stem: path for path in PAGES}
+    known = {path.stem: path for path in reversed(PAGES)}  # the README of docs has no table
     parser.add_argument("pages", nargs="*", choices=[[], *known], metavar="PAGE")
     parser.add_argument("--run", action="store_true", help="measure again")
     given = parser.parse_args()

@@ -7,26 +7,27 @@ import numpy as np
 import torch
 from cases import HALF, Case
 from measures import Yardstick
+from methods import Outcome
 
 from torch_modal.geometry.connectivity import Connectivity
 
 WORST = 0.2  # relative edge error at the end of the colour scale
 
 
-def draw_sheet(drawn: list[tuple[Case, dict[str, torch.Tensor]]], path: Path) -> None:
-    """A row for each case, a column for each method; colours are the mean relative edge errors around a vertex.
+def draw_sheet(found: dict[Case, dict[str, Outcome]], path: Path) -> None:
+    """A row for each case, a column for the truth and each method.
 
-    From pale (none) to dark red (``WORST`` and more).
+    Colours are the mean relative edge errors around a vertex, from pale (none) to dark red (``WORST`` and more).
     """
     import pyvista
 
-    drawn = [(case, shapes) for case, shapes in drawn if shapes]
-    methods = list(dict.fromkeys(name for _, shapes in drawn for name in shapes))
-    size = (260 * len(methods), 240 * len(drawn))
-    plotter = pyvista.Plotter(shape=(len(drawn), len(methods)), off_screen=True, window_size=size, border=False)
-    for i, (case, shapes) in enumerate(drawn):
+    methods = list(dict.fromkeys(["truth", *(name for outcomes in found.values() for name in outcomes)]))
+    size = (260 * len(methods), 240 * len(found))
+    plotter = pyvista.Plotter(shape=(len(found), len(methods)), off_screen=True, window_size=size, border=False)
+    for i, (case, outcomes) in enumerate(found.items()):
         yardstick = Yardstick(case)
         truth = case.truths.get(HALF)
+        shapes = {name: x.frames[0] for name, x in outcomes.items()} | ({} if truth is None else {"truth": truth})
         ends = [case.x_a, case.x_b] if truth is None else [truth]
         wanted = torch.stack([yardstick.lengths(x) for x in ends]).mean(0)
         guide = truth if truth is not None else next(iter(shapes.values()))
@@ -39,8 +40,7 @@ def draw_sheet(drawn: list[tuple[Case, dict[str, torch.Tensor]]], path: Path) ->
             polygons = pyvista.PolyData.from_regular_faces(x.numpy(), case.faces.numpy())
             polygons["error"] = around_vertices(error, Connectivity(case.faces.numpy()).edges, len(x))
             plotter.add_mesh(polygons, clim=(0, WORST), cmap="YlOrRd", show_scalar_bar=False, smooth_shading=False)
-            text = f"{name}  {100 * float(error.mean()):.1f} %\n{case.name}"
-            plotter.add_text(text, position=(6, 206), font_size=6)
+            plotter.add_text(f"{name}\n{case.name}", position=(6, 206), font_size=6)
             look(plotter, guide)
     plotter.screenshot(path)
     plotter.close()

@@ -1,181 +1,86 @@
-"""Thin things: modes of the surface itself, and sheets without a thickness.
+"""Thin things: sheets without a thickness, and modes of the surface beside those of the solid.
 
-    python tests/benchmarks/thin.py [--lens] [--times] [--bodies] [--sheets] [--peer-python FILE] [--only TEXT ...]
-                                    [--picture FILE.png]
+    python tests/benchmarks/thin.py [--only TEXT ...] [--peer-python FILE] [--picture FILE.png]
+    python tests/benchmarks/thin.py --bodies
 
-All parts, or those that are named:
+Mean relative errors of edge lengths at t = 1/4, 1/2 and 3/4 of sheets in closed form (tests/sheets.py), by modes of the
+surface. Morphomatics joins where it is installed, or with ``--peer-python``. ``--picture`` draws the sheets instead.
 
-- ``--lens``: modes of a squashed sphere, as its thickness goes to nothing.
-- ``--times``: processor seconds of the modes of one key-frame, of the surface and of the solid.
-- ``--bodies``: edge errors with modes of the surface over those with modes of the solid, at t = 1/2. Where no truth is
-  known, errors are to the mean lengths of both key-frames.
-- ``--sheets``: flat and open surfaces whose in-betweens are known (tests/sheets.py), by modes of the surface. Edge
-  errors at t = 1/4, 1/2 and 3/4, and ratios of their means to those of linear interpolation and of a peer.
-
-``--picture`` draws key-frames and in-betweens of the sheets.
+``--bodies`` compares, on closed bodies at t = 1/2, modes of the surface with those of the solid: edge errors with the
+preset "accurate", and processor seconds of the modes of both key-frames, with nothing cached.
 """
 
 from __future__ import annotations
 
 import argparse
-import os
+import sys
 import warnings
 from collections.abc import Iterator, Sequence
+from functools import partial
 from itertools import chain
 from pathlib import Path
+from statistics import fmean
 
 import cases
-import numpy as np
 import torch
-import trimesh
 from cases import HALF, Case, KeyframeSet
 from measures import Yardstick
-from methods import METHODS, UnavailableError
+from methods import METHODS, UnavailableError, add_peer, peer_python
+from results import Table, add_keep
 from sheet import look
 from sheets import SHEETS, sheet
-from tables import geometric_mean, number, print_table
+from tables import number
 from timing import limit_threads, timed, untimed
 
 import torch_modal as tm
 
 N_MODES = 30
 TIMES = (0.25, HALF, 0.75)
-OURS = {"subdivide": "accurate", "fast": "fast"}
-"""Methods of the comparison, and the presets that they are."""
-OTHERS = ("linear", "morphomatics")
-TARGETS = {"linear": 0.1, "morphomatics": 1.0}
-THICKNESSES = (0.1, 0.03, 0.01, 0.003, 0.001, 0.0)
-ZERO = 1e-6
-"""Largest eigenvalue of a rigid motion, over the first of the others."""
-TIMED = {"mh-hand/00-open.obj": 1, "ict-face/00-neutral.obj": 4, "mh-woman/00-rest.obj": 4}
-"""Files of the data, and into how many triangles each of theirs is cut in the end."""
 SHOWN = (0.0, 0.25, HALF, 0.75, 1.0)
-
-
-# ---------------------------------------------------------------------------------------------------------------- lens
-
-
-def lens_rows() -> Iterator[list[str]]:
-    """A line for each thickness."""
-    ball = trimesh.creation.icosphere(subdivisions=3)
-    faces = np.array(ball.faces)
-    for thickness in THICKNESSES:
-        vertices = np.array(ball.vertices) * (1, 1, thickness)
-        basis = tm.extract_modes(vertices, faces, N_MODES, method="shell", cache=False)
-        rigid, first, last = (float(x) for x in (basis.rigid_eigenvalues.abs().max(), *basis.eigenvalues[[0, -1]]))
-        yield [
-            f"{100 * thickness:g} %",
-            *(f"{x:.3g}" for x in (rigid, first, last)),
-            "" if rigid < ZERO * first else "MISSED",
-        ]
-
-
-LENS_COLUMNS = ["thickness", "largest rigid eigenvalue", "first elastic", "last", "notes"]
-
-
-# --------------------------------------------------------------------------------------------------------------- times
-
-
-def time_rows(only: Sequence[str]) -> Iterator[list[str]]:
-    """A line for each mesh and size."""
-    for name, parts in TIMED.items():
-        if not any(text in name for text in only) or not (cases.DATA / name).exists():
-            continue
-        keyframes, triangles = tm.load_keyframes([cases.DATA / name])
-        vertices, faces = keyframes[0].numpy(), triangles.numpy()
-        for level in range(1 + (parts == 4)):
-            if level:
-                vertices, faces = trimesh.remesh.subdivide(vertices, faces)
-            seconds = [
-                timed(lambda m=method, v=vertices, f=faces: tm.extract_modes(v, f, N_MODES, method=m, cache=False))[1]  # type: ignore[misc]
-                for method in ("shell", "solid")
-            ]
-            yield [name, str(len(vertices)), *(number(x, ".2f") for x in (*seconds, seconds[0] / seconds[1]))]
-
-
-TIME_COLUMNS = ["mesh", "vertices", "shell, s", "solid, s", "shell over solid"]
-
-
-# -------------------------------------------------------------------------------------------------------------- bodies
-
-
-def body_rows(only: Sequence[str]) -> Iterator[list[str]]:
-    """A line for each pair of key-frames, then the means."""
-    found: list[list[float]] = []
-    for case in chain(cases.shared(), cases.samples()):
-        if not any(text in case.name for text in only):
-            continue
-        yardstick, ends = Yardstick(case), torch.stack([case.x_a, case.x_b])
-        wanted = torch.stack([yardstick.lengths(x) for x in ends]).mean(0)
-        wanted = yardstick.lengths(case.truths[HALF]) if HALF in case.truths else wanted
-        errors = {}
-        for method in ("solid", "shell"):
-            bases = tm.extract_bases(ends, case.faces, N_MODES, method=method)  # type: ignore[arg-type]
-            for preset in ("accurate", "fast"):
-                with torch.no_grad():
-                    x = tm.InBetween(bases, case.faces, preset)(*ends, HALF)  # type: ignore[arg-type]
-                errors[method, preset] = float(((yardstick.lengths(x) - wanted).abs() / wanted).mean())
-        ratios = [errors["shell", preset] / errors["solid", preset] for preset in ("accurate", "fast")]
-        found.append(ratios)
-        shown = [errors[method, preset] for preset in ("accurate", "fast") for method in ("solid", "shell")]
-        yield [case.name, *(f"{100 * error:.3f} %" for error in shown), *(number(ratio, ".3f") for ratio in ratios)]
-    yield [
-        "geometric mean",
-        "",
-        "",
-        "",
-        "",
-        *(number(geometric_mean(list(r)), ".3f") for r in zip(*found, strict=True)),
-    ]
-
-
-BODY_COLUMNS = ["pair", "accurate: solid", "shell", "fast: solid", "shell", "accurate: over solid", "fast: over solid"]
-
-
-# -------------------------------------------------------------------------------------------------------------- sheets
+BODIES = ["creature 1/2", "sample hand", "mh-hand-path 00/08"]
 
 
 def sheet_cases(only: Sequence[str]) -> Iterator[Case]:
-    """The sheets of our own making, with modes of the surface."""
+    """Sheets in closed form, with modes of the surface."""
     for name in SHEETS:
-        if not any(text in name for text in only):
-            continue
-        body = sheet(name)
-        faces = torch.tensor(body.faces)
-        keyframes = torch.stack([torch.from_numpy(body.pose(t)) for t in (0.0, 1.0)])
-        bases = tm.extract_bases(keyframes, faces, N_MODES, method="shell")
-        truths = {t: torch.from_numpy(body.pose(t)) for t in TIMES}
-        yield Case(name, KeyframeSet(keyframes, faces, {N_MODES: bases}), 0, 1, truths, TIMES)
+        if any(text in name for text in only):
+            body = sheet(name)
+            faces = torch.tensor(body.faces)
+            keyframes = torch.stack([torch.from_numpy(body.pose(t)) for t in (0.0, 1.0)])
+            bases = tm.extract_bases(keyframes, faces, N_MODES, method="shell")
+            truths = {t: torch.from_numpy(body.pose(t)) for t in TIMES}
+            yield Case(name, KeyframeSet(keyframes, faces, {N_MODES: bases}), 0, 1, truths, TIMES)
 
 
-def sheet_rows(only: Sequence[str]) -> Iterator[list[str]]:
-    """A line for each sheet and preset."""
+def compare_sheets(only: Sequence[str], methods: list[str], table: Table) -> None:
+    """Add a row for each sheet."""
     for case in sheet_cases(only):
-        yardstick = Yardstick(case)
-        errors, notes = {}, {}
-        for name in (*OURS, *OTHERS):
+        yardstick, cells = Yardstick(case), []
+        for name in methods:
             try:
-                outcome = METHODS[name].function(case)
+                frames = METHODS[name](case).frames
             except UnavailableError as error:
-                notes[name] = f"{name}: {error}"
-                continue
-            errors[name] = [yardstick.edge_error(x, t) for x, t in zip(outcome.frames, TIMES, strict=True)]
-            if name in OURS:
-                notes[name] = outcome.note
-        for name, preset in OURS.items():
-            mine = errors[name]
-            ratios = [sum(mine) / sum(errors[other]) if other in errors else float("nan") for other in OTHERS]
-            missed = [f"MISSED over {o}" for o, ratio in zip(OTHERS, ratios, strict=True) if ratio > TARGETS[o]]
-            yield [
-                case.name,
-                preset,
-                *(f"{100 * error:.3f} %" for error in mine),
-                *(number(ratio, ".3f") for ratio in ratios),
-                "; ".join([*missed, *(notes[n] for n in (name, *OTHERS) if n in notes)]),
-            ]
+                print(f"{case.name}, {name}: {error}", file=sys.stderr)
+                cells.append("-")
+            else:
+                errors = [yardstick.edge_error(x, t) for x, t in zip(frames, TIMES, strict=True)]
+                cells.append(f"{100 * fmean(errors):.3f} %")
+        table.add(case.name, *cells)
 
 
-SHEET_COLUMNS = ["sheet", "preset", *(f"t = {t:g}" for t in TIMES), *(f"over {name}" for name in OTHERS), "notes"]
+def compare_bodies(only: Sequence[str], table: Table) -> None:
+    """Add a row for each pair of key-frames."""
+    for case in chain(cases.samples(), cases.hand_path()):
+        if not any(text in case.name for text in only):
+            continue
+        yardstick, ends, errors, seconds = Yardstick(case), torch.stack([case.x_a, case.x_b]), [], []
+        for method in ("solid", "shell"):
+            bases, spent = timed(partial(tm.extract_bases, ends, case.faces, N_MODES, method=method, cache=False))
+            with torch.no_grad():
+                x = tm.InBetween(bases, case.faces)(*ends, HALF)
+            errors.append(f"{100 * yardstick.edge_error(x, HALF):.2f} %")
+            seconds.append(spent)
+        table.add(case.name, *errors, number(seconds[1] / seconds[0], ".2f"))
 
 
 def draw(path: Path, only: Sequence[str]) -> None:
@@ -201,38 +106,28 @@ def draw(path: Path, only: Sequence[str]) -> None:
     plotter.close()
 
 
-PARTS = ("lens", "times", "bodies", "sheets")
-
-
-def main(words: Sequence[str] | None = None) -> None:
-    """Run the parts that were asked for."""
+def main() -> None:
+    """Measure and print, or draw."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--lens", action="store_true", help="modes of a squashed sphere")
-    parser.add_argument("--times", action="store_true", help="how long modes take")
-    parser.add_argument("--bodies", action="store_true", help="modes of the surface against those of the solid")
-    parser.add_argument("--sheets", action="store_true", help="sheets of our own making, against linear and a peer")
-    parser.add_argument("--only", nargs="+", default=[""], metavar="TEXT", help="only what has this in its name")
-    parser.add_argument("--peer-python", type=Path, metavar="FILE", help="a Python that has morphomatics")
+    parser.add_argument("--only", nargs="+", metavar="TEXT", help="only what has this in its name")
+    parser.add_argument("--bodies", action="store_true", help="modes of the surface beside those of the solid")
     parser.add_argument("--picture", type=Path, metavar="FILE.png", help="draw the sheets")
-    arguments = parser.parse_args(words)
-    if arguments.peer_python:
-        os.environ["TORCH_MODAL_PEER_PYTHON"] = str(arguments.peer_python)
-    chosen = [part for part in PARTS if getattr(arguments, part)]
-    chosen = chosen or ([] if arguments.picture else PARTS)
-    if "lens" in chosen:
-        print_table("A lens of 642 vertices: eigenvalues", LENS_COLUMNS, lens_rows())
-    if "times" in chosen:
-        print_table("Modes of one key-frame", TIME_COLUMNS, time_rows(arguments.only))
-    if "bodies" in chosen:
-        print_table("Modes of the surface and of the solid: edge errors", BODY_COLUMNS, body_rows(arguments.only))
-    if "sheets" in chosen:
-        with untimed():
-            print_table("Sheets: edge errors", SHEET_COLUMNS, sheet_rows(arguments.only))
-    if arguments.picture:
-        draw(arguments.picture, arguments.only)
+    add_peer(parser)
+    add_keep(parser)
+    given = parser.parse_args()
+    limit_threads()
+    warnings.simplefilter("ignore", tm.MeshWarning)
+    if given.picture:
+        draw(given.picture, given.only or [""])
+    elif given.bodies:
+        columns = ["pair", "modes of the solid", "modes of the surface", "time of the modes, surface over solid"]
+        with Table("surface-modes", columns, given.keep, columns[3:], "--bodies --only 'creature 1/2'") as table:
+            compare_bodies(given.only or BODIES, table)
+    else:
+        methods = ["linear", "fast", "accurate", *(["morphomatics"] if peer_python() else [])]
+        with untimed(), Table("sheets", ["sheet", *methods], given.keep, check="--only 'page folded'") as table:
+            compare_sheets(given.only or [""], methods, table)
 
 
 if __name__ == "__main__":
-    limit_threads()
-    warnings.simplefilter("ignore", tm.MeshWarning)
     main()

@@ -25,12 +25,11 @@ def unmarked_tables(page: str) -> Iterator[list[list[str]]]:
 
 
 def rows_by_labels(table: dict[str, Any]) -> dict[tuple[str, ...], dict[str, str]]:
-    """The cells that hold no times, by their columns, by the labels of their rows."""
+    """The cells that hold no times, by the heads of their columns, by the labels of their rows."""
     found = {}
     for row in table["rows"]:
-        cells = dict(enumerate(row[table["labels"] :], table["labels"]))
-        kept = {n: cell for n, cell in cells.items() if table["columns"][n] not in table["timed"]}
-        found[tuple(row[: table["labels"]])] = kept
+        cells = list(zip(table["columns"], row, strict=True))[table["labels"] :]
+        found[tuple(row[: table["labels"]])] = {name: cell for name, cell in cells if name not in table["timed"]}
     return found
 
 
@@ -83,5 +82,5 @@ def test_a_row_is_measured_again(name: str, tmp_path: Path, monkeypatch: pytest.
     again = rows_by_labels(json.loads((tmp_path / f"{name}.json").read_text(encoding="utf-8")))
     assert again
     for labels, cells in again.items():
-        for n, cell in cells.items():
-            assert close(cell, expected[labels][n]), (labels, table["columns"][n], cell, expected[labels][n])
+        for name, cell in cells.items():
+            assert close(cell, expected[labels][name]), (labels, name, cell, expected[labels][name])
