@@ -1,13 +1,12 @@
-"""Parts and landmarks of a body from few labelled poses: what each augmentation brings.
+"""Parts and landmarks of a hand from few labelled poses: what each augmentation brings.
 
-    python tests/benchmarks/parts.py [--bodies gestures fox] [--poses 4] [--seeds 2]
+    python tests/benchmarks/parts.py [--poses 4] [--seeds 2] [--steps 800]
 
-``gestures`` are 49 poses of the sample hand with each digit closed by a random amount, and labels from its bones; the
-parts of the animals beside the repository are clusters of vertices that turn alike in all frames. The poses with labels
-are far from each other: the first frame, then always the one that is farthest from those chosen. 24 others are the
-test. A small PointNet labels the points of noisy clouds that are turned by up to 15 degrees; another tells where 12
-landmarks are. Of each arm, 300 more shapes are made once: on straight lines between two poses (``linear mixtures``), or
-by a transform of the package; modal deformations have strains up to 0.03.
+The body is the sample hand in 49 gestures, each digit closed by a random amount, with labels from its bones. The poses
+with labels are far from each other: the first frame, then always the one that is farthest from those chosen. 24 others
+are the test. A small PointNet labels the points of noisy clouds that are turned by up to 15 degrees; another tells where
+12 landmarks are. Of each arm, 300 more shapes are made once: on straight lines between two poses (``linear mixtures``),
+or by a transform of the package; modal deformations have strains up to 0.03.
 
 IoU is the mean over the parts, landmarks are mean distances over the diagonal; means of the seeds.
 """
@@ -20,22 +19,19 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from cases import DATA, animal
 from results import Table, add_keep
-from scipy.cluster.vq import kmeans2
 from timing import limit_threads
 from torch import Tensor, nn
 
 import torch_modal as tm
 from torch_modal.geometry.rigid import best_fit
-from torch_modal.geometry.triangle_frames import frames, sides
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "examples"))
 from augment_segmentation import BATCH, N_MORE, N_POINTS, NOISE, TURNS, PointNet, mean_iou, trained
 from make_samples import gesture, parts_of, sculpted
 from train_timing import farthest_points
 
-N_FRAMES, N_TEST, N_PARTS, N_LANDMARKS, N_MODES = 49, 24, 12, 12, 30
+N_FRAMES, N_TEST, N_LANDMARKS, N_MODES = 49, 24, 12, 30
 LINEAR, MODAL, BETWEEN, BLEND = "linear mixtures", "`RandomModalDeformation`", "`RandomInBetween`", "`RandomBlend`"
 ARMS = ("none", LINEAR, MODAL, BETWEEN, BLEND)
 
@@ -52,30 +48,13 @@ class Task(NamedTuple):
     """Vertices that are far from each other. *Shape:* ``(N_LANDMARKS,)``."""
 
 
-def load(body: str) -> Task:
-    """A body of either kind."""
-    if body == "gestures":
-        made = sculpted("hand", gesture)
-        x = torch.tensor(np.stack([made.frame(t) for t in range(N_FRAMES)]))
-        faces, parts = torch.tensor(made.faces).long(), torch.tensor(parts_of("hand", x[0].numpy()))
-    else:
-        x, faces, _ = animal(body)
-        parts = co_moving(x[:: max(1, len(x) // N_FRAMES)], faces)
+def gestures() -> Task:
+    """Poses of the sample hand."""
+    made = sculpted("hand", gesture)
+    x = torch.tensor(np.stack([made.frame(t) for t in range(N_FRAMES)]))
+    parts = torch.tensor(parts_of("hand", x[0].numpy()))
     x = best_fit(x, x[0].expand_as(x), torch.ones(x.shape[1]).to(x)).apply(x)
-    return Task(x.float(), faces, parts, farthest_points(x[0], N_LANDMARKS, first=0))
-
-
-def co_moving(x: Tensor, faces: Tensor) -> Tensor:
-    """Clusters of vertices that turn alike, near each other. *Shape:* ``(T, V, 3) -> (V,)``."""
-    found = frames(sides(x.movedim(-1, 0).contiguous(), faces))
-    axes = torch.stack([found.e1, found.e2, found.normal])  # (3, 3, T, F)
-    turned = torch.einsum("aitf,ajf->ijtf", axes, axes[:, :, 0]).flatten(0, 2) / len(x) ** 0.5
-    vertices = torch.zeros(x.shape[1], len(turned)).to(x).index_add(0, faces.T.flatten(), turned.T.repeat(3, 1))
-    vertices = vertices / torch.bincount(faces.flatten(), minlength=x.shape[1])[:, None]
-    place = x[0] / (x[0].amax(0) - x[0].amin(0)).norm()
-    features = torch.cat([vertices, 3 * place], 1).numpy()
-    labels = kmeans2(features, N_PARTS, iter=50, minit="++", seed=0)[1]
-    return torch.unique(torch.tensor(labels), return_inverse=True)[1]
+    return Task(x.float(), torch.tensor(made.faces).long(), parts, farthest_points(x[0], N_LANDMARKS, first=0))
 
 
 def further(arm: str, space: tm.ShapeSpace) -> Tensor:
@@ -127,9 +106,9 @@ def landmark_error(task: Task, pool: Tensor, test: Tensor, seed: int, steps: int
     return float(torch.stack([(found - truth).norm(dim=-1).mean() for found, truth in pairs]).mean())
 
 
-def compare(body: str, n_poses: int, seeds: int, steps: int, table: Table) -> None:
+def compare(n_poses: int, seeds: int, steps: int, table: Table) -> None:
     """Add a line for each arm."""
-    task = load(body)
+    task = gestures()
     given = farthest_points(task.x.flatten(1), n_poses, first=0)
     others = torch.arange(len(task.x))[(task.x[:, None] - task.x[given]).abs().amax((2, 3)).amin(1) > 0]
     test = task.x[others[torch.linspace(0, len(others) - 1, N_TEST).round().long()]]
@@ -142,13 +121,12 @@ def compare(body: str, n_poses: int, seeds: int, steps: int, table: Table) -> No
         for seed in range(seeds):
             iou = mean_iou(trained(pool, task.parts, seed, steps), test, task.parts)
             found.append((iou, landmark_error(task, pool, test, seed, steps)))
-        table.add(body, arm, *(f"{100 * value:.1f} %" for value in np.mean(found, 0)))
+        table.add(arm, *(f"{100 * value:.1f} %" for value in np.mean(found, 0)))
 
 
 def main() -> None:
     """Print and keep the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--bodies", nargs="+", default=["gestures", *(["fox"] if DATA.is_dir() else [])])
     parser.add_argument("--poses", type=int, default=4)
     parser.add_argument("--seeds", type=int, default=2)
     parser.add_argument("--steps", type=int, default=800)
@@ -156,9 +134,8 @@ def main() -> None:
     given = parser.parse_args()
     limit_threads()
     warnings.simplefilter("ignore")  # in-betweens that did not converge
-    with Table("parts", ["", "further shapes", "IoU", "landmarks"], given.keep, labels=2) as table:
-        for body in given.bodies:
-            compare(body, given.poses, given.seeds, given.steps, table)
+    with Table("parts", ["further shapes", "IoU", "landmarks"], given.keep) as table:
+        compare(given.poses, given.seeds, given.steps, table)
 
 
 if __name__ == "__main__":
