@@ -4,9 +4,9 @@
 
 The body is the sample hand in 49 gestures, each digit closed by a random amount, with labels from its bones. The poses
 with labels are far from each other: the first frame, then always the one that is farthest from those chosen. 24 others
-are the test. A small PointNet labels the points of noisy clouds that are turned by up to 15 degrees; another tells where
-12 landmarks are. Of each arm, 300 more shapes are made once: on straight lines between two poses (``linear mixtures``),
-or by a transform of the package; modal deformations have strains up to 0.03.
+are the test. A small PointNet labels the points of noisy clouds that are turned by up to 15 degrees; another tells
+where 12 landmarks are. Of each arm, 300 more shapes are made once: on straight lines between two poses
+(``linear mixtures``), or by a transform of the package; modal deformations have strains up to 0.03.
 
 IoU is the mean over the parts, landmarks are mean distances over the diagonal; means of the seeds.
 """
