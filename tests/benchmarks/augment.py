@@ -1,30 +1,33 @@
-"""In-betweens a second through ShapeDataset and DataLoader, over those of linear interpolation.
+"""Shapes a second that a training loop gets from two workers: meshes from disk, linear mixtures, and each transform.
 
-    python tests/benchmarks/augment.py
+    python tests/benchmarks/augment.py [--meshes creature] [--shapes 1024]
 
-Everything compared is measured in one run, in turns and through the same loader, so that a busy machine slows all of
-it: what to read are the ratios. Two workers, batches of 16, float32; key-frames, bases and tables stand on disk, and
-each way has made what it keeps (tables, layers, factorisations, compiled code) in an epoch before.
+Through ``ShapeDataset`` and ``DataLoader``, in batches of 16, float32. Key-frames, bases and tables stand on disk, and
+each way has made what it keeps (tables, layers, factorisations) in an epoch before. Of an epoch, the shapes a second on
+the clock, and the milliseconds of the workers' processors for each, which other work on the machine hardly changes.
+Meshes from disk are OBJ files of the key-frames.
 """
 
 import argparse
+import os
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
-from statistics import median
 from typing import Any
 
 import torch
 from cases import keyframes_of
+from results import Table, add_keep
 from timing import limit_threads
 from torch import Tensor
-from torch.utils.data import DataLoader
+from torch.utils.data import DataLoader, Dataset, default_collate
 
 import torch_modal as tm
 
-MESHES = {"hand": ("mh-hand-path", "00", "04", "08"), "woman": ("mh-woman",)}
-"""Folders beside the project, and the files of them."""
-WORKERS, BATCH, ROUNDS = 2, 16, 3
+MESHES = {"creature": ("creature",), "hand": ("mh-hand-path", "00", "04", "08"), "woman": ("mh-woman",)}
+"""A sample, and folders beside the project with the files of them."""
+WORKERS, BATCH = 2, 16
 
 
 class RandomLinear(tm.RandomInBetween):
@@ -35,58 +38,78 @@ class RandomLinear(tm.RandomInBetween):
         return torch.lerp(batch.shapes, partners.shapes, t[:, None, None])
 
 
-def throughput(arguments: argparse.Namespace) -> None:
-    """Print shapes a second."""
-    with tempfile.TemporaryDirectory() as place:
-        for name in arguments.meshes:
-            found = keyframes_of(*MESHES[name])
-            if found is not None:
-                folder = Path(place) / name / "set"
-                tm.write_set(folder, *found, tm.extract_bases(*found, 30), [f"{i}.obj" for i in range(len(found[0]))])
-                compare(name, folder, arguments)
+class Files(Dataset[dict[str, Tensor]]):
+    """Meshes that are read from disk, each time."""
+
+    def __init__(self, folder: Path, n: int) -> None:
+        self.files, self.n = sorted(folder.glob("*.obj")), n
+
+    def __len__(self) -> int:
+        return self.n
+
+    def __getitem__(self, index: int) -> dict[str, Tensor]:
+        return {"vertices": tm.load_keyframes([self.files[index % len(self.files)]])[0][0].float()}
 
 
-def compare(name: str, folder: Path, arguments: argparse.Namespace) -> None:
-    """All ways on one mesh."""
-    options: dict[str, Any] = {"samples_per_set": arguments.shapes}
-    between = tm.RandomInBetween(p=1.0)
-    started = time.perf_counter()
-    list(tm.ShapeDataset(folder.parent, between, samples_per_set=16).__getitems__(range(16)))
-    cold = time.perf_counter() - started
-    deform, beyond = tm.RandomModalDeformation(p=1.0), tm.RandomExtrapolation(p=1.0)
-    every = tm.AugmentationSequential(between, deform, tm.RandomRigidMotion(p=1.0))
-    ways = {
-        "linear": tm.ShapeDataset(folder.parent, RandomLinear(p=1.0), **options),
-        "in-between, from the table": tm.ShapeDataset(folder.parent, between, **options),
-        "in-between, each solved": tm.ShapeDataset(
-            folder.parent, between, times=None, samples_per_set=max(BATCH * 4, arguments.shapes // 8)
-        ),
-        "modal deformation": tm.ShapeDataset(folder.parent, deform, samples_per_set=arguments.shapes // 4),
-        "extrapolation": tm.ShapeDataset(folder.parent, beyond, samples_per_set=arguments.shapes // 4),
-        "in-between, deformation, motion": tm.ShapeDataset(folder.parent, every, samples_per_set=arguments.shapes // 4),
+def ways(folder: Path, n: int) -> dict[str, Callable[[], Dataset[Any]]]:
+    """The data sets by their names; an epoch of slow ones has fewer shapes."""
+
+    def of(transform: tm.ShapeAugmentation, share: int = 1, **options: Any) -> Callable[[], Dataset[Any]]:
+        return lambda: tm.ShapeDataset(folder, transform, samples_per_set=max(2 * BATCH, n // share), **options)
+
+    return {
+        "meshes read from disk": lambda: Files(folder, max(2 * BATCH, n // 8)),
+        "linear mixtures": of(RandomLinear(p=1.0)),
+        "`RandomInBetween`, from tables": of(tm.RandomInBetween(p=1.0)),
+        "`RandomInBetween`, each solved (`times=None`)": of(tm.RandomInBetween(p=1.0), 8, times=None),
+        "`RandomBlend(members=64)`, from a table": of(tm.RandomBlend(p=1.0, members=64)),
+        "`RandomBlend`, each solved": of(tm.RandomBlend(p=1.0), 16),
+        "`RandomModalDeformation`, always new": of(tm.RandomModalDeformation(p=1.0), 4),
+        "`RandomExtrapolation`, from tables": of(tm.RandomExtrapolation(p=1.0), 4),
     }
-    loaders = {}
-    for way, data in ways.items():
-        loaders[way] = DataLoader(data, BATCH, num_workers=WORKERS, persistent_workers=True)
-        list(loaders[way])
-    rates: dict[str, list[float]] = {way: [] for way in ways}
-    for _ in range(ROUNDS):
-        for way, loader in loaders.items():
-            started = time.perf_counter()
-            n = sum(len(batch["vertices"]) for batch in loader)
-            rates[way].append(n / (time.perf_counter() - started))
-    n_vertices = tm.StoredSet(folder).n_vertices
-    print(f"\n{name}, {n_vertices} vertices, {WORKERS} workers, batches of {BATCH}; first 16 shapes {cold:.1f} s")
-    base = median(rates["linear"])
-    print(f"{'':34s}{'shapes / s':>12s}{'of linear':>12s}")
-    for way, found in rates.items():
-        rate = median(found)
-        print(f"{way:34s}{rate:12.1f}{rate / base:12.3f}")
 
 
-if __name__ == "__main__":
-    limit_threads()
+def spent(samples: list[dict[str, Tensor]]) -> tuple[Any, int, float]:
+    """A batch, with the process that made it and the time that its processor has spent."""
+    return default_collate(samples), os.getpid(), time.process_time()
+
+
+def rate(data: Dataset[Any]) -> str:
+    """Shapes a second, and milliseconds for each."""
+    loader = DataLoader(data, BATCH, num_workers=WORKERS, persistent_workers=True, collate_fn=spent)
+    before = {process: seconds for _, process, seconds in loader}
+    started, n, after = time.perf_counter(), 0, dict(before)
+    for batch, process, seconds in loader:
+        n, after[process] = n + len(batch["vertices"]), seconds
+    wall = time.perf_counter() - started
+    busy = sum(after[process] - before[process] for process in before)
+    return f"{n / wall:,.0f}; {1e3 * busy / n:.2g}"
+
+
+def main() -> None:
+    """Print and keep the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--meshes", nargs="+", choices=MESHES, default=list(MESHES))
     parser.add_argument("--shapes", type=int, default=1024, help="in an epoch of the fastest ways")
-    throughput(parser.parse_args())
+    add_keep(parser)
+    given = parser.parse_args()
+    limit_threads()
+    with tempfile.TemporaryDirectory() as place:
+        data: dict[str, dict[str, Callable[[], Dataset[Any]]]] = {}
+        for name in given.meshes:
+            found = keyframes_of(*MESHES[name])
+            if found is not None:
+                keyframes, faces = found
+                folder = Path(place) / name
+                names = [f"{i}.obj" for i in range(len(keyframes))]
+                tm.write_set(folder, keyframes, faces, tm.extract_bases(keyframes, faces, 30), names)
+                for own, x in zip(names, keyframes, strict=True):
+                    tm.save_mesh(x, faces, folder / own)
+                data[f"{name}, {keyframes.shape[1]:,} vertices"] = ways(folder, given.shapes)
+        with Table("augment", ["", *data], given.keep, data, "--meshes creature --shapes 64") as table:
+            for way in next(iter(data.values())):
+                table.add(way, *(rate(own[way]()) for own in data.values()))
+
+
+if __name__ == "__main__":
+    main()

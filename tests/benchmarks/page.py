@@ -1,20 +1,15 @@
-"""Size and speed of a page of shapes, and the pictures of docs/viewing.md.
+"""Sizes of a page of shapes, with positions and with bones, and the pictures of docs/viewing.md.
 
-    python tests/benchmarks/page.py [--repeats 3]
+    python tests/benchmarks/page.py [--only hand]
     python tests/benchmarks/page.py --pictures docs/images
 
-The sample creature: 33 shapes of one interval, and 193 of it there and back six times (by which nothing is saved),
-alone and beside linear interpolation. Sizes are also given in relation to the positions as float32 in base64. Loading
-is from the navigation to the first picture, in the page's own clock. While the page plays, pictures a second are
-counted, and the milliseconds that the page's scripts take for each. The browser draws in software: with a graphics
-card, the scripts are what is left.
+A sample's first two key-frames, subdivided into 33 shapes.
 """
 
 from __future__ import annotations
 
 import argparse
 import io
-import statistics
 import sys
 import tempfile
 import time
@@ -23,57 +18,29 @@ from typing import TYPE_CHECKING
 
 import torch
 from PIL import Image
+from results import Table, add_keep
 
 sys.path.append(str(Path(__file__).parents[1]))  # beside the tests
 from browsers import open_browser, open_page
 
 import torch_modal as tm
-from torch_modal.data.samples import load_sample
+from torch_modal.data.samples import SAMPLES, load_sample
 
 if TYPE_CHECKING:
     from selenium.webdriver import Chrome
 
 LEVELS = 5  # 32 intervals between two key-frames
-SECONDS = 4.0
 
 
-def play(chrome: Chrome) -> tuple[float, float]:
-    """Pictures drawn in a second while the page plays, and milliseconds that its scripts take for each."""
-    chrome.find_element("id", "play").click()
-    time.sleep(0.5)
-    script = "return [torchModal.drawn, torchModal.busy, performance.now()]"
-    before = chrome.execute_script(script)
-    time.sleep(SECONDS)
-    drawn, busy, milliseconds = (end - start for start, end in zip(before, chrome.execute_script(script), strict=True))
-    return 1000 * drawn / milliseconds, busy / drawn
-
-
-def measure(repeats: int, folder: Path) -> None:
-    """Print the table."""
-    sample = load_sample("creature")
-    keyframes = sample.keyframes[:2]
-    ours = tm.subdivide(keyframes, sample.faces, LEVELS)
-    linear = tm.linear_sequence(keyframes, tm.keyframe_places(2, LEVELS))
-    there_and_back = [*range(len(ours)), *range(len(ours) - 2, 0, -1)]
-    way = [*(3 * there_and_back), 0]
-    pages = {
-        f"{len(ours)} shapes": {"a": ours},
-        f"{len(ours)} shapes, with linear": {"a": ours, "b": linear},
-        f"{len(way)} shapes": {"a": ours[way]},
-        f"{len(way)} shapes, with linear": {"a": ours[way], "b": linear[way]},
-    }
-    print(f"{ours.shape[1]} vertices\n{'page':<26}{'MB':>7}{'/ float32':>11}{'load s':>8}{'a second':>10}{'ms':>7}")
-    for name, sequences in pages.items():
-        path = tm.show(sequences, sample.faces, view=sample.view).save(folder / "page.html", overwrite=True)
-        loads = []
-        for _ in range(repeats):
-            with open_browser(1280, 720) as chrome:
-                loads.append(open_page(chrome, path) / 1000)
-                rate, busy = play(chrome)
-        size = path.stat().st_size
-        plain = sum(4 / 3 * 4 * frames.numel() for frames in sequences.values())
-        load = statistics.median(loads)
-        print(f"{name:<26}{size / 1e6:>7.2f}{size / plain:>11.2f}{load:>8.2f}{rate:>10.0f}{busy:>7.2f}", flush=True)
+def measure(name: str, folder: Path) -> list[str]:
+    """A line of the table."""
+    sample = load_sample(name)
+    shapes = tm.subdivide(sample.keyframes[:2], sample.faces, LEVELS)
+    cells = [f"{name}, {len(shapes)} shapes of {shapes.shape[1]:,} vertices"]
+    for bones in (0, 40):
+        path = tm.show(shapes, sample.faces, bones=bones).save(folder / "page.html", overwrite=True)
+        cells.append(f"{path.stat().st_size / 1e6:.2f} MB")
+    return cells
 
 
 def save(chrome: Chrome, path: Path) -> None:
@@ -120,16 +87,19 @@ def draw(out: Path, folder: Path) -> None:
 
 
 def main() -> None:
-    """Measure, or draw the pictures."""
+    """Print and keep the table, or draw the pictures."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--repeats", type=int, default=3, help="loads of each page; the median counts")
+    parser.add_argument("--only", nargs="+", default=list(SAMPLES), choices=list(SAMPLES))
     parser.add_argument("--pictures", type=Path, metavar="FOLDER", help="draw the pictures there instead")
-    arguments = parser.parse_args()
+    add_keep(parser)
+    given = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        if arguments.pictures:
-            draw(arguments.pictures, Path(folder))
-        else:
-            measure(arguments.repeats, Path(folder))
+        if given.pictures:
+            draw(given.pictures, Path(folder))
+            return
+        with Table("page", ["", "positions", "`bones=40`"], given.keep, check="--only hand") as table:
+            for name in given.only:
+                table.add(*measure(name, Path(folder)))
 
 
 if __name__ == "__main__":

@@ -1,53 +1,39 @@
-"""Parts and landmarks of a body from few labelled poses: what each augmentation brings.
+"""Parts and landmarks of a hand from few labelled poses: what each augmentation brings.
 
-    python tests/benchmarks/parts.py [--bodies gestures fox] [--poses 2 4 8] [--seeds 5] [--arms rigid linear]
+    python tests/benchmarks/parts.py [--poses 4] [--seeds 2] [--steps 800]
 
-The sample hand and creature have labels from their bones, and their motion is known at any time; ``gestures`` are 49
-poses of the hand with each digit closed by a random amount; the parts of the animals beside the repository are clusters
-of vertices that turn alike in all frames. The poses with labels are far from each other: the first frame, then always
-the one that is farthest from those chosen. 24 others are the test. A small PointNet labels the points of noisy clouds
-that are turned by up to 15 degrees; another tells where 12 landmarks are. Of each arm, 300 more shapes are made once:
+The body is the sample hand in 49 gestures, each digit closed by a random amount, with labels from its bones. The poses
+with labels are far from each other: the first frame, then always the one that is farthest from those chosen. 24 others
+are the test. A small PointNet labels the points of noisy clouds that are turned by up to 15 degrees; another tells
+where 12 landmarks are. Of each arm, 300 more shapes are made once: on straight lines between two poses
+(``linear mixtures``), or by a transform of the package; modal deformations have strains up to 0.03.
 
-- ``none``: only the poses, as they are; ``rigid``: turned as in the test, as in all arms below;
-- ``linear``: on straight lines between two poses;
-- ``modal``: ``RandomModalDeformation`` of a pose, of strains up to 0.03;
-- ``in-between``: ``RandomInBetween``; ``weighted``: ``ShapeSpace.sample``; ``both``: half of each;
-- ``all frames``: every other frame of the body, for comparison.
-
-IoU is the mean over the parts, in percent, landmarks are mean distances in percent of the diagonal; means and standard
-deviations of the seeds. Seconds are those of one seed with its share of the shapes.
+IoU is the mean over the parts, landmarks are mean distances over the diagonal; means of the seeds.
 """
 
 import argparse
 import sys
-import time
 import warnings
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from cases import DATA, animal
-from scipy.cluster.vq import kmeans2
+from results import Table, add_keep
 from timing import limit_threads
 from torch import Tensor, nn
 
 import torch_modal as tm
 from torch_modal.geometry.rigid import best_fit
-from torch_modal.geometry.triangle_frames import frames, sides
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "examples"))
 from augment_segmentation import BATCH, N_MORE, N_POINTS, NOISE, TURNS, PointNet, mean_iou, trained
 from make_samples import gesture, parts_of, sculpted
 from train_timing import farthest_points
 
-N_FRAMES, N_TEST, N_PARTS, N_LANDMARKS, N_MODES = 49, 24, 12, 12, 30
-SCULPTED = {  # sample, motion if not its own, times
-    "gestures": ("hand", gesture, np.arange(N_FRAMES)),
-    "hand": ("hand", None, np.linspace(0, 1, N_FRAMES)),
-    "creature": ("creature", None, np.linspace(0, 6, N_FRAMES)),
-}
-ARMS = ("none", "rigid", "linear", "modal", "in-between", "weighted", "both", "all frames")
+N_FRAMES, N_TEST, N_LANDMARKS, N_MODES = 49, 24, 12, 30
+LINEAR, MODAL, BETWEEN, BLEND = "linear mixtures", "`RandomModalDeformation`", "`RandomInBetween`", "`RandomBlend`"
+ARMS = ("none", LINEAR, MODAL, BETWEEN, BLEND)
 
 
 class Task(NamedTuple):
@@ -62,54 +48,33 @@ class Task(NamedTuple):
     """Vertices that are far from each other. *Shape:* ``(N_LANDMARKS,)``."""
 
 
-def load(body: str) -> Task:
-    """A body of either kind."""
-    if body in SCULPTED:
-        sample, motion, times = SCULPTED[body]
-        made = sculpted(sample, motion)
-        x, faces = torch.tensor(np.stack([made.frame(t) for t in times])), torch.tensor(made.faces).long()
-        parts = torch.tensor(parts_of(sample, x[0].numpy()))
-    else:
-        x, faces, _ = animal(body)
-        parts = co_moving(x[:: max(1, len(x) // N_FRAMES)], faces)
+def gestures() -> Task:
+    """Poses of the sample hand."""
+    made = sculpted("hand", gesture)
+    x = torch.tensor(np.stack([made.frame(t) for t in range(N_FRAMES)]))
+    parts = torch.tensor(parts_of("hand", x[0].numpy()))
     x = best_fit(x, x[0].expand_as(x), torch.ones(x.shape[1]).to(x)).apply(x)
-    return Task(x.float(), faces, parts, farthest_points(x[0], N_LANDMARKS, first=0))
+    return Task(x.float(), torch.tensor(made.faces).long(), parts, farthest_points(x[0], N_LANDMARKS, first=0))
 
 
-def co_moving(x: Tensor, faces: Tensor) -> Tensor:
-    """Clusters of vertices that turn alike, near each other. *Shape:* ``(T, V, 3) -> (V,)``."""
-    found = frames(sides(x.movedim(-1, 0).contiguous(), faces))
-    axes = torch.stack([found.e1, found.e2, found.normal])  # (3, 3, T, F)
-    turned = torch.einsum("aitf,ajf->ijtf", axes, axes[:, :, 0]).flatten(0, 2) / len(x) ** 0.5
-    vertices = torch.zeros(x.shape[1], len(turned)).to(x).index_add(0, faces.T.flatten(), turned.T.repeat(3, 1))
-    vertices = vertices / torch.bincount(faces.flatten(), minlength=x.shape[1])[:, None]
-    place = x[0] / (x[0].amax(0) - x[0].amin(0)).norm()
-    features = torch.cat([vertices, 3 * place], 1).numpy()
-    labels = kmeans2(features, N_PARTS, iter=50, minit="++", seed=0)[1]
-    return torch.unique(torch.tensor(labels), return_inverse=True)[1]
-
-
-def further(arm: str, space: tm.ShapeSpace, rest: Tensor) -> Tensor:
+def further(arm: str, space: tm.ShapeSpace) -> Tensor:
     """Shapes beside the poses. *Shape:* ``(N, V, 3)``."""
     generator, poses = torch.Generator().manual_seed(0), space.keyframes()
     i, j = torch.stack([torch.randperm(len(poses), generator=generator)[:2] for _ in range(N_MORE)]).T
-    if arm == "linear":
+    if arm == LINEAR:
         return torch.lerp(poses[i], poses[j], torch.rand(N_MORE, 1, 1, generator=generator))
-    if arm == "modal":
-        return tm.RandomModalDeformation(strain=(0.0, 0.03), p=1.0, space=space, generator=generator)(poses[i])
-    if arm == "all frames":
-        return rest
-    made = [poses[:0]]
-    share = N_MORE // (1 + (arm == "both"))
-    if arm in ("in-between", "both"):
-        made.append(tm.RandomInBetween(p=1.0, space=space, generator=generator)(poses[i[:share]]))
-    if arm in ("weighted", "both"):
-        made.append(space.sample(share, generator))
-    return torch.cat(made)
+    if arm == BLEND:
+        return space.sample(N_MORE, generator)
+    if arm == "none":
+        return poses[:0]
+    transform = tm.RandomInBetween if arm == BETWEEN else tm.RandomModalDeformation
+    options: dict[str, Any] = {} if arm == BETWEEN else {"strain": (0.0, 0.03)}
+    made: Tensor = transform(p=1.0, space=space, generator=generator, **options)(poses[i])
+    return made
 
 
-def landmark_error(task: Task, pool: Tensor, test: Tensor, seed: int, steps: int, turns: float) -> float:
-    """Of a network that is trained on a pool of shapes, in percent of the diagonal."""
+def landmark_error(task: Task, pool: Tensor, test: Tensor, seed: int, steps: int) -> float:
+    """Of a network that is trained on a pool of shapes, over the diagonal."""
     torch.manual_seed(seed)
     network = PointNet(1)
     network.head = nn.Sequential(nn.ReLU(), nn.Linear(96, 64), nn.ReLU(), nn.Linear(64, 3 * N_LANDMARKS))
@@ -118,18 +83,18 @@ def landmark_error(task: Task, pool: Tensor, test: Tensor, seed: int, steps: int
     generator = torch.Generator().manual_seed(seed)
     size = (task.x[0].amax(0) - task.x[0].amin(0)).norm()
 
-    def predicted(x: Tensor, generator: torch.Generator, turns: float) -> tuple[Tensor, Tensor]:
+    def predicted(x: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Where the landmarks are found and where they are, from the middle of the cloud, in sizes of the body."""
         chosen = torch.rand(x.shape[:2], generator=generator).argsort(1)[:, :N_POINTS]
         both = torch.cat([x.gather(1, chosen[..., None].expand(-1, -1, 3)), x[:, task.landmarks]], 1) / size
         both = both - both[:, :N_POINTS].mean(1, keepdim=True)
-        both = tm.RandomRigidMotion(degrees=turns, p=1.0, generator=generator)(both)
+        both = tm.RandomRigidMotion(degrees=TURNS, p=1.0, generator=generator)(both)
         points, truth = both[:, :N_POINTS], both[:, N_POINTS:]
         points = points + NOISE / 2 * torch.randn(points.shape, generator=generator)
         return network(points).mean(1).view(truth.shape), truth
 
     for _ in range(steps):
-        found, truth = predicted(pool[torch.randint(len(pool), (BATCH,), generator=generator)], generator, turns)
+        found, truth = predicted(pool[torch.randint(len(pool), (BATCH,), generator=generator)], generator)
         loss = (found - truth).norm(dim=-1).mean()
         optimizer.zero_grad()
         loss.backward()
@@ -137,50 +102,40 @@ def landmark_error(task: Task, pool: Tensor, test: Tensor, seed: int, steps: int
         schedule.step()
     generator = torch.Generator().manual_seed(12345)
     with torch.no_grad():
-        pairs = [predicted(test, generator, TURNS) for _ in range(10)]
-    return 100 * float(torch.stack([(found - truth).norm(dim=-1).mean() for found, truth in pairs]).mean())
+        pairs = [predicted(test, generator) for _ in range(10)]
+    return float(torch.stack([(found - truth).norm(dim=-1).mean() for found, truth in pairs]).mean())
 
 
-def run(body: str, n_poses: int, arms: list[str], seeds: int, steps: int) -> None:
-    """Print a table."""
-    task = load(body)
+def compare(n_poses: int, seeds: int, steps: int, table: Table) -> None:
+    """Add a line for each arm."""
+    task = gestures()
     given = farthest_points(task.x.flatten(1), n_poses, first=0)
     others = torch.arange(len(task.x))[(task.x[:, None] - task.x[given]).abs().amax((2, 3)).amin(1) > 0]
-    test = others[torch.linspace(0, len(others) - 1, N_TEST).round().long()]
-    rest = torch.tensor([i for i in others.tolist() if i not in set(test.tolist())])
+    test = task.x[others[torch.linspace(0, len(others) - 1, N_TEST).round().long()]]
     poses = task.x[given]
-    bases = tm.extract_bases(poses, task.faces, N_MODES, progress=False)
-    space = tm.ShapeSpace(bases, task.faces)
-    print(f"\n| {body}, {n_poses} poses | IoU, % | landmarks, % | s |\n|---|---|---|---|", flush=True)
-    for arm in arms:
-        start = time.process_time()
-        more = further(arm, space, task.x[rest])
-        turns = 0.0 if arm == "none" else TURNS
+    space = tm.ShapeSpace(tm.extract_bases(poses, task.faces, N_MODES, progress=False), task.faces)
+    for arm in ARMS:
+        more = further(arm, space)
         pool = torch.cat([poses.repeat(max(1, len(more) // (4 * n_poses)), 1, 1), more])
-        iou, distance = [], []
+        found = []
         for seed in range(seeds):
-            network = trained(pool, task.parts, seed, steps, turns)
-            iou.append(100 * mean_iou(network, task.x[test], task.parts))
-            distance.append(landmark_error(task, pool, task.x[test], seed, steps, turns))
-        cells = [f"{np.mean(values):.1f} ± {np.std(values):.1f}" for values in (iou, distance)]
-        print(f"| {arm} | {' | '.join(cells)} | {(time.process_time() - start) / seeds:.0f} |", flush=True)
+            iou = mean_iou(trained(pool, task.parts, seed, steps), test, task.parts)
+            found.append((iou, landmark_error(task, pool, test, seed, steps)))
+        table.add(arm, *(f"{100 * value:.1f} %" for value in np.mean(found, 0)))
 
 
 def main() -> None:
-    """Print the tables."""
+    """Print and keep the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    animals = ["fox", "trex"] if DATA.is_dir() else []
-    parser.add_argument("--bodies", nargs="+", default=["gestures", "hand", "creature", *animals])
-    parser.add_argument("--poses", nargs="+", type=int, default=[2, 4, 8])
-    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--poses", type=int, default=4)
+    parser.add_argument("--seeds", type=int, default=2)
     parser.add_argument("--steps", type=int, default=800)
-    parser.add_argument("--arms", nargs="+", default=list(ARMS), choices=ARMS)
+    add_keep(parser)
     given = parser.parse_args()
     limit_threads()
     warnings.simplefilter("ignore")  # in-betweens that did not converge
-    for body in given.bodies:
-        for n_poses in given.poses:
-            run(body, n_poses, given.arms, given.seeds, given.steps)
+    with Table("parts", ["further shapes", "IoU", "landmarks"], given.keep) as table:
+        compare(given.poses, given.seeds, given.steps, table)
 
 
 if __name__ == "__main__":

@@ -1,24 +1,28 @@
-"""How well meshes are registered whose truth is known: the table of docs/registration.md.
+"""How well meshes are registered whose truth is known.
 
-    python tests/benchmarks/registration.py [--parts poses pairs across middle time] [--n-pairs 50]
+    python tests/benchmarks/registration.py [--parts poses pairs animals hands middle] [--n-pairs 12]
     python tests/benchmarks/registration.py --picture docs/images/registration.png
 
 The template is a pose decimated to 60 % of its vertices and shuffled; the target is another pose, turned, scaled and
 moved, and often damaged. The truth of a template vertex is the point of the other pose with the same place in the same
-face. Lengths are in percent of the target's bounding-box diagonal. Times are processor seconds of one thread.
+face. Errors are in percent of the target's bounding-box diagonal: of a pair of poses the mean over the vertices, across
+subjects the distances of points that are held out, of an in-between the mean distance to that of the true connectivity,
+both ways. Mean and maximum are those of trusted results. Times are processor seconds of one thread.
 """
 
 import argparse
+import contextlib
 import itertools
-import json
 import sys
 import time
-from collections.abc import Callable, Iterator
-from functools import cache
+from collections.abc import Callable, Iterable, Iterator
+from functools import cache, partial
 from pathlib import Path
+from statistics import fmean
 from typing import Any, NamedTuple
 
 import numpy as np
+from results import Table, add_keep
 from scipy import sparse
 from scipy.sparse import csgraph
 from scipy.spatial import cKDTree
@@ -29,7 +33,6 @@ from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.data.samples import sample_files
 from torch_modal.geometry.decimation import decimate
 from torch_modal.io.read import read_mesh
-from torch_modal.registration.maps import SpectralShape
 from torch_modal.registration.surface import MeshSurface, referenced
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "examples"))
@@ -46,6 +49,7 @@ BODIES = {
 DAMAGES = ("none", "hole", "noise", "cut off", "slit", "non-manifold")
 KEPT = 0.6
 WRONG = 3.0  # percent
+COLUMNS = ["", "pairs", "doubtful", "trusted, but off by 3 %", "error, mean", "at most", "time, mean"]
 FINGERS = ("thumb", "index", "middle", "ring", "little")
 HAND_LANDMARKS = (850, 29, 221, 416, 605, 1500, 1291, 1267)
 """Of mh-hand, where `own_hand` has its places; all are among the suggestions."""
@@ -101,14 +105,6 @@ def damaged(
     return surface.vertices, surface.faces
 
 
-def five_marks(rest: FloatArray, faces: IntArray, truth: FloatArray) -> FloatArray:
-    """Five points spread over the template, and where they belong: what a person would pick. *Shape:* ``(5, 2, 3)``."""
-    surface = MeshSurface(rest, faces)
-    shape = SpectralShape(surface)
-    chosen = surface.nearest_alike(shape.placed.vertices, shape.coarse.vertex_normals)[shape.farthest_points(5)[0]]
-    return np.stack([rest[chosen], truth[chosen]], axis=1)
-
-
 class Case(NamedTuple):
     """Two meshes to be registered, and the truth."""
 
@@ -135,50 +131,51 @@ def pair(name: str, i: int, j: int, how: str, seed: int) -> Case:
     return Case(rest, triangles, there, there_faces, truth, float(scale * np.linalg.norm(np.ptp(shapes[j], axis=0))))
 
 
-def one(name: str, i: int, j: int, how: str, seed: int, marked: bool) -> dict[str, Any]:
-    """One registration against its truth."""
+class Result(NamedTuple):
+    """A registration against its truth."""
+
+    errors: list[float]
+    """In percent."""
+    trusted: bool
+    seconds: float
+
+
+def registered(*meshes: Any, **options: Any) -> tuple[tm.Registration | None, float]:
+    """A registration, unless it is refused, and its seconds."""
+    started, found = time.process_time(), None
+    with contextlib.suppress(tm.MeshError):
+        found = tm.register(*meshes, cache=False, progress=False, **options)
+    return found, time.process_time() - started
+
+
+def one(name: str, i: int, j: int, how: str, seed: int) -> Result:
+    """Two poses."""
     rest, triangles, there, there_faces, truth, size = pair(name, i, j, how, seed)
-    marks = five_marks(rest, triangles, truth) if marked else None
-    row: dict[str, Any] = {"case": f"{name} {i}-{j}", "how": how, "marked": marked, "vertices": len(rest)}
-    started = time.process_time()
-    try:
-        found = tm.register(rest, triangles, there, there_faces, landmarks=marks, cache=False, progress=False)
-    except tm.MeshError as error:
-        return row | {"error": str(error)}
-    seconds = time.process_time() - started
-    errors = 100 / size * np.linalg.norm(found.positions.numpy() - truth, axis=1)
-    return row | {
-        "mean": errors.mean(),
-        "p95": np.percentile(errors, 95),
-        "confidence": found.confidence,
-        "score": found.map_score,
-        "distortion": found.distortion,
-        "stretch": found.stretch,
-        "to": found.to_target.mean,
-        "from": found.from_target.mean,
-        "flipped": found.flipped_area,
-        "seconds": seconds,
-    }
+    found, seconds = registered(rest, triangles, there, there_faces)
+    if found is None:
+        return Result([], False, seconds)
+    error = 100 / size * np.linalg.norm(found.positions.numpy() - truth, axis=1).mean()
+    return Result([float(error)], found.confidence >= 0.5, seconds)
 
 
-def pose_cases() -> Iterator[tuple[str, int, int, str, int, bool]]:
-    """Whole bodies, without landmarks."""
+def pose_cases() -> Iterator[tuple[str, int, int, str, int]]:
+    """Whole bodies."""
     for name, pairs in (
         ("mh-hand", [(0, 1), (0, 2), (2, 0), (0, 3), (3, 4), (1, 2)]),
         ("mh-woman", [(0, 1), (1, 2), (2, 0)]),
         ("creature", [(0, 1), (1, 2), (2, 5), (4, 2), (5, 1), (3, 0)]),
     ):
         for i, j in pairs:
-            yield name, i, j, "none", 10 * i + j, False
+            yield name, i, j, "none", 10 * i + j
 
 
-def random_cases(n: int) -> Iterator[tuple[str, int, int, str, int, bool]]:
+def random_cases(n: int) -> Iterator[tuple[str, int, int, str, int]]:
     """Random pairs of poses, with each flaw in turn."""
     random = np.random.default_rng(7)
     for k in range(n):
         name = list(BODIES)[random.integers(len(BODIES))]
         i, j = random.permutation(len(BODIES[name]))[:2]
-        yield name, int(i), int(j), DAMAGES[k % len(DAMAGES)], 1000 + k, False
+        yield name, int(i), int(j), DAMAGES[k % len(DAMAGES)], 1000 + k
 
 
 def own_hand() -> tuple[FloatArray, IntArray, FloatArray]:
@@ -207,16 +204,16 @@ def web(surface: MeshSurface, tips: tuple[int, int]) -> int:
     return way[int(away.argmax())]
 
 
-def across() -> dict[str, Any]:
+def animals() -> Result:
     """An animal on one of other proportions and tessellation, by eight landmarks; other places are held out."""
     (first, first_faces, cones), (second, second_faces, second_cones) = animal("slender"), animal("stout")
     here, there = MeshSurface(first, first_faces), MeshSurface(second, second_faces)
     marks = np.stack([here.closest(tips(cones)).points, there.closest(tips(second_cones)).points], axis=1)
     others, places = here.closest(held_out(cones)), there.closest(held_out(second_cones)).points
-    return laid("slender animal on stout animal", here, there, marks, lambda x: here.rows(others) @ x - places)
+    return across(here, there, marks, lambda x: here.rows(others) @ x - places)
 
 
-def across_hands() -> dict[str, Any]:
+def hands() -> Result:
     """A hand on a hand of another maker, eight landmarks; the webs between the four fingers are held out."""
     first, first_faces, places = own_hand()
     second, second_faces = (part[0] if part.ndim == 3 else part for part in poses("mh-hand"))
@@ -224,73 +221,43 @@ def across_hands() -> dict[str, Any]:
     marks = np.stack([cKDTree(first).query(places)[1], HAND_LANDMARKS], axis=1)
     pairs = [(web(here, (a[0], b[0])), web(there, (a[1], b[1]))) for a, b in itertools.pairwise(marks[1:5])]
     own, others = (list(column) for column in zip(*pairs, strict=True))
-    return laid("sample hand on mh-hand", here, there, marks, lambda x: x[own] - second[others])
+    return across(here, there, marks, lambda x: x[own] - second[others])
 
 
-def laid(
-    case: str, here: MeshSurface, there: MeshSurface, marks: Any, off: Callable[[FloatArray], FloatArray]
-) -> dict[str, Any]:
+def across(here: MeshSurface, there: MeshSurface, marks: Any, off: Callable[[FloatArray], FloatArray]) -> Result:
     """A registration across subjects, with the distances of what is held out."""
-    started = time.process_time()
     meshes = here.vertices, here.faces, there.vertices, there.faces
-    found = tm.register(*meshes, landmarks=marks, same_subject=False, cache=False, progress=False)
-    seconds = time.process_time() - started
-    return {
-        "case": case,
-        "vertices": len(here.vertices),
-        "to": found.to_target,
-        "from": found.from_target,
-        "flipped": found.flipped_area,
-        "folds": found.folds,
-        "held out": (100 / there.diagonal * np.linalg.norm(off(found.positions.numpy()), axis=1)).tolist(),
-        "landmarks": found.landmark_errors.tolist(),
-        "confidence": found.confidence,
-        "seconds": seconds,
-    }
+    found, seconds = registered(*meshes, landmarks=marks, same_subject=False)
+    assert found is not None
+    distances = 100 / there.diagonal * np.linalg.norm(off(found.positions.numpy()), axis=1)
+    return Result(distances.tolist(), found.confidence >= 0.5, seconds)
 
 
-def middle(name: str, i: int, j: int) -> dict[str, Any]:
+def middle(name: str, i: int, j: int) -> Result:
     """The in-between of a registered pair against that of the true connectivity."""
     shapes, faces = poses(name)
     rest, triangles = remeshed(shapes[i], faces, np.random.default_rng(0))
-    found = tm.register(rest, triangles, shapes[j], faces, cache=False, progress=False)
+    found, seconds = registered(rest, triangles, shapes[j], faces)
+    assert found is not None
     halves = [
         tm.subdivide(np.stack(pair), f, 1, progress=False)[1].numpy()
         for pair, f in (((rest, found.positions.numpy()), triangles), ((shapes[i], shapes[j]), faces))
     ]
     mine, true = MeshSurface(halves[0], triangles), MeshSurface(halves[1], faces)
-    size = 100 / true.diagonal
-    apart = [size * a.closest(b.vertices).distances for a, b in ((true, mine), (mine, true))]
-    return {"case": f"{name} {i}-{j}", "mean": [a.mean() for a in apart], "max": [a.max() for a in apart],
-            "confidence": found.confidence}  # fmt: skip
+    apart = [a.closest(b.vertices).distances.mean() for a, b in ((true, mine), (mine, true))]
+    return Result([float(100 / true.diagonal * max(apart))], found.confidence >= 0.5, seconds)
 
 
-def timed(n_rounds: int, kept: float = KEPT) -> dict[str, Any]:
-    """The woman, in faces cut into four as often as told and then decimated."""
-    import trimesh
-
-    shapes, faces = poses("mh-woman")
-    both, triangles = np.concatenate([shapes[0], shapes[1]], axis=1), faces
-    for _ in range(n_rounds):
-        cut, triangles, new = trimesh.remesh.subdivide(both[:, :3], triangles, vertex_attributes={"o": both[:, 3:]})
-        both = np.hstack([cut, new["o"]])
-    rest, template = remeshed(both[:, :3], triangles, np.random.default_rng(0), kept)
-    started = time.process_time()
-    tm.register(rest, template, both[:, 3:], triangles, cache=False, progress=False)
-    return {"case": f"{len(rest)} on {len(both)} vertices", "seconds": time.process_time() - started}
-
-
-def tasks(part: str, n_pairs: int) -> list[Callable[[], dict[str, Any]]]:
-    """What a part of the table is made of."""
-    if part in ("poses", "pairs"):
-        cases = pose_cases() if part == "poses" else random_cases(n_pairs)
-        return [lambda case=case: one(*case) for case in cases]  # type: ignore[misc]
-    if part == "across":
-        return [across, across_hands]
-    if part == "middle":
-        pairs = (("mh-hand", 0, 1), ("mh-woman", 1, 2), ("creature", 1, 5))
-        return [lambda pair=pair: middle(*pair) for pair in pairs]  # type: ignore[misc]
-    return [lambda: timed(0), lambda: timed(1), lambda: timed(1, 0.785)]
+def parts(n_pairs: int) -> dict[str, tuple[str, Iterable[Callable[[], Result]]]]:
+    """Lines of the table, and what each is made of."""
+    middles = (("mh-hand", 0, 1), ("mh-woman", 1, 2), ("creature", 1, 5))
+    return {
+        "poses": ("whole poses, no landmarks", (partial(one, *case) for case in pose_cases())),
+        "pairs": ("random poses, no landmarks", (partial(one, *case) for case in random_cases(n_pairs))),
+        "animals": ("slender on stout animal, eight landmarks", [animals]),
+        "hands": ("hand on a hand of another maker, eight landmarks", [hands]),
+        "middle": ("in-between of a registered pair", (partial(middle, *case) for case in middles)),
+    }
 
 
 def picture(out: Path) -> None:
@@ -323,46 +290,26 @@ def picture(out: Path) -> None:
 
 
 def main() -> None:
-    """Run parts and print their rows, and a summary of all."""
+    """Print and keep the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--parts", nargs="*", default=["poses", "pairs", "across", "middle", "time"])
-    parser.add_argument("--n-pairs", type=int, default=50)
+    parser.add_argument("--parts", nargs="*", default=list(parts(0)), choices=list(parts(0)))
+    parser.add_argument("--n-pairs", type=int, default=12)
     parser.add_argument("--picture", type=Path, help="only draw three examples there")
-    args = parser.parse_args()
-    if args.picture:
-        picture(args.picture)
+    add_keep(parser)
+    given = parser.parse_args()
+    if given.picture:
+        picture(given.picture)
         return
-    rows = []
-    for part in args.parts:
-        for task in tasks(part, args.n_pairs):
-            rows.append({"part": part, **task()})
-            print(json.dumps(rows[-1], default=float), flush=True)
-    print("\n".join(table(rows)))
-
-
-def table(rows: list[dict[str, Any]]) -> list[str]:
-    """The lines of the summary."""
-    lines = []
-    for part in ("poses", "pairs"):
-        own = [row for row in rows if row["part"] == part]
-        if not own:
-            continue
-        results = [row for row in own if "error" not in row]
-        trusted = [row for row in results if row["confidence"] >= 0.5]
-        whole = [row for row in trusted if row["how"] != "cut off"]
-        lines.append(
-            f"{part}: {len(own)} pairs, {len(own) - len(results)} errors, {len(results) - len(trusted)} doubtful, "
-            f"{sum(row['mean'] > WRONG for row in results)} beyond {WRONG:g} %, of these trusted "
-            f"{sum(row['mean'] > WRONG for row in trusted)}"
-        )
-        if trusted:
-            means, tails = ([row[key] for row in whole] for key in ("mean", "p95"))
-            lines.append(
-                f"  trusted whole ones: mean {np.mean(means):.2f} %, worst {max(means):.2f} %; 95th percentile "
-                f"{np.mean(tails):.2f} %, worst {max(tails):.2f} %; {sum(m > 1.3 for m in means)} of {len(whole)} "
-                "above 1.3 %"
-            )
-    return lines
+    with Table("registration", COLUMNS, given.keep, COLUMNS[-1:], "--parts animals") as table:
+        for part in given.parts:
+            name, tasks = parts(given.n_pairs)[part]
+            results = [task() for task in tasks]
+            errors = [result.errors for result in results if result.trusted]
+            wrong = sum(max(own) > WRONG for own in errors)
+            every = list(itertools.chain(*errors)) or [float("nan")]
+            numbers = [len(results), len(results) - len(errors), wrong]
+            seconds = fmean(result.seconds for result in results)
+            table.add(name, *map(str, numbers), f"{fmean(every):.2f} %", f"{max(every):.2f} %", f"{seconds:.1f} s")
 
 
 if __name__ == "__main__":

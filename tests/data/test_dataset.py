@@ -223,6 +223,21 @@ def test_tables_are_kept_in_the_folders(bars: Shapes, tmp_path: Path) -> None:
     assert not list((tmp_path / "set").glob("between-*"))
 
 
+def test_tables_of_members_are_kept_in_the_folders(bars: Shapes, tmp_path: Path) -> None:
+    tm.write_set(tmp_path / "set", *bars, ["0", "1", "2"])
+    blend = tm.RandomBlend(p=1.0, members=2)
+    first = batches(tm.ShapeDataset(tmp_path, blend))
+    path = tmp_path / "set" / "between-all.safetensors"
+    written = path.stat().st_mtime_ns
+    assert_same(batches(tm.ShapeDataset(tmp_path, blend)), first)
+    assert path.stat().st_mtime_ns == written
+    for other in (tm.RandomBlend(p=1.0, members=3), tm.RandomBlend(p=1.0, members=2, locality=1.0)):
+        before = path.read_bytes()
+        tm.ShapeDataset(tmp_path, other)[0]
+        assert path.read_bytes() != before
+    assert_same(batches(tm.ShapeDataset(tmp_path, blend)), first)
+
+
 def test_tables_of_other_modes_faces_settings_or_versions_are_not_read(
     bars: Shapes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -50,8 +50,7 @@ def test_a_draw_that_folds_is_made_less_local(space: tm.ShapeSpace, monkeypatch:
     variation = space.variation()
     weights, factors = (one[0] for one in variation.draw(1, 1.0, 3.0, seeded()))
     smoother = variation.member(weights, 0.25 * factors)[0]
-    # Of the given shapes none folds, of the first two draws each does.
-    counts = iter([0, 0, 0, 1, 1, 0])
+    counts = iter([1, 1, 0])
     monkeypatch.setattr(variation, "folds", lambda _: next(counts))
     assert torch.equal(variation.member(weights, factors)[0], smoother)
 
@@ -93,3 +92,13 @@ class TestRandomBlend:
         torch.testing.assert_close(found.mean(1), given.mean(1), rtol=0, atol=0.2)
         assert torch.equal(transform(given, params=transform.params), found)
         assert min(far(found[0].double(), x) for x in bars.keyframes) > 1e-3
+
+    def test_draws_from_a_table(self, space: tm.ShapeSpace, bars: Shapes) -> None:
+        transform = tm.RandomBlend(p=1.0, members=3, generator=seeded(), space=space)
+        found = transform(bars.keyframes[:1].expand(40, -1, -1))
+        members = space.sample(3, torch.Generator().manual_seed(0))
+        distances = torch.tensor([[far(x, y) for y in members.double()] for x in found])
+        assert float(distances.amin(1).max()) < 1e-5
+        assert sorted(set(distances.argmin(1).tolist())) == [0, 1, 2]
+        with pytest.raises(ValueError, match="members is 1 or more"):
+            tm.RandomBlend(members=0)

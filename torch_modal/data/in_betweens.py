@@ -124,17 +124,13 @@ class InBetweens:
         return found
 
     def _stored_or_solved(self, i: int, j: int, times: int) -> Tensor:
+        def solved() -> tuple[Tensor, bool]:
+            with torch.no_grad():
+                result = self._solved(i, j, torch.linspace(0, 1, times, dtype=torch.float64))
+            return _checked(result, i, j).to(self.dtype), bool(result.solution.usable.all())
+
         key = None if self.folder is None else self._key(i, j)
-        path = (self.folder or Path()) / f"between-{i}-{j}.safetensors"
-        if key is not None and (stored := read_table(path, key)) is not None:
-            return stored
-        with torch.no_grad():
-            result = self._solved(i, j, torch.linspace(0, 1, times, dtype=torch.float64))
-        table = _checked(result, i, j).to(self.dtype)
-        if key is not None and bool(result.solution.usable.all()):
-            with contextlib.suppress(OSError):  # the folder may not be writable
-                write_tensors(path, FORMAT, VERSION, {"shapes": table}, key)
-        return table
+        return stored_or_made((self.folder or Path()) / f"between-{i}-{j}.safetensors", key, solved)
 
     def _layer(self, i: int, j: int, like: Tensor) -> InBetween:
         def made() -> InBetween:
@@ -170,10 +166,9 @@ class InBetweens:
         span = None if self.motion is None else self.motion.span(i, j)
         bases = self.bases if span else [self.bases[place] for place in (i, j)]
         tensors = [(basis.reference, basis.eigenvalues, basis.modes) for basis in bases]
-        code = __version__, str(torch.__version__), code_digest()
         when = self.motion and span and (span, self.motion.times)
         try:
-            content = content_digest([*code, tensors, self.faces, when, *self.settings])
+            content = content_digest([*versions(), tensors, self.faces, when, *self.settings])
         except ContentError as error:
             warnings.warn(
                 f"tables of in-betweens are not stored in {self.folder}, as their key cannot hold the objective's own "
@@ -183,6 +178,11 @@ class InBetweens:
             )
             return None
         return {"times": str(self.times), "dtype": str(self.dtype), "content": content}
+
+
+def versions() -> tuple[str, str, str]:
+    """Those on which the numbers of tables depend."""
+    return __version__, str(torch.__version__), code_digest()
 
 
 def by_kind(kinds: Tensor, compute: Callable[[list[int], Tensor], Tensor]) -> Tensor:
@@ -215,6 +215,17 @@ def interpolate(table: Tensor, t: Tensor) -> Tensor:
         x * (x - 1) * (x - 2) / 6,
     ]
     return sum(weight[:, None, None] * table[start + i] for i, weight in enumerate(weights))  # type: ignore[return-value]
+
+
+def stored_or_made(path: Path, key: dict[str, str] | None, make: Callable[[], tuple[Tensor, bool]]) -> Tensor:
+    """A table from its file; or a new one, which is written if there is a key and it is worth keeping."""
+    if key is not None and (stored := read_table(path, key)) is not None:
+        return stored
+    table, kept = make()
+    if key is not None and kept:
+        with contextlib.suppress(OSError):  # the folder may not be writable
+            write_tensors(path, FORMAT, VERSION, {"shapes": table}, key)
+    return table
 
 
 def read_table(path: Path, key: dict[str, str]) -> Tensor | None:

@@ -151,21 +151,38 @@ class RandomBlend(ShapeAugmentation):
         concentration: As for :meth:`ShapeSpace.sample`.
         locality: Likewise.
         p: Probability that a shape is transformed.
+        members: Number of mixtures of a space, which are computed once and stored with its tables; each draw is one of
+            them. By default each draw is a new mixture.
         options: As for :class:`ShapeAugmentation`.
 
     Raises:
-        ValueError: ``concentration`` or ``locality`` is out of range.
+        ValueError: ``concentration``, ``locality`` or ``members`` is out of range.
     """
 
-    shown = ("concentration", "locality")
+    shown = ("concentration", "locality", "members")
 
-    def __init__(self, concentration: float = 0.2, locality: float = 3.0, p: float = 0.5, **options: Any) -> None:
+    def __init__(
+        self,
+        concentration: float = 0.2,
+        locality: float = 3.0,
+        p: float = 0.5,
+        *,
+        members: int | None = None,
+        **options: Any,
+    ) -> None:
         super().__init__(p, **options)
         check_density(concentration, locality)
-        self.concentration, self.locality = concentration, locality
+        if members is not None and members < 1:
+            raise ValueError(f"members is 1 or more, or None; got {members}")
+        self.concentration, self.locality, self.members = concentration, locality, members
 
     def generate_parameters(self, n: int, space: Any, generator: torch.Generator | None) -> Parameters:
-        """``weights`` of the key-frames, and ``factors`` by which they vary over the surface."""
+        """``weights`` of the key-frames, and ``factors`` by which they vary over the surface.
+
+        With a table, the place of the ``member`` in it, in [0, 1).
+        """
+        if self.members is not None:
+            return {"member": uniform(n, generator)}
         weights, factors = space.variation().draw(n, self.concentration, self.locality, generator)
         return {"weights": weights, "factors": factors}
 
@@ -173,8 +190,13 @@ class RandomBlend(ShapeAugmentation):
         self, batch: ShapeBatch, params: Parameters, space: Any, partners: ShapeBatch | None
     ) -> ShapeBatch:
         """Draw a member for each shape; gradients reach the shapes through the rigid alignment with them alone."""
-        drawn = (params[name].detach().double().cpu() for name in ("weights", "factors"))
-        found = space.variation().members(*drawn).to(batch.shapes)
+        drawn = {name: value.detach().double().cpu() for name, value in params.items()}
+        if self.members is None:
+            found = space.variation().members(drawn["weights"], drawn["factors"])
+        else:
+            table = space.members(self.members, self.concentration, self.locality)
+            found = table[(drawn["member"] * len(table)).long().clamp_max(len(table) - 1)]
+        found = found.to(batch.shapes)
         areas = space.reconstruction(found.device).areas.to(found)
         shapes: Tensor = best_fit(found, batch.shapes, areas).apply(found)
         return batch._replace(shapes=shapes, nearest=space.nearest(shapes))

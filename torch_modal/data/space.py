@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torch_modal.autograd import Recent, lasting
-from torch_modal.data.in_betweens import InBetweens
+from torch_modal.data.in_betweens import InBetweens, stored_or_made, versions
 from torch_modal.data.stored import Motion, StoredSet
 from torch_modal.data.strain import mode_scales
 from torch_modal.geometry.canonical import size
@@ -18,6 +18,7 @@ from torch_modal.geometry.poisson import Reconstruction
 from torch_modal.geometry.rigid import best_fit
 from torch_modal.geometry.vectors import norm, pick
 from torch_modal.inbetween.settings import Objective, Preset, Solver, settings
+from torch_modal.io.cache import content_digest
 from torch_modal.keyframes.check import check_keyframes
 from torch_modal.layers.blend import Blend
 from torch_modal.modes.basis import ModalBasis
@@ -238,6 +239,26 @@ class ShapeSpace:
         variation = self.variation()
         drawn = variation.draw(n, concentration, locality, generator)
         return (variation.members(*drawn) + variation.origin).to(self.dtype)
+
+    def members(self, n: int, concentration: float, locality: float) -> Tensor:
+        """A table of members that are drawn once, with a seed of their own, and stored with the other tables.
+
+        Arguments and shape as for :meth:`sample`, in the dtype of the tables.
+        """
+        folder, settings = self.in_betweens.folder, (n, concentration, locality)
+
+        def drawn() -> tuple[Tensor, bool]:
+            generator = torch.Generator().manual_seed(0)
+            return self.sample(n, generator, concentration=concentration, locality=locality), True
+
+        def table() -> Tensor:
+            if folder is None:
+                return drawn()[0]
+            content = content_digest([*versions(), self._keyframes, self.faces, str(self.dtype), *settings])
+            return stored_or_made(folder / "between-all.safetensors", {"content": content}, drawn)
+
+        found: Tensor = self._made.get(settings, table)
+        return found
 
     def fit(
         self, points: Tensor, vertices: Tensor, *, near: int | Tensor | None = None, robust: bool = False

@@ -80,6 +80,7 @@ class Variation:
         mesh = Mesh(self.coordinates.mesh)
         self.fine = choose("auto").fine_energy(mesh, [Stretch(ALPHA), Bend(BETA), Volume(GAMMA)])
         closed = all(encloses(x, mesh.connectivity) for x in self.shapes)
+        self.most_folds = max(self.folds(x) for x in self.shapes)
         #: Measures of the given shapes, at a size of 100.
         self.rest = self.fine.energy.rest_of(self.scale * self.shapes)
         #: Stiffnesses of the three terms of Eq. 5. *Shape of each:* ``(1, 1)``.
@@ -150,13 +151,12 @@ class Variation:
         they add up to one. *Shape:* ``(K,), (K, n_fields - 1) -> (V, 3), (K, V)``, with weights and factors of
         :meth:`draw`.
         """
-        most = max(self.folds(x) for x in self.shapes)
         logarithms = weights.clamp_min(torch.finfo(weights.dtype).tiny).log()[:, None]
         for i in range(ROUNDS + 1):
             part = 0 if i == ROUNDS else SMOOTHER**i
             own = torch.softmax(logarithms + part * factors @ self.fields[1:], 0)
             x = self.relaxed(self.assembled(own), own, STEPS, PRODUCTS)
-            if self.folds(x) <= most:
+            if self.folds(x) <= self.most_folds:
                 return x, own
         first = int(weights.argmax())
         return self.shapes[first].clone(), one_hot(weights.argmax(), len(self)).to(own)[:, None].expand_as(own)
