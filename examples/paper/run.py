@@ -21,6 +21,7 @@ import figure7
 import figure8
 import table1
 from results import Table, add_keep
+from timing import limit_threads
 
 PARTS = {
     "1": figure1,
@@ -44,6 +45,7 @@ def main() -> None:
     given = parser.parse_args()
     if given.folder:
         given.folder.mkdir(parents=True, exist_ok=True)
+    limit_threads()
     warnings.simplefilter("ignore")
     for name, part in ((name, PARTS[name]) for name in given.parts):
         print(f"\n{part.__doc__.splitlines()[0]}")
