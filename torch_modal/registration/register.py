@@ -29,10 +29,10 @@ from torch_modal.registration.maps import (
 from torch_modal.registration.report import TRUSTED, Quality, Registration, judge, measure, ramp
 from torch_modal.registration.surface import MeshSurface, main_part, outward, referenced
 
-VERSION = 5
+VERSION = 6
 """Part of the cache key: raise it when the algorithm changes."""
 MIN_LANDMARKS = 5
-"""Minimum number of landmarks between different subjects, whose spectra do not determine the map."""
+"""Minimum number of landmarks between different subjects: fewer do not determine the map."""
 _SURE_SCORE = 0.62  # score of a spectral map below which more initial maps are tried
 _SCORE_SHARE = 0.5  # weight of a map's score relative to the stretch of its fit
 _NEAR_LANDMARK = 0.1  # largest landmark error of a spectral map, for a surface of unit area
@@ -85,7 +85,8 @@ def register(
         target_faces: Vertex indices. *Shape:* ``(F_target, 3)``.
         landmarks: Vertices of the template and of the target, *shape* ``(n, 2)``; points, in the coordinates of each,
             *shape* ``(n, 2, 3)``; or a file of either.
-        same_subject: True for nearly isometric poses of one body. Different bodies need five landmarks.
+        same_subject: True for nearly isometric poses of one body. Different bodies need five landmarks where the report
+            says that the map without any is doubtful.
         cache_dir: Folder of the cache; by default ``TORCH_MODAL_CACHE`` or the user's cache folder.
         cache: Keep results on disk, and find them there.
         progress: See :data:`torch_modal.progress.Progress`; the total grows during the work.
@@ -106,10 +107,10 @@ def register(
     welded, welded_goal = (
         weld_seams(x[None], mesh.faces.cpu()) for x, mesh in zip(shapes, (checked, goal), strict=True)
     )
-    if not same_subject and len(points) < MIN_LANDMARKS:
+    if not same_subject and 0 < len(points) < MIN_LANDMARKS:
         raise MeshError(
-            f"two different subjects need {MIN_LANDMARKS} landmarks or more, got {len(points)}: spectra alone "
-            "do not determine the map; give pairs of vertices, template first"
+            f"two different subjects need {MIN_LANDMARKS} landmarks or more, or none, got {len(points)}: so few do not "
+            "determine the map; give pairs of vertices, template first"
         )
     own, other = ((one.keyframes[0].numpy(), one.faces.numpy()) for one in (welded, welded_goal))
 
@@ -170,11 +171,16 @@ class _RegistrationProblem:
             self.mark_vertices = np.stack(found, axis=1)
         #: Score minus distortion of the best map onto the mirrored target.
         self.mirrored = -np.inf
+        #: Advantage in cost of the best fit over one along another map.
+        self.lead = np.inf
 
     def solve(self) -> Registration:
         rivals = self._rivals(self._maps())
         candidates = [self._coarse(found, distortion) for found, distortion in rivals]
-        best = self._rescaled(self._refined(min(candidates, key=lambda one: one.cost)))
+        candidates.sort(key=lambda one: one.cost)
+        if len(candidates) > 1:
+            self.lead = candidates[1].cost - candidates[0].cost
+        best = self._rescaled(self._refined(candidates[0]))
         x, everything = self._fine(best)
         return self._report(x, everything, best)
 
@@ -308,7 +314,7 @@ class _RegistrationProblem:
         lost = float(self.template.vertex_areas[supported < TRUSTED].sum() / self.template.area)
         quality = quality._replace(unsupported_area=max(quality.unsupported_area, lost))
         confidence, said = judge(
-            quality, score, distortion, errors, lead, same_subject=self.same_subject, landmarks=bool(len(self.marks))
+            quality, score, distortion, errors, lead, self.lead, self.same_subject, landmarks=bool(len(self.marks))
         )
         of_vertices = np.full(len(everything), confidence)
         of_vertices[self.used] = supported
