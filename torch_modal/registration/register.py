@@ -85,8 +85,7 @@ def register(
         target_faces: Vertex indices. *Shape:* ``(F_target, 3)``.
         landmarks: Vertices of the template and of the target, *shape* ``(n, 2)``; points, in the coordinates of each,
             *shape* ``(n, 2, 3)``; or a file of either.
-        same_subject: True for nearly isometric poses of one body. Different bodies need five landmarks where the report
-            says that the map without any is doubtful.
+        same_subject: True for nearly isometric poses of one body. Different bodies may need five landmarks or more.
         cache_dir: Folder of the cache; by default ``TORCH_MODAL_CACHE`` or the user's cache folder.
         cache: Keep results on disk, and find them there.
         progress: See :data:`torch_modal.progress.Progress`; the total grows during the work.
@@ -171,18 +170,14 @@ class _RegistrationProblem:
             self.mark_vertices = np.stack(found, axis=1)
         #: Score minus distortion of the best map onto the mirrored target.
         self.mirrored = -np.inf
-        #: Advantage in cost of the best fit over one along another map.
-        self.lead = np.inf
 
     def solve(self) -> Registration:
         rivals = self._rivals(self._maps())
-        candidates = [self._coarse(found, distortion) for found, distortion in rivals]
-        candidates.sort(key=lambda one: one.cost)
-        if len(candidates) > 1:
-            self.lead = candidates[1].cost - candidates[0].cost
+        candidates = sorted((self._coarse(*rival) for rival in rivals), key=lambda one: one.cost)
+        # Advantage of the best fit over one along another map.
+        lead = candidates[1].cost - candidates[0].cost if len(candidates) > 1 else np.inf
         best = self._rescaled(self._refined(candidates[0]))
-        x, everything = self._fine(best)
-        return self._report(x, everything, best)
+        return self._report(*self._fine(best), best, lead)
 
     # ------------------------------------------------------------------------------------------------------------- maps
     def _maps(self) -> list[Map]:
@@ -294,7 +289,7 @@ class _RegistrationProblem:
         return found, everything
 
     # ----------------------------------------------------------------------------------------------------------- report
-    def _report(self, x: FloatArray, everything: FloatArray, best: _Candidate) -> Registration:
+    def _report(self, x: FloatArray, everything: FloatArray, best: _Candidate, lead: float) -> Registration:
         quality, supported = measure(self.template, x, self.target)
         coarse = best.fit.template.moved(best.x)
         images = self.second.placed.nearest_alike(coarse.vertices, coarse.vertex_normals)
@@ -305,7 +300,7 @@ class _RegistrationProblem:
         if len(self.marks):
             rows = self.template.rows(self.template.closest(self.marks))
             errors = np.linalg.norm(rows @ x - self.mark_places, axis=1)
-        lead = float(self.mirrored - (score - distortion))
+        mirrored = float(self.mirrored - (score - distortion))
         if self.same_subject:
             # Of a vertex in a wrong place, many distances are wrong; of the others, the few to such vertices.
             misplaced = np.quantile(self.pair.errors(images), _MOST, axis=1)
@@ -313,9 +308,7 @@ class _RegistrationProblem:
             supported = np.minimum(supported, ramp(misplaced, *_MISPLACED)[near])
         lost = float(self.template.vertex_areas[supported < TRUSTED].sum() / self.template.area)
         quality = quality._replace(unsupported_area=max(quality.unsupported_area, lost))
-        confidence, said = judge(
-            quality, score, distortion, errors, lead, self.lead, self.same_subject, landmarks=bool(len(self.marks))
-        )
+        confidence, said = judge(quality, score, distortion, errors, mirrored, lead, self.same_subject)
         of_vertices = np.full(len(everything), confidence)
         of_vertices[self.used] = supported
         closest = self.target.closest(everything)
@@ -327,7 +320,7 @@ class _RegistrationProblem:
             map_score=score,
             distortion=distortion,
             **quality._asdict(),
-            mirrored_lead=lead,
+            mirrored_lead=mirrored,
             landmark_errors=torch.from_numpy(errors),
             target_faces=torch.from_numpy(closest.faces),
             barycentric=torch.from_numpy(closest.barycentric),

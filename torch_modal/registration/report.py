@@ -16,11 +16,6 @@ from torch_modal.registration.surface import MeshSurface, referenced
 TRUSTED = 0.5
 """Confidence below which a result is doubtful."""
 
-OF_MAP, OF_MAP_ACROSS = (0.32, 0.70), (0.25, 0.50)
-"""Score minus distortion of a map: no confidence, full confidence."""
-LEAD = 0.0, 0.1
-"""Advantage over another map between different subjects: no confidence, full confidence."""
-
 _FAR = 0.01  # distance from the target above which a face is unsupported, in diagonals
 _SHRUNK = 0.2  # area change relative to the median below which a face is unsupported: missing parts collapse
 _STRAY = 0.03  # distance from the template above which a piece of the target is ignored, in diagonals
@@ -221,12 +216,10 @@ def judge(
     mirrored_lead: float,
     lead: float,
     same_subject: bool,
-    *,
-    landmarks: bool,
 ) -> tuple[float, tuple[str, ...]]:
     """Confidence, the minimum of several criteria, and a message for each criterion that fails."""
     advice = "look at the result, and give landmarks (five or more) on both meshes" + (
-        ", or more of them" if landmarks else ""
+        ", or more of them" if len(landmark_errors) else ""
     )
     distance = max(quality.to_target.mean, quality.from_target.mean)
     criteria = [
@@ -237,17 +230,15 @@ def judge(
             f"{100 * quality.unsupported_area:.1f} % of the area have no target beside them",
         ),
     ]
-    if same_subject or not landmarks:
+    if same_subject or not len(landmark_errors):
         of_map = f"the map scores {map_score:.2f} with distances {distortion:.2f} off, right ones 0.7 and 0.1"
-        criteria += [
-            (ramp(map_score - distortion, *(OF_MAP if same_subject else OF_MAP_ACROSS)), of_map),
-            (ramp(mirrored_lead, 0.15, 0.05), "the target looks like a mirror image of the template"),
-        ]
-    if same_subject:
         of_edges = f"edges change by {100 * quality.stretch:.0f} % in the mean"
-        criteria.append((ramp(quality.stretch, 0.35, 0.2), of_edges))
-    elif not landmarks:
-        criteria.append((ramp(lead, *LEAD), "another map fits nearly as well"))
+        criteria += [
+            (ramp(map_score - distortion, *((0.32, 0.70) if same_subject else (0.25, 0.50))), of_map),
+            (ramp(mirrored_lead, 0.15, 0.05), "the target looks like a mirror image of the template"),
+            (ramp(quality.stretch, 0.35, 0.2) if same_subject else 1.0, of_edges),
+            (1.0 if same_subject else ramp(lead, 0.0, 0.1), "another map fits nearly as well"),
+        ]
     if len(landmark_errors):
         worst = int(landmark_errors.argmax())
         error = landmark_errors[worst]
