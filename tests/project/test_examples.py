@@ -108,10 +108,10 @@ def test_new_shapes_are_drawn_and_poses_follow_their_markers(tmp_path: Path) -> 
 
 @pytest.mark.slow
 def test_figures_of_the_paper_are_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With their cheapest rows; their numbers are compared with those of the page (test_results.py)."""
-    monkeypatch.setattr(sys, "argv", ["run", str(tmp_path), "--parts", "3", "5", "--only", "solid", "Eq. 4"])
+    """One of them, with its cheapest row; their numbers are compared with the page (test_results.py)."""
+    monkeypatch.setattr(sys, "argv", ["run", str(tmp_path), "--parts", "5", "--only", "Eq. 4"])
     load_example("paper/run").main()
-    assert all((tmp_path / f"paper-figure{n}.png").stat().st_size > 30_000 for n in (3, 5))
+    assert (tmp_path / "paper-figure5.png").stat().st_size > 30_000
 
 
 @pytest.mark.slow
