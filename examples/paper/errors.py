@@ -1,4 +1,6 @@
-"""How far shapes are from the truth."""
+"""How far shapes are from the truth, and rows of tables."""
+
+from collections.abc import Iterable
 
 import torch
 from torch import Tensor
@@ -24,3 +26,13 @@ def vertex_error(x: Tensor, truth: Tensor) -> float:
     weights = torch.ones(x.shape[-2], dtype=x.dtype)
     diagonal = (truth.amax(-2) - truth.amin(-2)).norm(dim=-1).mean()
     return 100 * float((best_fit(x, truth, weights).apply(x) - truth).norm(dim=-1).mean() / diagonal)
+
+
+def percents(*errors: float) -> list[str]:
+    """Cells of a table."""
+    return [f"{error:.2f} %" for error in errors]
+
+
+def wanted(name: str, only: Iterable[str]) -> bool:
+    """Whether a row is asked for: its name holds one of the texts."""
+    return any(text in name for text in only)

@@ -3,38 +3,36 @@
 The paper's women are not to be had; this person is sculpted and posed here, and every joint turns evenly.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import _paths  # noqa: F401
 import torch
 from _bipeds import biped
-from errors import edge_error
+from errors import edge_error, percents, wanted
+from results import Table
 
 import torch_modal as tm
 
+COLUMNS = ["", "edge error"]
+CHECK = "linear torch_modal"
 VIEW = (72.0, 6.0)
 
 
-def main(out: Path, overwrite: bool = True, cell: float | None = None, levels: int = 2) -> list[str]:
-    """Draw the rows; ``cell`` is the length of the edges."""
-    last = 2**levels
-    times = [n / last for n in range(last + 1)]
-    body = biped("person", cell)
+def main(table: Table, out: Path | None, only: Sequence[str]) -> None:
+    """Draw the rows."""
+    body = biped("person", None)
     faces = torch.from_numpy(body.faces)
-    truth = torch.stack([torch.from_numpy(body.pose(t)) for t in times])
-    keyframes = truth[[0, last]]
-    rows = {
-        "linear": tm.linear_sequence(keyframes, [0, last]),
-        "the paper": tm.subdivide(keyframes, faces, levels=levels, preset="paper", progress=False),
-        "torch_modal": tm.subdivide(keyframes, faces, levels=levels, progress=False),
-        "truth": truth,
+    truth = torch.stack([torch.from_numpy(body.pose(n / 4)) for n in range(5)])
+    keyframes = truth[[0, 4]]
+    methods = {
+        "linear": lambda: tm.linear_sequence(keyframes, [0, 4]),
+        "the paper": lambda: tm.subdivide(keyframes, faces, levels=2, preset="paper", progress=False),
+        "torch_modal": lambda: tm.subdivide(keyframes, faces, levels=2, progress=False),
     }
-    tm.render_sequence(
-        rows, faces, out / "paper-figure2.png", keyframe_indices=[0, last], view=VIEW, overwrite=overwrite
-    )
-    found = [f"{n:12s} {edge_error(x[1:-1], truth[1:-1], faces):.2f} %" for n, x in rows.items() if n != "truth"]
-    return [f"{len(body.rest)} vertices; edge error, quarters and half-way:", *found]
-
-
-if __name__ == "__main__":
-    print("\n".join(main(Path())))
+    rows = {name: method() for name, method in methods.items() if wanted(name, only)}
+    for name, x in rows.items():
+        table.add(name, *percents(edge_error(x[1:-1], truth[1:-1], faces)))
+    if out:
+        rows["truth"] = truth
+        tm.render_sequence(rows, faces, out / "paper-figure2.png", keyframe_indices=[0, 4], view=VIEW, overwrite=True)

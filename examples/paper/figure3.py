@@ -5,16 +5,22 @@ A surface alone has modes that pinch and shrivel it. The surface's are those of 
 volume that each mode changes, at the same size of motion.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 
+import _paths  # noqa: F401
 import numpy as np
 import torch
 import trimesh
+from errors import wanted
+from results import Table
 from torch import Tensor
 
 import torch_modal as tm
 
 N_MODES, AMPLITUDE = 8, 0.12
+COLUMNS = ["volume changed", *(f"mode {i + 1}" for i in range(N_MODES))]
+CHECK = "solid surface"
 
 
 def beam() -> tuple[Tensor, Tensor]:
@@ -45,30 +51,24 @@ def surface_modes(x: Tensor, faces: Tensor, n: int) -> Tensor:
     return torch.linalg.eigh(stiffness).eigenvectors[:, 6 : 6 + n].mT.unflatten(1, (v, 3))
 
 
-def main(out: Path, overwrite: bool = True) -> list[str]:
+def main(table: Table, out: Path | None, only: Sequence[str]) -> None:
     """Draw both rows, and say how much volume they change."""
     x, faces = beam()
-    solid = tm.extract_modes(x, faces, N_MODES, mesher="lattice").modes
-    rows, lines = {}, []
-    energy = tm.ShellEnergy(faces)
-    for name, modes in (("solid", solid), ("surface", surface_modes(x, faces, N_MODES))):
-        modes = modes / modes.norm(dim=-1).amax(1)[:, None, None]
-        rows[name] = x + AMPLITUDE * 4 * modes
-        volume = energy.measure(torch.cat([x[None], x + 0.02 * modes, x - 0.02 * modes])).volume
-        # Half the sum of both sides is of second order: turns cost that much too.
-        first = (volume[1 : N_MODES + 1] - volume[N_MODES + 1 :]).abs() / 2 / volume[0] / 0.02
-        lines.append(f"{name:8s} volume changed, per unit of motion: " + " ".join(f"{float(c):.4f}" for c in first))
-    tm.render_sequence(
-        rows,
-        faces,
-        out / "paper-figure3.png",
-        columns=range(N_MODES),
-        titles=[f"mode {i + 1}" for i in range(N_MODES)],
-        keyframe_indices=range(N_MODES),
-        overwrite=overwrite,
-    )
-    return lines
-
-
-if __name__ == "__main__":
-    print("\n".join(main(Path())))
+    methods = {
+        "solid": lambda: tm.extract_modes(x, faces, N_MODES, mesher="lattice").modes,
+        "surface": lambda: surface_modes(x, faces, N_MODES),
+    }
+    rows, energy = {}, tm.ShellEnergy(faces)
+    for name, method in methods.items():
+        if wanted(name, only):
+            modes = method()
+            modes = modes / modes.norm(dim=-1).amax(1)[:, None, None]
+            rows[name] = x + AMPLITUDE * 4 * modes
+            volume = energy.measure(torch.cat([x[None], x + 0.02 * modes, x - 0.02 * modes])).volume
+            # Half the sum of both sides is of second order: turns cost that much too.
+            first = (volume[1 : N_MODES + 1] - volume[N_MODES + 1 :]).abs() / 2 / volume[0] / 0.02
+            table.add(name, *(f"{float(change):.3f}" for change in first))
+    if out:
+        file, every = out / "paper-figure3.png", range(N_MODES)
+        titles = [f"mode {i + 1}" for i in every]
+        tm.render_sequence(rows, faces, file, every, titles, every, overwrite=True)

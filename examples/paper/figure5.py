@@ -3,14 +3,16 @@
 :mod:`torch_modal.inbetween.regions` says what each is; the preset ``"paper"`` does it.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import _paths  # noqa: F401
 import matplotlib
 import numpy as np
 import torch
-from errors import edge_error, lengths, vertex_error
+from errors import edge_error, lengths, percents, vertex_error, wanted
 from numpy.typing import NDArray
+from results import Table
 from torch import Tensor
 
 import torch_modal as tm
@@ -26,12 +28,14 @@ from matplotlib import pyplot
 
 FloatArray = NDArray[np.float64]
 
+COLUMNS = ["half-way", "edge error", "in the regions", "vertex error"]
+CHECK = "'Eq. 4' torch_modal"
 PAIR = 2
 """The key-frame of the gallop before, at which the legs begin to be drawn in."""
 REGION_COLOR = (0.78, 0.22, 0.20)
 
 
-def main(out: Path, overwrite: bool = True) -> list[str]:
+def main(table: Table, out: Path | None, only: Sequence[str]) -> None:
     """Draw what is found, and the mid-shape without and with."""
     sample = load_sample("creature")
     faces = sample.faces
@@ -45,23 +49,19 @@ def main(out: Path, overwrite: bool = True) -> list[str]:
     error = fitting_error(space, core.alignment.references)[clusters] / CANONICAL_SIZE
     segment = segments(space, core.alignment.references)[clusters]
     region = core.local.region.numpy()
+    methods = {
+        "Eq. 4": lambda: tm.MidShape(bases, faces, preset="paper", regions=0),
+        "the paper": lambda: layer,
+        "torch_modal": lambda: tm.MidShape(bases, faces),
+    }
     with torch.no_grad():
-        shapes = {
-            "Eq. 4": tm.MidShape(bases, faces, preset="paper", regions=0)(x_a, x_b),
-            "Eq. 4, local interpolation": layer(x_a, x_b),
-            "torch_modal": tm.MidShape(bases, faces)(x_a, x_b),
-            "truth": truth,
-        }
-    _draw(out / "paper-figure5.png", ends, faces, 100 * error, segment, region, shapes, overwrite)
+        shapes = {name: method()(x_a, x_b) for name, method in methods.items() if wanted(name, only)}
     inside = torch.from_numpy(region)[faces].all(1)
-    part = float(core.alignment.weights[torch.from_numpy(region)].sum())
-    lines = [f"regions: {100 * part:.0f} % of the surface; edge error, in the regions, vertex error:"]
     for name, x in shapes.items():
-        if name != "truth":
-            parts = [edge_error(x, truth, f) for f in (faces, faces[inside])]
-            vertices = vertex_error(x[None], truth[None])
-            lines.append(f"{name:26s} {parts[0]:.2f} %  {parts[1]:.2f} %  {vertices:.2f} %")
-    return lines
+        parts = [edge_error(x, truth, some) for some in (faces, faces[inside])]
+        table.add(name, *percents(*parts, vertex_error(x[None], truth[None])))
+    if out:
+        _draw(out / "paper-figure5.png", ends, faces, 100 * error, segment, region, {**shapes, "truth": truth})
 
 
 def _draw(
@@ -72,11 +72,8 @@ def _draw(
     segment: NDArray[np.int64],
     region: NDArray[np.bool_],
     shapes: dict[str, Tensor],
-    overwrite: bool,
 ) -> None:
     """Three rows: what is found on the first key-frame, mid-shapes, and the errors of their edges from nearby."""
-    if file.exists() and not overwrite:
-        raise FileExistsError(file)
     off = np.stack([around_vertices(x, shapes["truth"], faces) for x in shapes.values()])
     scales = [_scale(error), _scale(off)]
     palette = pyplot.get_cmap("tab20")(np.arange(20) / 20)[:, :3] * 0.8 + 0.15
@@ -98,7 +95,8 @@ def _draw(
     nearby = _images(points[4:] - (low + high) / 2, scales[1].to_rgba(off)[..., :3], faces, close)
 
     figure, axes = pyplot.subplots(3, 4, figsize=(11, 6.2), dpi=110, layout="constrained")
-    for cell, image in zip(axes.flat, [*images, *nearby], strict=True):
+    places = [*axes.flat[: len(images)], *axes[2]]
+    for cell, image in zip(places, [*images, *nearby], strict=False):
         cell.imshow(image, interpolation="antialiased")
         cell.set(xticks=[], yticks=[])
         cell.spines[:].set(visible=cell in axes[2], color="#bbbbbb")

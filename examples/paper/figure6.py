@@ -4,40 +4,36 @@ The paper's hands are not to be had; this is the sample hand. The geodesic is in
 errors of edge lengths.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import _paths  # noqa: F401
 import torch
-from errors import edge_error
+from errors import edge_error, percents, wanted
 from geodesic import geodesic
+from results import Table
 
 import torch_modal as tm
 from torch_modal.data.samples import load_sample
 
+COLUMNS = ["", "edge error"]
+CHECK = "linear torch_modal"
 
-def main(out: Path, overwrite: bool = True) -> list[str]:
+
+def main(table: Table, out: Path | None, only: Sequence[str]) -> None:
     """Draw the rows."""
     hand = load_sample("hand")
-    first, last = hand.keyframes
-    own = tm.subdivide(hand.keyframes, hand.faces, levels=2, progress=False)
-    paper = tm.subdivide(hand.keyframes, hand.faces, levels=2, preset="paper", progress=False)
-    linear = tm.linear_sequence(hand.keyframes, [0, 4])
-    truth = torch.stack([first, *hand.truth, last])
-    rows = {
-        "linear": linear,
-        "the paper": paper,
-        "torch_modal": own,
-        "geodesic\n(Kilian et al. 2007)": geodesic(first, last, hand.faces).frames[::2],
-        "truth": truth,
+    faces, ends = hand.faces, hand.keyframes
+    truth = torch.stack([ends[0], *hand.truth, ends[1]])
+    methods = {
+        "linear": lambda: tm.linear_sequence(ends, [0, 4]),
+        "the paper": lambda: tm.subdivide(ends, faces, levels=2, preset="paper", progress=False),
+        "torch_modal": lambda: tm.subdivide(ends, faces, levels=2, progress=False),
+        "geodesic (Kilian et al. 2007)": lambda: geodesic(*ends, faces).frames[::2],
     }
-    lines = []
+    rows = {name: method() for name, method in methods.items() if wanted(name, only)}
     for name, x in rows.items():
-        if name != "truth":
-            error = edge_error(x[1:4], truth[1:4], hand.faces)
-            lines.append(f"{' '.join(name.split()):30s} edge error, quarters and half-way: {error:.2f} %")
-    tm.render_sequence(rows, hand.faces, out / "paper-figure6.png", keyframe_indices=[0, 4], overwrite=overwrite)
-    return lines
-
-
-if __name__ == "__main__":
-    print("\n".join(main(Path())))
+        table.add(name, *percents(edge_error(x[1:4], truth[1:4], faces)))
+    if out:
+        drawn = {name.replace(" (", "\n("): x for name, x in (rows | {"truth": truth}).items()}
+        tm.render_sequence(drawn, faces, out / "paper-figure6.png", keyframe_indices=[0, 4], overwrite=True)

@@ -1,13 +1,13 @@
 """Figures and the table of the paper, as far as they are reproduced: docs/paper.md says what is not.
 
-python examples/paper/run.py [FOLDER] [--parts 2 7 ...]
+python examples/paper/run.py [FOLDER] [--parts 2 7 ...] [--only TEXT ...] [--keep]
+
+Each part prints a table, and draws its pictures where a folder is given.
 """
 
 import argparse
 import sys
-import time
 import warnings
-from collections.abc import Sequence
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -20,32 +20,41 @@ import figure6
 import figure7
 import figure8
 import table1
+from results import Table, add_keep
+from timing import limit_threads
 
 PARTS = {
-    "1": ("Figure 1", figure1),
-    "2": ("Figure 2", figure2),
-    "3": ("Figure 3", figure3),
-    "5": ("Figure 5", figure5),
-    "6": ("Figure 6", figure6),
-    "7": ("Figure 7", figure7),
-    "8": ("Figure 8", figure8),
-    "table": ("Table 1", table1),
+    "1": figure1,
+    "2": figure2,
+    "3": figure3,
+    "5": figure5,
+    "6": figure6,
+    "7": figure7,
+    "8": figure8,
+    "table": table1,
 }
 
 
-def main(out: Path, parts: Sequence[str] = tuple(PARTS)) -> None:
+def main() -> None:
     """Draw and print all parts, or some."""
-    out.mkdir(parents=True, exist_ok=True)
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("folder", type=Path, nargs="?", help="of the pictures")
+    parser.add_argument("--parts", nargs="+", choices=list(PARTS), default=list(PARTS), help="default: all")
+    parser.add_argument("--only", nargs="+", default=[""], metavar="TEXT", help="rows whose names hold one of these")
+    add_keep(parser)
+    given = parser.parse_args()
+    if given.folder:
+        given.folder.mkdir(parents=True, exist_ok=True)
+    limit_threads()
     warnings.simplefilter("ignore")
-    for name, part in (PARTS[key] for key in parts):
-        start = time.process_time()
-        lines = part.main(out)
-        print(f"{name} ({time.process_time() - start:.0f} s of processor time)", *lines, "", sep="\n", flush=True)
+    for name, part in ((name, PARTS[name]) for name in given.parts):
+        print(f"\n{part.__doc__.splitlines()[0]}")
+        check, labels = f"--parts {name} --only {part.CHECK}", getattr(part, "LABELS", 1)
+        timed = [column for column in part.COLUMNS if column.endswith(", s")]
+        with Table(f"paper-{part.__name__}", part.COLUMNS, given.keep, timed, check, labels) as table:
+            table.content["command"] = f"python examples/paper/run.py --parts {name}"
+            part.main(table, given.folder, given.only)
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("folder", type=Path, nargs="?", default=Path("paper"), help="default: %(default)s")
-    parser.add_argument("--parts", nargs="+", choices=list(PARTS), default=list(PARTS), help="default: all")
-    given = parser.parse_args()
-    main(given.folder, given.parts)
+    main()

@@ -37,8 +37,7 @@ def steps(layer: tm.MidShape, case: Case) -> int:
     """Gauss-Newton steps until one gains less than a part of the energy."""
     core, half = layer.in_between.core, torch.full((1, 2), 0.5, dtype=torch.float64)
     shapes, _, _ = core.alignment(torch.stack([case.x_a, case.x_b])[None], half)
-    stiffness = [torch.full_like(half[:, :1], float(term.stiffness)) for term in core.fine.terms]
-    mu = torch.full_like(half[:, 0], float(layer.in_between.objective.mu))
+    stiffness, mu = (each(half, half.shape[:1]) for each in (layer.in_between.stiffness_of, layer.in_between.mu_of))
     placed = core.space.place(shapes[:, 0], RestShapes(shapes, half, stiffness), mu)
     step, a = tm.GaussNewtonStep(core.space), half.new_zeros(1, core.space.n_amplitudes)
     value = core.space.value(a, placed)

@@ -1,34 +1,20 @@
-"""Spacetime interpolation by modes (Hildebrandt et al. 2012), beside what the paper compares with it in Figure 1.
+"""Spacetime interpolation by modes (Hildebrandt et al. 2012), which the paper compares with itself in Figure 1.
 
-    python tests/benchmarks/spacetime.py [creature fox ...] [--pitch 0.03] [--picture FOLDER]
-
-For the sample creature and animals beside the project, at the quarters and half-way of each interval: mean relative
-errors of edges, and mean distances of vertices after the best rigid motion, over the diagonal, of all and of the paws
-alone; how far an interval's last shape is from the key-frame there; and processor seconds of all, with modes left out.
+``python examples/paper/run.py --parts 1`` measures it.
 """
 
 from __future__ import annotations
 
-import argparse
-import warnings
-from collections.abc import Iterator, Sequence
-from itertools import chain
-from pathlib import Path
-from typing import Any
+from collections.abc import Sequence
 
 import torch
-from cases import KeyframeSet, animal
-from motions import MOTIONS, Motion, fractions, make_samples
-from shapes import edge_error
-from tables import print_table
-from timing import limit_threads, timed
 from torch import Tensor
 
 import torch_modal as tm
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.local_rotations import LocalRotations
 from torch_modal.geometry.poisson import Reconstruction
-from torch_modal.geometry.rigid import best_fit, blend
+from torch_modal.geometry.rigid import best_fit
 from torch_modal.geometry.rotations import turned
 from torch_modal.geometry.triangle_frames import bend, bending_between, edge_means, frames_of, sides, stretched
 from torch_modal.geometry.vectors import cross
@@ -36,8 +22,6 @@ from torch_modal.geometry.vectors import cross
 N_MODES = 50
 DAMPING = 0.1
 """Over what is critical, of all modes."""
-PAWS = 0.08
-"""Of the height of an animal that stands."""
 
 
 class WarpedModes:
@@ -179,78 +163,3 @@ def spacetime(
         rigid = best_fit(keyframes[i], keyframes[last], weights).fraction(u)
         found[own] = rigid.apply(best_fit(shapes, straight, weights).apply(shapes))
     return found
-
-
-def galloping(name: str) -> tuple[Motion, Tensor]:
-    """A gallop, of an animal beside the project with every fourth frame as a key-frame; and which vertices are paws."""
-    if name == "creature":
-        motion = next(MOTIONS["gallop"]())
-        bones = sorted({cone.bone for cone in make_samples.creature()[1]})
-        part = make_samples.parts_of(name, motion.shapes.keyframes[0].numpy())
-        return motion, torch.tensor(["paw" in bones[i] for i in part])
-    frames, faces, clips = animal(name)
-    starts = {clip: slice(start, end) for clip, start, end in clips}
-    gallop, height = frames[starts["Gallop"]], frames[starts["Eating"]][0, :, 1]
-    keyframes = gallop[::4]
-    times = tuple(map(float, range(len(keyframes))))
-    measured = fractions(times, 0.25, 0.5, 0.75)
-    motion = Motion(name, KeyframeSet(keyframes, faces), times, measured, lambda t: gallop[round(4 * t)])
-    return motion, height < torch.lerp(height.amin(), height.amax(), PAWS)
-
-
-def rows(name: str, pitch: float, picture: Path | None) -> Iterator[list[str]]:
-    """A line for each method."""
-    motion, paws = galloping(name)
-    x, faces = motion.shapes.keyframes, motion.shapes.faces
-    way: dict[str, Any] = {"bases": motion.shapes.bases(N_MODES), "cyclic": motion.cyclic}
-    ones, times = torch.ones_like(x[0, :, 0]), torch.tensor(motion.measured)
-    truth = torch.stack([motion.truth(t) for t in motion.measured])
-
-    def subdivided(preset: tm.Preset) -> Tensor:
-        return tm.subdivide(x, faces, 2, preset=preset, progress=False, **way)[(4 * times).long()]
-
-    def straight() -> Tensor:
-        located = [motion.located(t) for t in motion.measured]
-        return torch.stack([blend(x[i], x[(i + 1) % len(x)], torch.tensor(u).to(x), ones) for i, u in located])
-
-    def apart(found: Tensor, wanted: Tensor) -> Tensor:
-        return (best_fit(found, wanted, ones).apply(found) - wanted).norm(dim=-1) / motion.diagonal
-
-    shown = {"truth": truth}
-    for method, run in {
-        "default": lambda: subdivided("accurate"),
-        "paper": lambda: subdivided("paper"),
-        "spacetime": lambda: spacetime(x, faces, times, pitch=pitch, **way),
-        "linear": straight,
-    }.items():
-        shown[method], seconds = timed(run)
-        edges = [edge_error(shown[method], truth, f) for f in (faces, faces[paws[faces].all(1)])]
-        away, missed = apart(shown[method], truth), torch.zeros(1)
-        if method == "spacetime":
-            missed = apart(spacetime(x, faces, torch.arange(1, len(x)) - 1e-6, pitch=pitch, **way), x[1:])
-        shares = *edges, away.mean(), away[:, paws].mean(), missed.mean()
-        yield [name, method, *(f"{100 * float(share):.2f} %" for share in shares), f"{seconds:.2f}"]
-    if picture:
-        drawn = {method: torch.stack([x[0], y[1], x[1], y[4], x[2]]) for method, y in shown.items()}
-        file = picture / f"spacetime-{name}.png"
-        tm.render_sequence(drawn, faces, file, keyframe_indices=[0, 2, 4], overwrite=True)
-
-
-COLUMNS = ["body", "method", "edges", "of the paws", "vertices", "of the paws", "key-frames missed by", "s"]
-
-
-def main() -> None:
-    """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("names", nargs="*", default=["creature", "fox"], help="default: creature fox")
-    parser.add_argument("--pitch", type=float, default=0.03)
-    parser.add_argument("--picture", type=Path, metavar="FOLDER", help="draw two intervals")
-    given = parser.parse_args()
-    limit_threads()
-    every = (rows(name, given.pitch, given.picture) for name in given.names)
-    print_table("Errors between key-frames", COLUMNS, chain.from_iterable(every))
-
-
-if __name__ == "__main__":
-    warnings.simplefilter("ignore", tm.ConvergenceWarning)
-    main()

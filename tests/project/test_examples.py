@@ -107,41 +107,11 @@ def test_new_shapes_are_drawn_and_poses_follow_their_markers(tmp_path: Path) -> 
 
 
 @pytest.mark.slow
-def test_figures_of_the_paper_are_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Those of the samples; the others have tests of their own."""
-    load_example("paper/run").main(tmp_path, ["1", "3", "6"])
-    assert sorted(path.name for path in tmp_path.glob("*.png")) == [f"paper-figure{n}.png" for n in (1, 3, 6)]
-    said = capsys.readouterr().out
-    errors = [float(line.split()[-2]) for line in said.splitlines() if "edge error, quarters" in line]
-    assert errors[2] < errors[1] < errors[0]  # ours, Eq. 4, linear
-    head, _, ours, theirs = load_example("paper/table1").main(tmp_path, names=["hand"])
-    assert head.count("|") == ours.count("|") == theirs.count("|")
-
-
-@pytest.mark.slow
-def test_local_interpolation_mends_the_worst_regions(tmp_path: Path) -> None:
-    lines = load_example("paper/figure5").main(tmp_path)
-    plain, local, own = ([float(word) for word in line.split()[-6::2]] for line in lines[1:])
-    assert local[1] < 0.7 * plain[1] and own[1] < 0.5 * local[1]  # in the regions
-    assert own[0] < 0.7 * local[0] < 0.5 * plain[0]
-    assert (tmp_path / "paper-figure5.png").stat().st_size > 50_000
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("number", "cell"), [(2, 0.05), (7, 0.018)])
-def test_sculpted_figures_of_the_paper_are_drawn(tmp_path: Path, number: int, cell: float) -> None:
-    found = load_example(f"paper/figure{number}").main(tmp_path, cell=cell, levels=1)
-    errors = [float(line.split("%")[0].split()[-1]) for line in found[1:4]]
-    assert errors[2] < 0.6 * errors[1]  # ours, and Eq. 4 before it
-    assert (tmp_path / f"paper-figure{number}.png").stat().st_size > 30_000
-
-
-@pytest.mark.slow
-def test_figure_8_keeps_the_length_of_the_tail(tmp_path: Path) -> None:
-    found = load_example("paper/figure8").main(tmp_path, cell=0.042, across=False)
-    ours = [float(word) for line in found if line.startswith("poses   torch_modal") for word in line.split()[2:]]
-    assert len(ours) == 3 and all(abs(ratio - 1) < 0.03 for ratio in ours)
-    assert (tmp_path / "paper-figure8-poses.png").stat().st_size > 30_000
+def test_figures_of_the_paper_are_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One of them, with its cheapest row; their numbers are compared with the page (test_results.py)."""
+    monkeypatch.setattr(sys, "argv", ["run", str(tmp_path), "--parts", "5", "--only", "Eq. 4"])
+    load_example("paper/run").main()
+    assert (tmp_path / "paper-figure5.png").stat().st_size > 30_000
 
 
 @pytest.mark.slow

@@ -65,7 +65,7 @@ def add_registration(sub: argparse.ArgumentParser) -> None:
     """Options of the registration of meshes of different connectivity."""
     text = "lines of vertex numbers, counted from 0, or of coordinates: a column for each mesh"
     sub.add_argument("--landmarks", type=Path, metavar="FILE", help=text)
-    text = "the meshes are different subjects; needs five landmarks or more"
+    text = "the meshes are different subjects; may need five landmarks or more"
     sub.add_argument("--across", action="store_true", help=text)
 
 

@@ -37,7 +37,7 @@ def register(args: argparse.Namespace) -> None:
     """One mesh's connectivity laid onto others.
 
     Lay the connectivity of the first mesh onto another mesh of the same subject, or,
-    with --across and landmarks, of another one. Key-frames of different connectivity
+    with --across, of another one. Key-frames of different connectivity
     become key-frames of one.
 
     A report is printed; a doubtful result is an error. Landmarks help: a text file

@@ -42,7 +42,7 @@ def load_keyframes(
         register: Register meshes of another connectivity, see :func:`torch_modal.register`.
         landmarks: For the registration: a landmark file, vertices ``(n, K)``, or points ``(n, K, 3)``, a column for
             each of the K meshes.
-        same_subject: True for poses of one body; different bodies need five landmarks or more.
+        same_subject: True for poses of one body; different bodies may need five landmarks or more.
         cache_dir: Folder of the cache; by default ``TORCH_MODAL_CACHE`` or the user's cache folder.
         cache: Keep registrations on disk, and find them there.
         progress: Progress of registrations, see :data:`torch_modal.progress.Progress`.

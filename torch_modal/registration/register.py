@@ -29,10 +29,10 @@ from torch_modal.registration.maps import (
 from torch_modal.registration.report import TRUSTED, Quality, Registration, judge, measure, ramp
 from torch_modal.registration.surface import MeshSurface, main_part, outward, referenced
 
-VERSION = 5
+VERSION = 6
 """Part of the cache key: raise it when the algorithm changes."""
 MIN_LANDMARKS = 5
-"""Minimum number of landmarks between different subjects, whose spectra do not determine the map."""
+"""Minimum number of landmarks between different subjects: fewer do not determine the map."""
 _SURE_SCORE = 0.62  # score of a spectral map below which more initial maps are tried
 _SCORE_SHARE = 0.5  # weight of a map's score relative to the stretch of its fit
 _NEAR_LANDMARK = 0.1  # largest landmark error of a spectral map, for a surface of unit area
@@ -85,7 +85,7 @@ def register(
         target_faces: Vertex indices. *Shape:* ``(F_target, 3)``.
         landmarks: Vertices of the template and of the target, *shape* ``(n, 2)``; points, in the coordinates of each,
             *shape* ``(n, 2, 3)``; or a file of either.
-        same_subject: True for nearly isometric poses of one body. Different bodies need five landmarks.
+        same_subject: True for nearly isometric poses of one body. Different bodies may need five landmarks or more.
         cache_dir: Folder of the cache; by default ``TORCH_MODAL_CACHE`` or the user's cache folder.
         cache: Keep results on disk, and find them there.
         progress: See :data:`torch_modal.progress.Progress`; the total grows during the work.
@@ -106,10 +106,10 @@ def register(
     welded, welded_goal = (
         weld_seams(x[None], mesh.faces.cpu()) for x, mesh in zip(shapes, (checked, goal), strict=True)
     )
-    if not same_subject and len(points) < MIN_LANDMARKS:
+    if not same_subject and 0 < len(points) < MIN_LANDMARKS:
         raise MeshError(
-            f"two different subjects need {MIN_LANDMARKS} landmarks or more, got {len(points)}: spectra alone "
-            "do not determine the map; give pairs of vertices, template first"
+            f"two different subjects need {MIN_LANDMARKS} landmarks or more, or none, got {len(points)}: so few do not "
+            "determine the map; give pairs of vertices, template first"
         )
     own, other = ((one.keyframes[0].numpy(), one.faces.numpy()) for one in (welded, welded_goal))
 
@@ -173,10 +173,11 @@ class _RegistrationProblem:
 
     def solve(self) -> Registration:
         rivals = self._rivals(self._maps())
-        candidates = [self._coarse(found, distortion) for found, distortion in rivals]
-        best = self._rescaled(self._refined(min(candidates, key=lambda one: one.cost)))
-        x, everything = self._fine(best)
-        return self._report(x, everything, best)
+        candidates = sorted((self._coarse(*rival) for rival in rivals), key=lambda one: one.cost)
+        # Advantage of the best fit over one along another map.
+        lead = candidates[1].cost - candidates[0].cost if len(candidates) > 1 else np.inf
+        best = self._rescaled(self._refined(candidates[0]))
+        return self._report(*self._fine(best), best, lead)
 
     # ------------------------------------------------------------------------------------------------------------- maps
     def _maps(self) -> list[Map]:
@@ -288,7 +289,7 @@ class _RegistrationProblem:
         return found, everything
 
     # ----------------------------------------------------------------------------------------------------------- report
-    def _report(self, x: FloatArray, everything: FloatArray, best: _Candidate) -> Registration:
+    def _report(self, x: FloatArray, everything: FloatArray, best: _Candidate, lead: float) -> Registration:
         quality, supported = measure(self.template, x, self.target)
         coarse = best.fit.template.moved(best.x)
         images = self.second.placed.nearest_alike(coarse.vertices, coarse.vertex_normals)
@@ -299,7 +300,7 @@ class _RegistrationProblem:
         if len(self.marks):
             rows = self.template.rows(self.template.closest(self.marks))
             errors = np.linalg.norm(rows @ x - self.mark_places, axis=1)
-        lead = float(self.mirrored - (score - distortion))
+        mirrored = float(self.mirrored - (score - distortion))
         if self.same_subject:
             # Of a vertex in a wrong place, many distances are wrong; of the others, the few to such vertices.
             misplaced = np.quantile(self.pair.errors(images), _MOST, axis=1)
@@ -307,9 +308,7 @@ class _RegistrationProblem:
             supported = np.minimum(supported, ramp(misplaced, *_MISPLACED)[near])
         lost = float(self.template.vertex_areas[supported < TRUSTED].sum() / self.template.area)
         quality = quality._replace(unsupported_area=max(quality.unsupported_area, lost))
-        confidence, said = judge(
-            quality, score, distortion, errors, lead, same_subject=self.same_subject, landmarks=bool(len(self.marks))
-        )
+        confidence, said = judge(quality, score, distortion, errors, mirrored, lead, self.same_subject)
         of_vertices = np.full(len(everything), confidence)
         of_vertices[self.used] = supported
         closest = self.target.closest(everything)
@@ -321,7 +320,7 @@ class _RegistrationProblem:
             map_score=score,
             distortion=distortion,
             **quality._asdict(),
-            mirrored_lead=lead,
+            mirrored_lead=mirrored,
             landmark_errors=torch.from_numpy(errors),
             target_faces=torch.from_numpy(closest.faces),
             barycentric=torch.from_numpy(closest.barycentric),

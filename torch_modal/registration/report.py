@@ -214,13 +214,12 @@ def judge(
     distortion: float,
     landmark_errors: FloatArray,
     mirrored_lead: float,
-    *,
+    lead: float,
     same_subject: bool,
-    landmarks: bool,
 ) -> tuple[float, tuple[str, ...]]:
     """Confidence, the minimum of several criteria, and a message for each criterion that fails."""
     advice = "look at the result, and give landmarks (five or more) on both meshes" + (
-        ", or more of them" if landmarks else ""
+        ", or more of them" if len(landmark_errors) else ""
     )
     distance = max(quality.to_target.mean, quality.from_target.mean)
     criteria = [
@@ -231,12 +230,14 @@ def judge(
             f"{100 * quality.unsupported_area:.1f} % of the area have no target beside them",
         ),
     ]
-    if same_subject:
+    if same_subject or not len(landmark_errors):
         of_map = f"the map scores {map_score:.2f} with distances {distortion:.2f} off, right ones 0.7 and 0.1"
+        of_edges = f"edges change by {100 * quality.stretch:.0f} % in the mean"
         criteria += [
-            (ramp(map_score - distortion, 0.32, 0.70), of_map),
+            (ramp(map_score - distortion, *((0.32, 0.70) if same_subject else (0.25, 0.50))), of_map),
             (ramp(mirrored_lead, 0.15, 0.05), "the target looks like a mirror image of the template"),
-            (ramp(quality.stretch, 0.35, 0.2), f"edges change by {100 * quality.stretch:.0f} % in the mean"),
+            (ramp(quality.stretch, 0.35, 0.2) if same_subject else 1.0, of_edges),
+            (1.0 if same_subject else ramp(lead, 0.0, 0.1), "another map fits nearly as well"),
         ]
     if len(landmark_errors):
         worst = int(landmark_errors.argmax())
