@@ -82,8 +82,8 @@ def rate(data: Dataset[Any]) -> str:
     for batch, process, seconds in loader:
         n, after[process] = n + len(batch["vertices"]), seconds
     wall = time.perf_counter() - started
-    busy = sum(after[process] - before[process] for process in before)
-    return f"{n / wall:,.0f}; {1e3 * busy / n:.2g}"
+    busy = 1e3 * sum(after[process] - before[process] for process in before) / n
+    return f"{n / wall:,.0f}; {busy:.{2 if busy < 1 else 0 if busy > 10 else 1}f}"
 
 
 def main() -> None:
