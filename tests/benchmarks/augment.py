@@ -106,7 +106,7 @@ def main() -> None:
                 for own, x in zip(names, keyframes, strict=True):
                     tm.save_mesh(x, faces, folder / own)
                 data[f"{name}, {keyframes.shape[1]:,} vertices"] = ways(folder, given.shapes)
-        with Table("augment", ["", *data], given.keep, data, "--meshes creature --shapes 64") as table:
+        with Table("augment", ["", *data], given.keep, data, "--meshes creature --shapes 16") as table:
             for way in next(iter(data.values())):
                 table.add(way, *(rate(own[way]()) for own in data.values()))
 
