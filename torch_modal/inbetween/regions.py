@@ -182,9 +182,10 @@ class LocalInterpolation(nn.Module):
             measures.append(q[:, 0] + 0.5 * part.term.difference(q[:, 1], q[:, 0]))
             stiffness.append(value if some is None or value.shape[-1] == 1 else value[:, some.to(value.device)])
         reference = energy.against(Rest(tuple(measures), tuple(w.mean(1) for w in rest.weights)), stiffness)
-        step = partial(
-            relax, energy, reference=reference, n_steps=1, n_products=N_PRODUCTS, free=self.region[self.used]
-        )
+        options = {"reference": reference, "n_steps": 1, "n_products": N_PRODUCTS, "free": self.region[self.used]}
+        # To trace hundreds of products takes minutes.
+        within = torch.compiler.is_compiling() and not torch.compiler.is_exporting()
+        step = partial(torch.compiler.disable(relax) if within else relax, energy, **options)
         # Where gradients are recorded, steps are computed twice: they would take ten times the memory.
         again = torch.is_grad_enabled() and plain(ends[0])
         found = []
