@@ -213,8 +213,8 @@ class PeriodicTerm(Term):
         first, heaviest = measures[..., 0, :], pulls[..., 0, :]
         for own, pull in zip(measures.unbind(-2)[1:], pulls.unbind(-2)[1:], strict=True):
             first, heaviest = torch.where(pull > heaviest, own, first), torch.maximum(pull, heaviest)
-        rows = [first, *((shares * part).sum(-2) for part in _turns(measures - first[..., None, :]))]
-        rows = torch.stack(rows, -2)
+        means = ((shares * part).sum(-2) for part in _turns(measures - first[..., None, :]))
+        rows = torch.stack([first, *means], -2)
         return rows, torch.where(whole > 0, whole, 0), torch.zeros_like(whole)
 
     def energies(self, measures: Tensor, rest: Tensor, weights: Tensor) -> Tensor:

@@ -13,6 +13,7 @@ way there already: half-way on the rest of it, their regions have passed each ot
 import heapq
 from collections.abc import Sequence
 from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
@@ -182,10 +183,11 @@ class LocalInterpolation(nn.Module):
             measures.append(q[:, 0] + 0.5 * part.term.difference(q[:, 1], q[:, 0]))
             stiffness.append(value if some is None or value.shape[-1] == 1 else value[:, some.to(value.device)])
         reference = energy.against(Rest(tuple(measures), tuple(w.mean(1) for w in rest.weights)), stiffness)
-        options = {"reference": reference, "n_steps": 1, "n_products": N_PRODUCTS, "free": self.region[self.used]}
-        # To trace hundreds of products takes minutes.
-        within = torch.compiler.is_compiling() and not torch.compiler.is_exporting()
-        step = partial(torch.compiler.disable(relax) if within else relax, energy, **options)
+        step: Any = partial(
+            relax, energy, reference=reference, n_steps=1, n_products=N_PRODUCTS, free=self.region[self.used]
+        )
+        if torch.compiler.is_compiling() and not torch.compiler.is_exporting():
+            step = torch.compiler.disable(step)  # to trace hundreds of products takes minutes
         # Where gradients are recorded, steps are computed twice: they would take ten times the memory.
         again = torch.is_grad_enabled() and plain(ends[0])
         found = []
