@@ -190,7 +190,7 @@ def _advanced(energy: AmplitudeEnergy, state: State) -> State:
     """One evaluation: a step where the energy falls, a shorter one next where it does not."""
     value, slope = energy.value_and_gradient(state.there.squeeze(-1), state.placement)
     by_kernel = getattr(energy, "quasi_newton", None)
-    if by_kernel is None or value.device.type != "cpu":
+    if by_kernel is None or value.device.type != "cpu" or {state.a.dtype, slope.dtype} != {torch.float64}:
         return updated(state, value, slope[..., None])
     return by_kernel(state, SHORTEST, value, slope)
 
