@@ -1,7 +1,5 @@
 """How far shapes are from the truth, and rows of tables."""
 
-from collections.abc import Iterable
-
 import torch
 from torch import Tensor
 
@@ -31,8 +29,3 @@ def vertex_error(x: Tensor, truth: Tensor) -> float:
 def percents(*errors: float) -> list[str]:
     """Cells of a table."""
     return [f"{error:.2f} %" for error in errors]
-
-
-def wanted(name: str, only: Iterable[str]) -> bool:
-    """Whether a row is asked for: its name holds one of the texts."""
-    return any(text in name for text in only)

@@ -11,9 +11,9 @@ from pathlib import Path
 import _paths  # noqa: F401
 import numpy as np
 import torch
-from errors import edge_error, percents, vertex_error, wanted
+from errors import edge_error, percents, vertex_error
 from figure5 import around_vertices
-from results import Table
+from results import Table, wanted
 from spacetime import spacetime
 from torch import Tensor
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import _paths  # noqa: F401
 import torch
 from _bipeds import biped
-from errors import edge_error, percents, wanted
-from results import Table
+from errors import edge_error, percents
+from results import Table, wanted
 
 import torch_modal as tm
 

@@ -12,8 +12,7 @@ import _paths  # noqa: F401
 import numpy as np
 import torch
 import trimesh
-from errors import wanted
-from results import Table
+from results import Table, wanted
 from torch import Tensor
 
 import torch_modal as tm

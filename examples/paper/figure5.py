@@ -10,9 +10,9 @@ import _paths  # noqa: F401
 import matplotlib
 import numpy as np
 import torch
-from errors import edge_error, lengths, percents, vertex_error, wanted
+from errors import edge_error, lengths, percents, vertex_error
 from numpy.typing import NDArray
-from results import Table
+from results import Table, wanted
 from torch import Tensor
 
 import torch_modal as tm

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import _paths  # noqa: F401
 import torch
-from errors import edge_error, percents, wanted
+from errors import edge_error, percents
 from geodesic import geodesic
-from results import Table
+from results import Table, wanted
 
 import torch_modal as tm
 from torch_modal.data.samples import load_sample

@@ -12,9 +12,9 @@ import _paths  # noqa: F401
 import numpy as np
 import torch
 from _bipeds import Biped, biped
-from errors import edge_error, percents, vertex_error, wanted
+from errors import edge_error, percents, vertex_error
 from reduced import ReducedPair, froehlich_botsch
-from results import Table
+from results import Table, wanted
 from torch import Tensor
 
 import torch_modal as tm

@@ -16,8 +16,7 @@ import morph_animals
 import numpy as np
 import torch
 from _animals import animal, galloping
-from errors import wanted
-from results import Table
+from results import Table, wanted
 from torch import Tensor
 
 import torch_modal as tm

@@ -16,8 +16,7 @@ from typing import Any
 import _paths  # noqa: F401
 import torch
 from _bipeds import KINDS, biped
-from errors import wanted
-from results import Table
+from results import Table, wanted
 
 import torch_modal as tm
 from torch_modal.data.samples import load_sample

@@ -15,7 +15,7 @@ import numpy as np
 import registration as cases
 from _animals import animal, galloping, held_out, tips
 from morph_animals import TIMES
-from results import Table, add_keep
+from results import Table, add_keep, wanted
 from scipy.spatial import cKDTree
 from timing import limit_threads
 
@@ -81,7 +81,7 @@ def main() -> None:
     limit_threads()
     with Table("registration-across", COLUMNS, given.keep, check="--only 'slender on stout'", labels=2) as table:
         for name, pair in PAIRS.items():
-            if not any(text in name for text in given.only):
+            if not wanted(name, given.only):
                 continue
             here, there, own, its = pair()
             n = 8 if len(own) < len(here.vertices) else 0

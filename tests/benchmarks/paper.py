@@ -15,7 +15,7 @@ import cases
 import torch
 from cases import Case
 from methods import linear
-from results import Table, add_keep
+from results import Table, add_keep, wanted
 from shapes import edge_lengths
 from tables import number, percent
 from timing import limit_threads
@@ -80,7 +80,7 @@ def main() -> None:
     options = {name: value for name, value in (("mu", given.mu), ("regions", given.regions)) if value is not None}
     with Table("paper-pairs", COLUMNS, given.keep, check="--only 'hand 0/1'") as table:
         for case in chain(cases.samples(), cases.hand_path()):
-            if cases.HALF in case.truths and any(text in case.name for text in given.only):
+            if cases.HALF in case.truths and wanted(case.name, given.only):
                 table.add(*cells(case, given.modes, options))
 
 

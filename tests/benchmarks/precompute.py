@@ -24,7 +24,7 @@ import numpy as np
 import torch
 from cases import keyframes_of
 from numpy.typing import NDArray
-from results import Table, add_keep
+from results import Table, add_keep, wanted
 from timing import limit_threads
 
 import torch_modal as tm
@@ -75,7 +75,7 @@ def shared(basis: tm.ModalBasis, other: tm.ModalBasis, n: int = 30) -> float:
 def meshes(only: list[str]) -> Iterator[tuple[str, FloatArray, IntArray]]:
     """Sets of key-frames."""
     for name, given in (("creature", keyframes_of("creature")), ("woman", keyframes_of("mh-woman", "0"))):
-        if given is not None and any(text in name for text in only):
+        if given is not None and wanted(name, only):
             x, faces = (array.numpy() for array in given)
             yield f"{name}, {len(x)} key-frames, {x.shape[1]:,} vertices", x, faces
 

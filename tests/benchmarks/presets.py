@@ -19,7 +19,7 @@ import torch
 from cases import Case
 from measures import Yardstick
 from methods import linear
-from results import Table, add_keep
+from results import Table, add_keep, wanted
 from tables import percent
 from timing import limit_threads, timed
 from torch import Tensor
@@ -44,7 +44,7 @@ def settings(modes: list[int], coarse_faces: list[int]) -> dict[str, tuple[int, 
 def chosen(only: list[str]) -> Iterator[Case]:
     """The samples, and larger key-frames where they are there."""
     for case in chain(cases.samples(), cases.hand_path(), cases.women()):
-        if any(text in case.name for text in only):
+        if wanted(case.name, only):
             yield case.at([cases.HALF])
 
 

@@ -24,7 +24,7 @@ import torch
 from cases import HALF, Case
 from measures import Yardstick
 from methods import METHODS, Outcome, UnavailableError, add_peer
-from results import Table, add_keep
+from results import Table, add_keep, wanted
 from sheet import draw_sheet
 from tables import geometric_mean, number, percent
 from timing import limit_threads
@@ -50,7 +50,7 @@ def half_way(case: Case, names: list[str]) -> dict[str, Outcome]:
 def chosen(folders: list[Path], only: list[str]) -> Iterator[Case]:
     """The cases that are compared."""
     given = chain.from_iterable(map(cases.folder, folders)) if folders else chain(cases.shared(), cases.samples())
-    return (case for case in given if folders or any(text in case.name for text in only))
+    return (case for case in given if folders or wanted(case.name, only))
 
 
 def compare(found: dict[Case, dict[str, Outcome]], table: Table) -> None:

@@ -13,7 +13,7 @@ import re
 import shlex
 import subprocess
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +47,7 @@ class Table:
         self.name, self.keep = name, keep
         self.content: dict[str, Any] = {
             "command": command(),
-            "commit": commit(),
+            "commit": commit() if keep else "",
             "check": check,
             "labels": labels,
             "timed": list(timed),
@@ -79,6 +79,11 @@ def add_keep(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--keep", nargs="?", type=Path, const=RESULTS, metavar="FOLDER", help="keep the table as JSON (docs/results)"
     )
+
+
+def wanted(name: str, only: Iterable[str]) -> bool:
+    """Whether a row is asked for: its name holds one of the texts."""
+    return any(text in name for text in only)
 
 
 def command() -> str:
@@ -124,9 +129,9 @@ def rendered(name: str) -> str:
     return "\n".join(lines)
 
 
-def refreshed(page: str, render: Callable[[str], str] = rendered) -> str:
+def refreshed(page: str) -> str:
     """A page with its tables as they are kept."""
-    return MARKED.sub(lambda found: f"{found[1]}{render(found[2])}\n{found[3]}", page)
+    return MARKED.sub(lambda found: f"{found[1]}{rendered(found[2])}\n{found[3]}", page)
 
 
 def names(page: str) -> list[str]:

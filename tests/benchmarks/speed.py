@@ -31,7 +31,7 @@ import torch
 import trimesh
 from cases import Case, KeyframeSet, divided, samples, shared
 from methods import by_peer
-from results import ROOT, Table, add_keep
+from results import ROOT, Table, add_keep, wanted
 from tables import geometric_mean
 from timing import limit_threads, timed
 
@@ -107,7 +107,7 @@ def compare(given: argparse.Namespace) -> None:
     kept = "speed" if given.before is None else "speed-before"
     with Table(kept, ["mesh", "vertices", *WORK], given.keep, WORK) as table:
         for name, case in all_cases().items():
-            if not any(text in name for text in given.only):
+            if not wanted(name, given.only):
                 continue
             ours, others = {}, {}
             for _ in range(given.rounds):

@@ -11,7 +11,7 @@ import numpy as np
 from cases import keyframes_of
 from motions import make_samples  # noqa: F401 (the examples are found from here on)
 from quadratic import quadratic_modes
-from results import Table, add_keep
+from results import Table, add_keep, wanted
 from solids import eigenmodes
 from timing import limit_threads
 
@@ -57,12 +57,12 @@ def main() -> None:
     limit_threads()
     with Table("stiffness", COLUMNS, given.keep, labels=3) as table:
         for name, surface in bodies():
-            if any(text in name for text in given.only):
-                wanted = quadratic_modes(filled(FINE, surface), N).eigenvalues
+            if wanted(name, given.only):
+                truth = quadratic_modes(filled(FINE, surface), N).eigenvalues
                 for mesher, form in WAYS:
                     tetrahedra = filled(MESHERS[mesher](), surface)
                     k, mass = arap_hessian(tetrahedra, form), mass_matrix(tetrahedra)
-                    ratios = eigenmodes(k, mass, tetrahedra.vertices, N).eigenvalues[-N:] / np.asarray(wanted)
+                    ratios = eigenmodes(k, mass, tetrahedra.vertices, N).eigenvalues[-N:] / np.asarray(truth)
                     size = f"{len(tetrahedra.vertices):,}"
                     table.add(name, f"`{mesher}`", f"`{form}`", size, *(f"{ratio:.2f}" for ratio in ratios))
 

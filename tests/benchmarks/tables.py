@@ -1,18 +1,9 @@
 """Numbers of tables as text."""
 
 import math
-from collections.abc import Iterable
 from statistics import fmean
 
 from measures import NAN
-from results import head
-
-
-def print_table(title: str, columns: Iterable[str], rows: Iterable[Iterable[str]]) -> None:
-    """Print a table in Markdown, each line as soon as it is known."""
-    print(f"\n**{title}**\n\n{head(*columns)}", flush=True)
-    for row in rows:
-        print(f"| {' | '.join(row)} |", flush=True)
 
 
 def geometric_mean(values: list[float]) -> float:

@@ -26,7 +26,7 @@ import torch
 from cases import HALF, Case, KeyframeSet
 from measures import Yardstick
 from methods import METHODS, UnavailableError, add_peer, peer_python
-from results import Table, add_keep
+from results import Table, add_keep, wanted
 from sheet import look
 from sheets import SHEETS, sheet
 from tables import number
@@ -43,7 +43,7 @@ BODIES = ["creature 1/2", "sample hand", "mh-hand-path 00/08"]
 def sheet_cases(only: Sequence[str]) -> Iterator[Case]:
     """Sheets in closed form, with modes of the surface."""
     for name in SHEETS:
-        if any(text in name for text in only):
+        if wanted(name, only):
             body = sheet(name)
             faces = torch.tensor(body.faces)
             keyframes = torch.stack([torch.from_numpy(body.pose(t)) for t in (0.0, 1.0)])
@@ -71,7 +71,7 @@ def compare_sheets(only: Sequence[str], methods: list[str], table: Table) -> Non
 def compare_bodies(only: Sequence[str], table: Table) -> None:
     """Add a row for each pair of key-frames."""
     for case in chain(cases.samples(), cases.hand_path()):
-        if not any(text in case.name for text in only):
+        if not wanted(case.name, only):
             continue
         yardstick, ends, errors, seconds = Yardstick(case), torch.stack([case.x_a, case.x_b]), [], []
         for method in ("solid", "shell"):

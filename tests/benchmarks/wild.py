@@ -52,6 +52,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from results import wanted
 from tables import geometric_mean, number
 from timing import limit_threads
 from tqdm import tqdm
@@ -384,7 +385,7 @@ def chosen_bodies(arguments: argparse.Namespace) -> list[WildBody]:
     found = [
         body
         for body in BODIES.values()
-        if (not arguments.kinds or body.kind in arguments.kinds) and any(text in body.name for text in arguments.only)
+        if (not arguments.kinds or body.kind in arguments.kinds) and wanted(body.name, arguments.only)
     ]
     kinds: dict[str, list[WildBody]] = {}
     for body in found:

@@ -1,5 +1,7 @@
 """Variation of a set of shapes, with weights of its own for each part of the surface."""
 
+from functools import cached_property
+
 import numpy as np
 import torch
 from scipy import sparse
@@ -80,7 +82,6 @@ class Variation:
         mesh = Mesh(self.coordinates.mesh)
         self.fine = choose("auto").fine_energy(mesh, [Stretch(ALPHA), Bend(BETA), Volume(GAMMA)])
         closed = all(encloses(x, mesh.connectivity) for x in self.shapes)
-        self.most_folds = max(self.folds(x) for x in self.shapes)
         #: Measures of the given shapes, at a size of 100.
         self.rest = self.fine.energy.rest_of(self.scale * self.shapes)
         #: Stiffnesses of the three terms of Eq. 5. *Shape of each:* ``(1, 1)``.
@@ -156,10 +157,15 @@ class Variation:
             part = 0 if i == ROUNDS else SMOOTHER**i
             own = torch.softmax(logarithms + part * factors @ self.fields[1:], 0)
             x = self.relaxed(self.assembled(own), own, STEPS, PRODUCTS)
-            if self.folds(x) <= self.most_folds:
+            if self.folds(x) <= self._most_folds:
                 return x, own
         first = int(weights.argmax())
         return self.shapes[first].clone(), one_hot(weights.argmax(), len(self)).to(own)[:, None].expand_as(own)
+
+    @cached_property
+    def _most_folds(self) -> int:
+        """Most folds of a given shape."""
+        return max(self.folds(x) for x in self.shapes)
 
     def folds(self, x: Tensor) -> int:
         """Number of pairs of neighbouring triangles that lie on each other. *Shape:* ``(V, 3)``."""

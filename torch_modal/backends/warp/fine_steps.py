@@ -152,10 +152,9 @@ class WarpSteps(WarpShell):
             to_reference: Is added to.
         """
         x, at, solution, length, kept, scalars = step
-        to_x, to_solution, to_energy, to_gradient = to_reached.clone(), to_reached, None, torch.zeros_like(x)
+        to_x, to_solution, to_energy, to_slope = to_reached.clone(), to_reached, None, None
         if bool((length < 1).any()):
             to_solution, to_energy, to_slope = self._length_back(step, to, to_x, to_reference)
-            to_gradient = to_slope[:, None, None] * solution
         module, (b, n), n_products = kernels("steps"), x.shape[:2], kept.shape[1]
         force, (residual, direction, to_volume) = torch.empty_like(kept[0]), x.new_zeros(3, *x.shape)
         to_diagonal, received = torch.zeros_like(at.diagonal), x.new_zeros(n_products, b, 3)
@@ -173,8 +172,9 @@ class WarpSteps(WarpShell):
         given = [self.constants, kept, force, at.factors, b, n_products, to_factors]
         launch(module.back_to_factors, (b, self.n_edges), given)
         # The right side is the gradient's opposite.
+        to_gradient = -residual if to_slope is None else to_slope[:, None, None] * solution - residual
         others = to_diagonal, to_factors
-        self.from_point(x, at, to, to_gradient - residual, to_x, to_reference, others, to_volume, to_energy)
+        self.from_point(x, at, to, to_gradient, to_x, to_reference, others, to_volume, to_energy)
         to_reference.stiffness.add_((scalars[:-1, :, 1] * received[..., 2]).sum(0))
         return to_x
 

@@ -166,10 +166,7 @@ def launch(
     """
     if 0 in dim:
         return
-    for x in given:
-        if isinstance(x, Tensor):
-            device = x.device
-            break
+    device = next(x.device for x in given if isinstance(x, Tensor))
     n_threads = dim[0]
     if len(dim) == 2:
         given = [*given, 1 if device.type == "cpu" else dim[1]]
@@ -219,9 +216,14 @@ class _Command:
     def __call__(self, n_threads: int, given: Sequence[Any], adjoints: Sequence[Any]) -> None:
         for i, before in self.last.items():
             x = given[i]
-            if x is not before:
-                self.last[i] = x
-                self._set(i, x)
+            if x is before:
+                continue
+            self.last[i] = x
+            if isinstance(x, Constants) or not self.on_cpu:
+                self.recorded.set_param_at_index(i, x.on(self.device) if isinstance(x, Constants) else x)
+                x = self.recorded.params[1 + i]
+            if self.on_cpu:
+                setattr(self.structs[0], f"a{i}", x)
         for arrays, tensors in zip(self.arrays, (given, adjoints), strict=False):
             for i, array, shape, width, dtype in arrays:
                 x = tensors[i] if i < len(tensors) else None  # not all have an adjoint
@@ -248,15 +250,6 @@ class _Command:
             import warp as wp
 
             self.recorded.launch(wp.stream_from_torch(torch.cuda.current_stream(self.device)))
-
-    def _set(self, i: int, x: Any) -> None:
-        """Write an argument that is no array."""
-        if self.on_cpu and not isinstance(x, Constants):
-            setattr(self.structs[0], f"a{i}", x)
-            return
-        self.recorded.set_param_at_index(i, x.on(self.device) if isinstance(x, Constants) else x)
-        if self.on_cpu:
-            setattr(self.structs[0], f"a{i}", self.recorded.params[1 + i])
 
 
 def _struct(arguments: Sequence[Any]) -> Any:
