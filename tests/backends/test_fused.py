@@ -22,13 +22,17 @@ from torch_modal.backends.choice import choose
 from torch_modal.backends.torch.backend import TorchBackend
 from torch_modal.backends.torch.distortion import Distortion
 from torch_modal.backends.torch.fine_steps import FineEnergy, relax
+from torch_modal.backends.torch.volumes import Volumes
 from torch_modal.backends.warp import backend, launch
 from torch_modal.backends.warp import modal_energy as fused_modal
 from torch_modal.backends.warp.distortion import WarpDistortion
 from torch_modal.backends.warp.fine_steps import WarpFineEnergy, WarpSteps
+from torch_modal.backends.warp.function import fused as fused_operation
 from torch_modal.backends.warp.modal_energy import WarpModalEnergy
+from torch_modal.backends.warp.procrustes import mean_pose
 from torch_modal.backends.warp.rotations import WarpRotations
 from torch_modal.backends.warp.shell import ShellReference, WarpShell
+from torch_modal.backends.warp.volumes import WarpVolumes
 from torch_modal.energy.bend import Bend
 from torch_modal.energy.energy import Energy, RestShapes
 from torch_modal.energy.modal_energy import ModalEnergy, Placement
@@ -36,10 +40,12 @@ from torch_modal.energy.stretch import Stretch
 from torch_modal.energy.term import Mesh
 from torch_modal.energy.volume import Volume
 from torch_modal.errors import MissingPackageError
+from torch_modal.geometry import procrustes
 from torch_modal.geometry.canonical import CANONICAL_SIZE
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.local_rotations import LocalRotations, Trajectory
 from torch_modal.geometry.poisson import Poisson
+from torch_modal.geometry.rotations import exp
 from torch_modal.geometry.triangle_frames import frames_of
 from torch_modal.inbetween.settings import PRESETS
 from torch_modal.motion.cubics import cubics
@@ -207,6 +213,16 @@ class TestModal:
         found, wanted = (torch.func.vjp(each, *given)[1](direction) for each in (by_kernels, by_torch))
         assert_alike(found, wanted, 1e-10)
 
+    def test_softer_at_needles(self, case: Case) -> None:
+        """Shapes with needles, along either side of their triangles."""
+        (fused, own), _ = self.both(case)
+        shapes = own.base * torch.tensor([0.02, 1.0, 3.0], dtype=DOUBLE)
+        operation, given = fused_modal._Softened(fused.shell), [shapes, own.reference.elements]
+        softened, hard = operation.by_torch(*given)[0][..., 2], own.reference.elements[..., 2]
+        assert float((softened / hard)[hard > 0].min()) < 0.1
+        run, truth = lambda *x: fused_operation(operation, *x)[0], lambda *x: operation.by_torch(*x)[0]
+        assert_kernels(run, truth, given, 1e-12 * float(hard.max()), 1e-12)
+
     @torch.no_grad()
     def test_samples_that_are_too_many_at_a_time(self, case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
         """No array of all samples outgrows what kernels count: they are taken in chunks."""
@@ -261,6 +277,38 @@ def turned(rotations: WarpRotations, kind: type[LocalRotations] = WarpRotations)
         return kind.pulls(rotations, torch.stack([first, second], 1), torch.stack([1 - t, t], -1), poisson)
 
     return run
+
+
+class TestAlignment:
+    """Covariances of a reference with pairs of shapes, and of these."""
+
+    @staticmethod
+    def given(*, flat: float = 1.0) -> list[Tensor]:
+        generator = torch.Generator().manual_seed(5)
+        noise = torch.randn(6, 2, 20, 3, dtype=DOUBLE, generator=generator)
+        x = noise[0, 0] * torch.tensor([3.0, flat, flat**2], dtype=DOUBLE) + 0.3 * flat**2 * noise
+        x = x @ exp(2 * noise[:, :, 0]).mT
+        t = torch.linspace(0, 1, 6, dtype=DOUBLE)
+        return [x[0, 0].mT @ x, x[:, :, None].mT @ x[:, None], torch.stack([1 - t, t], 1)]
+
+    @pytest.mark.parametrize("index", [0, 1], ids=["turns", "pose"])
+    def test_of_two_shapes(self, index: int) -> None:
+        for given in (self.given(), [0.01 * x for x in self.given()[:2]] + self.given()[2:]):
+            run, truth = lambda *x: mean_pose(*x)[index], lambda *x: procrustes.mean_pose(*x)[index]
+            assert_kernels(run, truth, given, 1e-12, 1e-10)
+
+    def test_of_shapes_on_a_line(self) -> None:
+        """Nothing determines the turn about it: it is a rotation all the same, and gradients are finite."""
+        given = self.given(flat=0.0)
+        for found in mean_pose(*given):
+            torch.testing.assert_close(found @ found.mT, torch.eye(3, dtype=DOUBLE).expand_as(found))
+            assert (torch.linalg.det(found) > 0).all()
+        assert all(x.isfinite().all() for x in gradients(lambda *x: mean_pose(*x)[1], given))
+
+    def test_volumes(self, small_bars: Shapes) -> None:
+        mesh = Connectivity(small_bars.faces.numpy())
+        found, truth = (kind(mesh)(small_bars.keyframes[None]) for kind in (WarpVolumes, Volumes))
+        torch.testing.assert_close(found, truth, rtol=1e-12, atol=0)
 
 
 class TestRotations:

@@ -142,7 +142,9 @@ def test_second_order_is_optional_and_comes_in_chunks(small_bars: Shapes, monkey
     case = Case(small_bars.faces, small_bars.keyframes[1] * 20)
     whole, first_order = case.derivatives(), case.derivatives(second_order=False)
     assert first_order.second_order is None
-    assert torch.equal(whole.gauss_newton, first_order.gauss_newton)
+    assert torch.equal(whole.gradient, first_order.gradient)
+    scale = float(whole.gauss_newton.abs().max())
+    torch.testing.assert_close(first_order.gauss_newton, whole.gauss_newton, rtol=0, atol=1e-6 * scale)
     monkeypatch.setattr(modal_energy, "MOST_BYTES", 1)  # one sample at a time
     torch.testing.assert_close(case.derivatives().second_order, whole.second_order, rtol=1e-12, atol=1e-9)
 

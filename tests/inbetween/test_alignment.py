@@ -5,6 +5,7 @@ import torch
 from conftest import Shapes, random_rotation
 from torch import Tensor
 
+from torch_modal.backends.torch.backend import TorchBackend
 from torch_modal.energy.term import Mesh
 from torch_modal.geometry.canonical import CANONICAL_SIZE, size
 from torch_modal.geometry.connectivity import Connectivity
@@ -18,7 +19,7 @@ DOUBLE = torch.float64
 
 def frame_of(shapes: Tensor, faces: Tensor) -> tuple[KeyframeAlignment, CoarseMesh]:
     mesh = Mesh(Connectivity(faces.numpy()))
-    alignment = KeyframeAlignment(shapes, mesh.connectivity)
+    alignment = KeyframeAlignment(shapes, mesh.connectivity, TorchBackend())
     return alignment, CoarseMesh(alignment.references, mesh, 200, alignment.weights, [])
 
 

@@ -29,7 +29,9 @@ class LeastSquares:
             hessian = torch.autograd.functional.hessian(lambda a: self.value(a, None), sample)
             rows.append((2 * j.mT @ r, 2 * j.mT @ j, hessian - 2 * j.mT @ j, torch.zeros_like(r[0])))
         gradient, gauss_newton, curved, resolution = map(torch.stack, zip(*rows, strict=True))
-        return Derivatives(gradient, gauss_newton, curved if second_order else None, resolution)
+        return Derivatives(
+            self.value(a, placement), gradient, gauss_newton, curved if second_order else None, resolution
+        )
 
     def value_and_gradient(self, a: Tensor, placement: Any) -> tuple[Tensor, Tensor]:
         return self.value(a, placement), self.derivatives(a, placement).gradient
@@ -97,7 +99,7 @@ def test_newtons_step_where_it_exists_and_gauss_newtons_elsewhere() -> None:
             return (a - wanted).square().sum(-1)
 
         def derivatives(self, a: Tensor, placement: Any, second_order: bool = True) -> Derivatives:
-            return Derivatives(gradient, definite, beyond, gradient[:, 0])
+            return Derivatives(self.value(a, placement), gradient, definite, beyond, gradient[:, 0])
 
     found = GaussNewtonStep(Distance(), damping=0.0)(torch.zeros_like(gradient), None)
     torch.testing.assert_close(found.amplitudes, wanted)

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.func import jacfwd
 
 from torch_modal.backends.warp.backend import WarpBackend
-from torch_modal.energy.modal_energy import ModalEnergy
+from torch_modal.energy.modal_energy import Derivatives, ModalEnergy
 from torch_modal.energy.shell import ShellEnergy
 from torch_modal.energy.term import periodic_square
 from torch_modal.inbetween.results import ConvergenceError, report
@@ -91,6 +91,21 @@ def test_what_drowns_in_rounding_has_converged() -> None:
 
     solution = minimise(Drowned(), start([1.5465700486790057]), None, tolerance=1e-9)
     assert float(solution.gradient_norm) < 100, "one Newton step has 202 times the gradient of the start"
+
+
+def test_a_hessian_that_is_too_singular_for_single_precision_is_computed_again() -> None:
+    class Single(Rosenbrock):
+        """Without the second-order term, samples with a first amplitude below zero have lost what is small."""
+
+        def derivatives(self, a: Tensor, placement: Any, second_order: bool = True) -> Derivatives:
+            found = super().derivatives(a, placement, second_order)
+            lost = found.gauss_newton * torch.where(a[:, :1, None] < 0, -1.0, 1.0)
+            return found if second_order else found._replace(gauss_newton=lost)
+
+    given = start([0.5, 0.5], [-1.2, 1.0])
+    exact, found = (minimise(energy, given, None) for energy in (Rosenbrock(), Single()))
+    assert found.converged.all()
+    assert torch.equal(found.amplitudes, exact.amplitudes)
 
 
 def test_what_cannot_go_on_says_why() -> None:

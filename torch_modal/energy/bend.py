@@ -50,6 +50,11 @@ class SquaredBend(Term):
         """In closed form: by ``torch.func``, an in-between in torch takes 1.2 to 1.4 times as long."""
         return dihedral_gradient(edge_vectors)
 
+    def linearised(self, edge_vectors: Tensor) -> tuple[Tensor, Tensor]:
+        """Both from the same normals."""
+        hinges = normals(edge_vectors)
+        return dihedral_angle(edge_vectors, hinges), dihedral_gradient(edge_vectors, hinges)
+
     def hessians(self, edge_vectors: Tensor) -> Tensor:
         """In closed form: ``torch.func`` knows neither checkpoints, whose tensors have hooks, nor ``torch.export``."""
         return dihedral_hessian(edge_vectors)
@@ -62,7 +67,14 @@ class Bend(PeriodicTerm, SquaredBend):
     """
 
 
-def dihedral_angle(edge_vectors: Tensor) -> Tensor:
+def normals(edge_vectors: Tensor) -> tuple[Tensor, ...]:
+    """Normals of both triangles of a hinge, where one has none, and the edge's length. *Shape:* ``(3, 3, ...)``."""
+    e, a, b = edge_vectors
+    n1, n2 = cross(e, a), cross(b, e)
+    return n1, n2, collapsed(e, n1) | collapsed(e, n2), norm(e)
+
+
+def dihedral_angle(edge_vectors: Tensor, hinges: tuple[Tensor, ...] | None = None) -> Tensor:
     """Signed angle between the normals of the two triangles of a hinge, 0 where flat, in ``(-pi, pi]``.
 
     With the edge ``e``, ``n1 = e x a`` and ``n2 = b x e``, the sine is ``(n1 x n2).e/|e| = -|e| n1.b`` and the cosine
@@ -71,31 +83,27 @@ def dihedral_angle(edge_vectors: Tensor) -> Tensor:
     Args:
         edge_vectors: ``e = x_j - x_i``, ``a = x_k - x_i`` and ``b = x_l - x_i`` of a row of
             :attr:`~torch_modal.geometry.connectivity.Connectivity.hinges`, components second. *Shape:* ``(3, 3, ...)``.
+        hinges: Their :func:`normals`, if known.
     """
-    e, a, b = edge_vectors
-    n1 = cross(e, a)
-    n2 = cross(b, e)
-    sine = -norm(e) * (n1 * b).sum(0)
+    n1, n2, flat, length = normals(edge_vectors) if hinges is None else hinges
+    sine = -length * (n1 * edge_vectors[2]).sum(0)
     cosine = (n1 * n2).sum(0)
     # atan2(0, 0) has a NaN gradient; a hinge with a collapsed triangle is flat by convention.
-    flat = collapsed(e, n1) | collapsed(e, n2)
     return torch.atan2(torch.where(flat, 0, sine), torch.where(flat, 1, cosine))
 
 
-def dihedral_gradient(edge_vectors: Tensor) -> Tensor:
+def dihedral_gradient(edge_vectors: Tensor, hinges: tuple[Tensor, ...] | None = None) -> Tensor:
     """Gradient of :func:`dihedral_angle` in closed form: ``-|e| n / |n|^2`` at either tip, the edge by balance.
 
     Args:
         edge_vectors: As above. *Shape:* ``(3, 3, ...)``.
+        hinges: As above.
 
     Returns:
         Zero where a triangle is collapsed. *Shape:* ``(3, 3, ...)``.
     """
     e, a, b = edge_vectors
-    n1 = cross(e, a)
-    n2 = cross(b, e)
-    flat = collapsed(e, n1) | collapsed(e, n2)
-    length = norm(e)
+    n1, n2, flat, length = normals(edge_vectors) if hinges is None else hinges
     to_a = n1 * (-length * inverse((n1 * n1).sum(0), flat))
     to_b = n2 * (-length * inverse((n2 * n2).sum(0), flat))
     to_e = -((a * e).sum(0) * to_a + (b * e).sum(0) * to_b) * inverse((e * e).sum(0), flat)
@@ -117,9 +125,7 @@ def dihedral_hessian(edge_vectors: Tensor) -> Tensor:
         Zero where a triangle is collapsed. *Shape:* ``(3, 3, 3, 3, ...)``.
     """
     e, a, b = edge_vectors
-    n1, n2 = cross(e, a), cross(b, e)
-    flat = collapsed(e, n1) | collapsed(e, n2)
-    length = norm(e)
+    n1, n2, flat, length = normals(edge_vectors)
     per_length = inverse(length, flat)
     own = e.new_zeros(())
     with_itself, with_edge = [], []

@@ -251,9 +251,9 @@ class Energy(nn.Module):
         found = []
         for part, rest, weight in zip(self.parts, reference.measures, reference.weights, strict=True):
             edge_vectors = part.edge_vectors(extended)
-            measures = part.measures(edge_vectors)
-            gradients = part.term.gradients(edge_vectors)
+            measures, gradients = part.term.linearised(edge_vectors)
             if part.term.total:
+                measures = measures.sum(-1, keepdim=True)
                 gradients = part.scattered(torch.zeros_like(extended), gradients)
             slope = part.term.slopes(measures, rest, weight)
             curvatures = part.term.curvatures(measures, rest, weight)

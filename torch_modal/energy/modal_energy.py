@@ -10,8 +10,6 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from torch_modal import trees
-from torch_modal.autograd import traced, transformed
 from torch_modal.energy.bend import Bend, fullness
 from torch_modal.energy.energy import Energy, Linearised, Reference, RestShapes
 from torch_modal.energy.shell import ShellEnergy
@@ -22,12 +20,15 @@ MOST_BYTES = 2**26
 
 
 class Derivatives(NamedTuple):
-    """Derivatives of an energy in the amplitudes ``a``."""
+    """An energy and its derivatives in the amplitudes ``a``."""
 
+    value: Tensor
+    """*Shape:* ``(B,)``."""
     gradient: Tensor
     """*Shape:* ``(B, n)``."""
     gauss_newton: Tensor
-    """``2 J^T J``, always positive semi-definite. *Shape:* ``(B, n, n)``."""
+    """``2 J^T J``, positive semi-definite but for rounding: that of single precision without the second-order term,
+    where a metric is wanted. *Shape:* ``(B, n, n)``."""
     second_order: Tensor | None
     """The second-order term of the full Hessian. *Shape:* ``(B, n, n)``."""
     resolution: Tensor
@@ -133,7 +134,7 @@ class ModalEnergy(nn.Module):
         return self.energy.value(self.rows(a, placement), placement.reference)
 
     def derivatives(self, a: Tensor, placement: Placement, second_order: bool = True) -> Derivatives:
-        """Gradient and Hessians at ``a``.
+        """Energy, gradient and Hessians at ``a``.
 
         Args:
             a: Amplitudes. *Shape:* ``(B, n)``.
@@ -149,7 +150,7 @@ class ModalEnergy(nn.Module):
                 row = self._along_columns(one.gradients)
                 gradient, own = one.slope * row, one.curvature[..., None] * row[:, :, None] * row[:, None, :]
             else:
-                gradient, own = _normal_equations(one, columns)
+                gradient, own = _normal_equations(one, columns, second_order)
             gradients.append(gradient)
             inner.append(own)
             if second_order:
@@ -160,20 +161,13 @@ class ModalEnergy(nn.Module):
         rounding = torch.finfo(x.dtype).eps * x.abs().amax((0, -1))
         resolution = rounding * (stiffest * stiffness).sqrt()
         beyond = reduce(torch.add, curved) if second_order else None
-        return Derivatives(reduce(torch.add, gradients), gauss_newton, beyond, resolution)
+        value = self.energy.value_at(at, placement.reference)
+        return Derivatives(value, reduce(torch.add, gradients), gauss_newton, beyond, resolution)
 
     def value_and_gradient(self, a: Tensor, placement: Placement) -> tuple[Tensor, Tensor]:
         """Energy and gradient at ``a``. *Shape:* ``(B, n) -> (B,), (B, n)``."""
-        # Autograd computes the gradient in half of the time that the derivatives of all elements take.
-        given = a, *trees.leaves(placement)
-        if torch.is_inference_mode_enabled() or traced(a) or any(transformed(x) or x.is_inference() for x in given):
-            at = self.energy.linearise(self.rows(a, placement), placement.reference)
-            return self.energy.value_at(at, placement.reference), self._along_columns(self.energy.gradient(at))
-        with torch.enable_grad():
-            leaf = a.detach().requires_grad_()
-            value = self.value(leaf, placement)
-            (gradient,) = torch.autograd.grad(value.sum(), leaf)
-        return value.detach(), gradient
+        at = self.energy.linearise(self.rows(a, placement), placement.reference)
+        return self.energy.value_at(at, placement.reference), self._along_columns(self.energy.gradient(at))
 
     def gradient(self, a: Tensor, placement: Placement) -> Tensor:
         """Gradient at ``a``, to be differentiated in all that the placement holds. *Shape:* ``(B, n) -> (B, n)``."""
@@ -185,7 +179,13 @@ class ModalEnergy(nn.Module):
         return extended.transpose(0, 1).flatten(1) @ self.columns.flatten(1).mT
 
 
-def _normal_equations(one: Linearised, columns: Tensor) -> tuple[Tensor, Tensor]:
+def gram(rows: Tensor, exact: bool) -> Tensor:
+    """``J^T J``, or the same of single precision in half of the time. *Shape:* ``(B, m, n) -> (B, n, n)``."""
+    rows, like = rows if exact else rows.float(), rows
+    return (rows.mT @ rows).to(like)
+
+
+def _normal_equations(one: Linearised, columns: Tensor, exact: bool) -> tuple[Tensor, Tensor]:
     """Contribution of one term to the gradient and to Gauss-Newton's Hessian, by edge vectors along the columns.
 
     *Shape:* ``(M, c, n) -> (B, n), (B, n, n)``, with ``c`` three times the number of edge vectors.
@@ -195,7 +195,7 @@ def _normal_equations(one: Linearised, columns: Tensor) -> tuple[Tensor, Tensor]
     local = root * one.gradients.flatten(0, 1)
     # Products of tiny matrices are fast in one dense block only: any other layout is copied matrix by matrix.
     jacobian = (local.permute(2, 1, 0).contiguous() @ columns).transpose(0, 1)
-    return (jacobian.mT @ (one.slope / root)[..., None]).squeeze(-1), jacobian.mT @ jacobian
+    return (jacobian.mT @ (one.slope / root)[..., None]).squeeze(-1), gram(jacobian, exact)
 
 
 def _second_order(term: Term, one: Linearised, columns: Tensor) -> Tensor:

@@ -170,6 +170,10 @@ class Term(nn.Module):
         """Gradients of the measures in the edge vectors. *Shape:* ``(n-1, 3, ..., M) -> (n-1, 3, ..., M)``."""
         return self._each(jacrev(self.measure), edge_vectors)
 
+    def linearised(self, edge_vectors: Tensor) -> tuple[Tensor, Tensor]:
+        """The measures and their gradients, for terms in which both share work. *Shape:* ``(n-1, 3, ..., M)``."""
+        return self.measures(edge_vectors), self.gradients(edge_vectors)
+
     def hessians(self, edge_vectors: Tensor) -> Tensor:
         """Hessians of the measures in the edge vectors. *Shape:* ``(n-1, 3, ..., M) -> (n-1, 3, n-1, 3, ..., M)``."""
         return self._each(jacrev(jacrev(self.measure)), edge_vectors)

@@ -8,6 +8,7 @@ from scipy.spatial import KDTree
 from torch import Tensor, nn
 
 from torch_modal.arrays import FloatArray, IntArray
+from torch_modal.autograd import plain
 from torch_modal.geometry.connectivity import Connectivity, half_cotangents, vertex_areas
 from torch_modal.geometry.rigid import best_fit
 from torch_modal.geometry.sparse import SparseSolver, graph_laplacian, solve_by, solve_exported
@@ -87,7 +88,8 @@ class Poisson(nn.Module):
     def or_near(self, pulls: Tensor, near: Tensor) -> Tensor:
         """:meth:`forward`, and the shape nearby where that is not finite. *Shape:* ``(B, V, 3), (B, V, 3)``."""
         found = self(pulls, near)
-        return torch.where(found.detach().sum((1, 2)).isfinite()[:, None, None], found, near)
+        finite = found.detach().sum((1, 2)).isfinite()
+        return found if plain(finite) and finite.all() else torch.where(finite[:, None, None], found, near)
 
     def pulls(self, wanted: Tensor) -> Tensor:
         """Right-hand side of the system of target edge vectors. *Shape:* ``(3, ..., E) -> (..., V, 3)``."""
@@ -100,9 +102,9 @@ class Poisson(nn.Module):
         """Centre of the piece of each vertex. *Shape:* ``(..., V, 3) -> (..., V, 3)``, or ``(..., 1, 3)``."""
         piece, shares = self.piece.to(x.device), self.shares.to(x.device)
         # Sequential float32 sums over thousands of vertices lose three digits.
-        weighted = x.double() * shares.double()[:, None]
         if self.n_pieces == 1:
-            return weighted.sum(-2, keepdim=True).to(x)
+            return (shares.double() @ x.double())[..., None, :].to(x)
+        weighted = x.double() * shares.double()[:, None]
         return torch.zeros_like(weighted).index_add(-2, piece, weighted).index_select(-2, piece).to(x)
 
 

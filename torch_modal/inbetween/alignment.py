@@ -7,16 +7,11 @@ import torch
 from torch import Tensor, nn
 
 from torch_modal.autograd import plain
+from torch_modal.backends.torch.backend import TorchBackend
 from torch_modal.errors import MeshWarning
 from torch_modal.geometry.canonical import CANONICAL_SIZE, size
 from torch_modal.geometry.connectivity import Connectivity, vertex_areas
 from torch_modal.geometry.rigid import best_rotation, centroid, looks_mirrored
-from torch_modal.geometry.rotations import agreeing, matrix, mean, quaternion
-from torch_modal.geometry.vectors import cross, pick
-
-# Rounds in which more than two key-frames are turned on to their mean, and the last of them, which have derivatives: of
-# the poses of a gallop, each leaves a tenth.
-ROUNDS, LAST_ROUNDS = 6, 5
 
 # A key-frame smaller than this part of the reference is a point.
 SMALLEST_SIZE = 1e-6
@@ -40,6 +35,7 @@ class KeyframeAlignment(nn.Module):
     Args:
         references: Shapes near the key-frames, float64 on the CPU. *Shape:* ``(K, V, 3)``.
         mesh: Their connectivity.
+        backend: Turns the key-frames.
     """
 
     scale: Tensor
@@ -49,11 +45,10 @@ class KeyframeAlignment(nn.Module):
     roots: Tensor
     rooted: Tensor
     extent: Tensor
-    corners: Tensor
 
-    def __init__(self, references: Tensor, mesh: Connectivity) -> None:
+    def __init__(self, references: Tensor, mesh: Connectivity, backend: TorchBackend) -> None:
         super().__init__()
-        corners = torch.tensor(mesh.faces).T.contiguous()
+        self.mean_pose = backend.mean_pose
         sizes = torch.tensor([size(x.numpy(), mesh.faces) for x in references], dtype=references.dtype)
         scale = CANONICAL_SIZE / sizes.mean()
         areas = torch.stack([torch.from_numpy(vertex_areas(x.numpy(), mesh.faces)) for x in references])
@@ -74,8 +69,7 @@ class KeyframeAlignment(nn.Module):
         extent = (self.reference.amax(0) - self.reference.amin(0)).norm()
         #: Diagonal of the bounding box of the first reference.
         self.register_buffer("extent", extent, persistent=False)
-        #: Of the faces. *Shape:* ``(3, F)``.
-        self.register_buffer("corners", corners, persistent=False)
+        self.volumes = backend.volumes(mesh)
         self.closed = len(mesh.boundary_edges) == 0
         self.size_warned = False
 
@@ -100,8 +94,9 @@ class KeyframeAlignment(nn.Module):
         weights, known = torch.where(weights.isfinite(), weights, 1 / weights.shape[1]), weights.isfinite()
         x, usable = self.checked(keyframes.mT.contiguous())
         turned, pose = self._aligned(x, weights)
-        usable = usable & ~self.mirrored(turned.detach(), weights)
-        return turned.mT.contiguous(), pose, ((usable | (weights == 0)) & known).all(1)
+        shapes = turned.mT.contiguous()
+        usable = usable & ~self.mirrored(shapes.detach(), weights)
+        return shapes, pose, ((usable | (weights == 0)) & known).all(1)
 
     def checked(self, keyframes: Tensor) -> tuple[Tensor, Tensor]:
         """Key-frames that are finite and have a size, the reference in the place of others; which those are.
@@ -117,55 +112,34 @@ class KeyframeAlignment(nn.Module):
         return torch.where(usable[..., None, None], keyframes, self.reference.mT / self.scale), usable
 
     def _aligned(self, keyframes: Tensor, weights: Tensor) -> tuple[Tensor, Pose]:
-        """Key-frames turned on to their weighted mean, and this to the reference. *Shape:* ``(B, K, 3, V)``.
-
-        Generalised Procrustes analysis: the weighted squared distances of all pairs are least. Of two, it is their best
-        fit.
-        """
+        """Key-frames turned on to their weighted mean, and this to the reference. *Shape:* ``(B, K, 3, V)``."""
         centres = keyframes @ self.weights
         centred = (keyframes - centres[..., None]) * self.scale
         rows = (centred * self.roots).flatten(1, 2)
         to_reference = (self.rooted @ rows.mT).unflatten(2, (-1, 3)).transpose(1, 2)  # (B, K, 3, 3)
         among = (rows @ rows.mT).unflatten(2, (-1, 3)).unflatten(1, (-1, 3)).transpose(2, 3)  # (B, K, K, 3, 3)
-        pulls = weights[..., None, None]
-        if weights.shape[1] > 2:
-            with torch.no_grad():
-                turns = best_rotation(to_reference)
-                for _ in range(ROUNDS):
-                    turns = best_rotation(((pulls * turns)[:, :, None] @ among).sum(1))
-            turns = turns.detach()  # forward mode goes through no_grad
-            for _ in range(LAST_ROUNDS):
-                turns = best_rotation(((pulls * turns)[:, :, None] @ among).sum(1))
-        else:
-            turns = torch.cat([torch.eye(3).to(among).expand(len(among), 1, 3, 3), best_rotation(among[:, 0, 1:])], 1)
-        turns = best_rotation((pulls * to_reference @ turns.mT).sum(1))[:, None] @ turns
-        poses = quaternion(turns.mT.movedim((-2, -1), (0, 1)))  # (4, B, K)
-        signs = agreeing(torch.einsum("ibk,ibl->bkl", poses, poses).detach(), weights.detach())
-        pose = mean((signs * poses)[..., None], weights[..., None]).squeeze(-1)
-        rotation = matrix(pose).movedim(-1, 0)
+        turns, rotation = self.mean_pose(to_reference, among, weights)
         return turns @ centred, Pose(rotation, (weights[..., None] * centres).sum(1))
 
     def restore(self, x: Tensor, pose: Pose) -> Tensor:
         """Shapes of the frame in the caller's coordinates. *Shape:* ``(B, V, 3)``."""
-        return (x / self.scale) @ pose.rotation.mT + pose.centre[:, None]
+        return torch.baddbmm(pose.centre[:, None], x, pose.rotation.mT / self.scale)
 
     def bring(self, points: Tensor, pose: Pose) -> Tensor:
         """The inverse of :meth:`restore`. *Shape:* ``(B, P, 3)``."""
         return (points - pose.centre[:, None]) @ pose.rotation * self.scale
 
     def mirrored(self, shapes: Tensor, weights: Tensor) -> Tensor:
-        """True for mirror images of the heaviest, of closed surfaces. *Shape:* ``(B, K, 3, V), (B, K) -> (B, K)``."""
+        """True for mirror images of the heaviest, of closed surfaces. *Shape:* ``(B, K, V, 3), (B, K) -> (B, K)``."""
         if not self.closed:
             return torch.zeros_like(weights, dtype=torch.bool)
-        a, b, c = (pick(shapes, corner).movedim(2, 0) for corner in self.corners)
-        volumes = (a * cross(b, c)).sum((0, -1))
-        heaviest = weights.argmax(1, keepdim=True)
+        volumes, heaviest = self.volumes(shapes), weights.argmax(1, keepdim=True)
         turned = volumes * volumes.gather(1, heaviest) < 0
         if plain(turned) and not turned.any():
             return turned
         first = shapes.take_along_dim(heaviest[..., None, None], 1).expand_as(shapes)
-        own, of = first.flatten(0, 1).mT, shapes.flatten(0, 1).mT
-        return turned & looks_mirrored(own, of, self.corners.T).view_as(turned)
+        own, of = first.flatten(0, 1), shapes.flatten(0, 1)
+        return turned & looks_mirrored(own, of, self.volumes.corners.T).view_as(turned)
 
     def _warn_of_size(self, sizes: Tensor) -> None:
         """Say, once for a layer, that key-frames and bases seem to be in different units."""

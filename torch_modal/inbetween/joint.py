@@ -110,12 +110,12 @@ class JointSpace(nn.Module):
         return reduce(torch.add, energies) + 0.5 * self.anchor * a.square().sum(-1)
 
     def derivatives(self, a: Tensor, placement: Sequence[Placement], second_order: bool = True) -> Derivatives:
-        """Gradient and Hessians at ``a``. *Shape:* ``(B, n)``."""
+        """Energy, gradient and Hessians at ``a``. *Shape:* ``(B, n)``."""
         found = [part.derivatives(a.to(own.base.dtype), own, second_order) for part, own in self._each(placement)]
         sums: list[Any] = [None if each[0] is None else reduce(torch.add, each) for each in zip(*found, strict=True)]
-        gradient, gauss_newton, *others = sums
-        eye = torch.eye(a.shape[-1]).to(gauss_newton)
-        return Derivatives(gradient + self.anchor * a, gauss_newton + self.anchor * eye, *others)
+        value, gradient, gauss_newton, *others = sums
+        value, eye = value + 0.5 * self.anchor * a.square().sum(-1), torch.eye(a.shape[-1]).to(gauss_newton)
+        return Derivatives(value, gradient + self.anchor * a, gauss_newton + self.anchor * eye, *others)
 
     def value_and_gradient(self, a: Tensor, placement: Sequence[Placement]) -> tuple[Tensor, Tensor]:
         """Energy and gradient at ``a``. *Shape:* ``(B, n) -> (B,), (B, n)``."""

@@ -88,14 +88,15 @@ class PairedSpace(nn.Module):
         return strain + self._similarity(a, placement)[0]
 
     def derivatives(self, a: Tensor, placement: PairedPlacement, second_order: bool = True) -> Derivatives:
-        """Gradient and Hessians at ``a``; the similarity is quadratic and part of Gauss-Newton's."""
+        """Energy, gradient and Hessians at ``a``; the similarity is quadratic and part of Gauss-Newton's."""
         ends = self._ends(a, placement)
         first, second = (space.derivatives(part, place, second_order) for space, part, place in ends)
-        gradient = torch.cat([first.gradient, second.gradient], -1) + self._similarity(a, placement)[1]
+        similarity, pull = self._similarity(a, placement)
+        value, gradient = first.value + second.value + similarity, torch.cat([first.gradient, second.gradient], -1)
         similar = 2 * placement.mu[:, None, None] * self.gap_gram
         gauss_newton = _block_diagonal(first.gauss_newton, second.gauss_newton) + similar
         curved = _block_diagonal(first.second_order, second.second_order) if second_order else None
-        return Derivatives(gradient, gauss_newton, curved, first.resolution + second.resolution)
+        return Derivatives(value, gradient + pull, gauss_newton, curved, first.resolution + second.resolution)
 
     def value_and_gradient(self, a: Tensor, placement: PairedPlacement) -> tuple[Tensor, Tensor]:
         """Energy and gradient at ``a``. *Shape:* ``(B, n) -> (B,), (B, n)``."""
@@ -142,8 +143,8 @@ def newton(
         a, n_steps = torch.where(moving[:, None], taken.amplitudes, a), n_steps + moving
         if not moving.any():
             break
-    found, value = energy.derivatives(a, placement, second_order=False), energy.value(a, placement)
-    norm = found.gradient.norm(dim=-1)
+    found = energy.derivatives(a, placement, second_order=False)
+    norm, value = found.gradient.norm(dim=-1), found.value
     start = norm if start is None else start
     small = norm <= torch.maximum(tolerance * start, found.floor)
     status = torch.where(small, Status.CONVERGED, torch.where(moving, Status.OUT_OF_STEPS, Status.STALLED))

@@ -59,7 +59,7 @@ class InBetweenSolver(nn.Module):
         super().__init__()
         backend, others = choose(solver.backend), terms[N_SHELL_TERMS:]
         self.solver, self.mesh, self.backend = solver, mesh, backend
-        self.alignment = KeyframeAlignment(references, mesh.connectivity)
+        self.alignment = KeyframeAlignment(references, mesh.connectivity, backend)
         self.fine = backend.fine_energy(mesh, terms)
         self.distortion = backend.distortion(mesh, Energy(mesh, others) if others else None)
         joint = objective.space == "joint"

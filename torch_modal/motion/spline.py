@@ -65,7 +65,7 @@ class Spline(nn.Module):
         super().__init__()
         n = len(references)
         self.scheme, self.cyclic = scheme, len(times) > n
-        self.alignment = KeyframeAlignment(references, mesh)
+        self.alignment = KeyframeAlignment(references, mesh, backend)
         self.register_buffer("times", times.clone(), persistent=False)
         self.poisson = backend.poisson(mesh, weights_per_length(mesh, references))
         first = backend.rotations(mesh, references)
@@ -99,8 +99,8 @@ class Spline(nn.Module):
             turns.append(turns[-1] @ step)
         rotations = torch.stack(turns).mT
         shapes = self.alignment.scale * centred @ rotations
-        flat = shapes.detach().movedim(0, 1).mT
-        usable = usable.all(1) & ~self.alignment.mirrored(flat, torch.ones_like(flat[..., 0, 0])).any(1)
+        every = shapes.detach().movedim(0, 1)
+        usable = usable.all(1) & ~self.alignment.mirrored(every, torch.ones_like(every[..., 0, 0])).any(1)
         durations = self.times.diff()
 
         def through(steps: Tensor, dim: int = -1) -> Cubics:

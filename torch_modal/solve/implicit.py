@@ -148,4 +148,4 @@ def solve_unrolled(
     status = torch.where(found, Status.CONVERGED, Status.OUT_OF_STEPS)
     status = torch.where(usable & norm.isfinite(), status, Status.INVALID)
     relative = norm / first.clamp_min(torch.finfo(first.dtype).tiny)
-    return Solution(a, energy.value(a, placement), relative.detach(), torch.full_like(status, max_steps), status)
+    return Solution(a, derivatives.value, relative.detach(), torch.full_like(status, max_steps), status)

@@ -130,17 +130,22 @@ def minimise(
         max_steps: Evaluations of the gradient at most.
         tolerance: Bound on the gradient norm, relative to the one at the start.
     """
-    found, reached, norm = a.clone(), energy.value(a, placement), a.new_zeros(len(a))
-    n_steps = torch.zeros(len(a), dtype=torch.int64, device=a.device)
-    start, goal, drowned = norm.clone(), norm.clone(), norm > 0
+    found, norm, n_steps = a.clone(), a.new_zeros(len(a)), torch.zeros(len(a), dtype=torch.int64, device=a.device)
+    reached, start, goal, drowned = norm, norm, norm, norm > 0
     eye, rows = torch.eye(a.shape[-1]).to(a), torch.arange(len(a), device=a.device)
     for used in range(0, max(max_steps, 1), MOST_EVALUATIONS):
         some = placement if len(rows) == len(a) else trees.rows(placement, rows)
         derivatives = energy.derivatives(found[rows], some, second_order=False)
+        factor, info = torch.linalg.cholesky_ex(ridged(derivatives.gauss_newton))
+        if bool(info.any()):  # too singular for single precision
+            exact = energy.derivatives(found[rows], some).gauss_newton
+            exact = torch.where((info != 0)[:, None, None], exact, derivatives.gauss_newton)
+            derivatives = derivatives._replace(gauss_newton=exact)
+            factor, info = torch.linalg.cholesky_ex(ridged(exact))
         own_norm = derivatives.gradient.norm(dim=-1)
         if not used:
-            start, goal = own_norm.clone(), torch.maximum(tolerance * own_norm, derivatives.floor)
-        factor, info = torch.linalg.cholesky_ex(ridged(derivatives.gauss_newton))
+            reached, start = derivatives.value.clone(), own_norm.clone()
+            goal = torch.maximum(tolerance * own_norm, derivatives.floor)
         regular = (info == 0) & own_norm.isfinite() & reached[rows].isfinite()
         inverse = torch.cholesky_inverse(torch.where(regular[:, None, None], factor, eye)).contiguous()
         length, before = (regular & (own_norm > goal[rows])).to(a), n_steps[rows]

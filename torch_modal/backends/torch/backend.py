@@ -8,12 +8,14 @@ from torch import Tensor
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.backends.torch.distortion import Distortion
 from torch_modal.backends.torch.fine_steps import FineEnergy
+from torch_modal.backends.torch.volumes import Volumes
 from torch_modal.energy.energy import Energy
 from torch_modal.energy.modal_energy import ModalEnergy
 from torch_modal.energy.term import Mesh, Term
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.local_rotations import LocalRotations
 from torch_modal.geometry.poisson import Poisson
+from torch_modal.geometry.procrustes import mean_pose
 
 
 class TorchBackend:
@@ -25,6 +27,8 @@ class TorchBackend:
 
     quasi_newton: Callable[..., Any] | None = None
     """Does what :func:`torch_modal.solve.minimise.updated` does."""
+
+    mean_pose = staticmethod(mean_pose)
 
     def load(self) -> None:
         """Load what takes long, so that nobody waits for it later."""
@@ -44,6 +48,10 @@ class TorchBackend:
     def fine_energy(self, mesh: Mesh, terms: Sequence[Term]) -> FineEnergy:
         """All terms on the caller's mesh, for steps of all vertices. Those of Eq. 5 come first."""
         return FineEnergy(mesh, terms)
+
+    def volumes(self, mesh: Connectivity) -> Volumes:
+        """Signed volumes of closed shapes."""
+        return Volumes(mesh)
 
     def distortion(self, mesh: Mesh, further: Energy | None) -> Distortion:
         """A bounded measure of shapes, with terms beside Eq. 5 where there are some."""

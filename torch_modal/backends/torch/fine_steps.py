@@ -6,6 +6,7 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor, nn
 
+from torch_modal.autograd import plain
 from torch_modal.energy.energy import Energy, Linearised, Reference, RestShapes, energy_rounding
 from torch_modal.energy.shell import N_SHELL_TERMS
 from torch_modal.energy.term import Mesh, Term
@@ -140,20 +141,26 @@ def relax(
         *Shape:* ``(B, V, 3)``.
     """
     fixed = None if anchors is None else anchors.movedim(-1, 0)
-    rows = x.movedim(-1, 0).contiguous()
-    for _ in range(n_steps):
-        extended = energy.extend(rows, fixed)
-        at, more = energy.linearise(extended, reference), [one.at(rows.movedim(0, -1).contiguous()) for one in beside]
+    rows, at = x.movedim(-1, 0).contiguous(), None
+    for k in range(n_steps):
+        at = energy.linearise(energy.extend(rows, fixed), reference) if at is None else at
+        more = [one.at(rows.movedim(0, -1).contiguous()) for one in beside]
         right = -sum((one.gradient.movedim(-1, 0) for one in more), start=energy.fold(energy.gradient(at)))
         right = right if free is None else free * right
         direction = _solved(energy, ConvexHessian(energy, at), right, n_products, more, free)
         reached = rows + direction
         there = reached.movedim(0, -1).contiguous()
         before = sum((one.value for one in more), start=energy.value_at(at, reference))
-        after = energy.value(energy.extend(reached, fixed), reference)
+        extended, at = energy.extend(reached, fixed), None
+        if k < n_steps - 1 and plain(reached):  # the whole step is nearly always the one that is taken
+            at = energy.linearise(extended, reference)
+        after = energy.value(extended, reference) if at is None else energy.value_at(at, reference)
         after = sum((one.value(there) for one in beside), start=after)
         length = step_length(before, -(right * direction).sum((0, -1)), after, direction.abs().amax((0, -1)))
-        rows = rows + length[:, None] * direction
+        if at is not None and bool((length == 1).all()):
+            rows = reached
+        else:
+            rows, at = rows + length[:, None] * direction, None
     return rows.movedim(0, -1)
 
 
@@ -172,7 +179,10 @@ def step_length(before: Tensor, slope: Tensor, after: Tensor, largest: Tensor) -
     """
     half, finite = -0.5 * slope, after.isfinite()
     rounding = energy_rounding(before.dtype) * before.detach().abs()
-    surplus = (torch.where(finite, after, 0) - before + half - rounding).clamp_min(0)
+    gap = torch.where(finite, after, before) - before + half - rounding
+    if not torch.is_grad_enabled() and plain(gap) and bool((finite & (gap <= 0)).all()):
+        return torch.ones_like(gap)  # nearly always
+    surplus = gap.clamp_min(0)
     counts = ((largest / SLIGHT - 1) / 9).clamp(0, 1)
     shorter = (surplus > 0) & (counts > 0)
     length = torch.where(shorter, 1 - counts * surplus / torch.where(shorter, half + surplus, 1), 1)

@@ -16,8 +16,10 @@ from torch_modal.backends.warp.distortion import WarpDistortion
 from torch_modal.backends.warp.fine_steps import WarpFineEnergy
 from torch_modal.backends.warp.launch import kernels, load_kernels
 from torch_modal.backends.warp.modal_energy import WarpModalEnergy
+from torch_modal.backends.warp.procrustes import mean_pose
 from torch_modal.backends.warp.quasi_newton import update
 from torch_modal.backends.warp.rotations import WarpRotations
+from torch_modal.backends.warp.volumes import WarpVolumes
 from torch_modal.energy.bend import Bend
 from torch_modal.energy.energy import Energy
 from torch_modal.energy.modal_energy import ModalEnergy
@@ -36,7 +38,7 @@ class WarpBackend(TorchBackend):
         MissingPackageError: Warp is not installed.
     """
 
-    quasi_newton = staticmethod(update)
+    quasi_newton, mean_pose = staticmethod(update), staticmethod(mean_pose)
 
     def __init__(self) -> None:
         if importlib.util.find_spec("warp") is None:
@@ -71,6 +73,10 @@ class WarpBackend(TorchBackend):
     def fine_energy(self, mesh: Mesh, terms: Sequence[Term]) -> FineEnergy:
         """Overrides the base class."""
         return WarpFineEnergy(mesh, terms) if _are_of_shell(terms) else super().fine_energy(mesh, terms)
+
+    def volumes(self, mesh: Connectivity) -> WarpVolumes:
+        """Overrides the base class."""
+        return WarpVolumes(mesh)
 
     def distortion(self, mesh: Mesh, further: Energy | None) -> Distortion:
         """Overrides the base class."""

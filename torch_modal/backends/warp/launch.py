@@ -18,7 +18,17 @@ from torch import Tensor
 from torch_modal.energy.term import Mesh
 from torch_modal.progress import ProgressReport
 
-Module = Literal["shell", "modal", "quasi_newton", "steps", "rotations", "rotations_adjoint", "adjoints", "crossings"]
+Module = Literal[
+    "shell",
+    "shell_adjoint",
+    "modal",
+    "quasi_newton",
+    "steps",
+    "rotations",
+    "rotations_adjoint",
+    "adjoints",
+    "crossings",
+]
 PACKAGE = "torch_modal.backends.warp.kernels"
 IN_BETWEENS: tuple[Module, ...] = ("rotations", "shell", "modal", "quasi_newton", "steps")
 """The modules for in-betweens without gradients."""

@@ -13,7 +13,7 @@ from torch_modal.backends.warp.launch import kernels, launch
 from torch_modal.backends.warp.shell import ShellReference, WarpShell
 from torch_modal.energy.bend import fullness
 from torch_modal.energy.energy import Energy, RestShapes
-from torch_modal.energy.modal_energy import Derivatives, ModalEnergy, Placement
+from torch_modal.energy.modal_energy import Derivatives, ModalEnergy, Placement, gram
 from torch_modal.energy.term import Mesh
 
 # Columns that a kernel takes at a time.
@@ -54,10 +54,7 @@ class WarpModalEnergy(ModalEnergy):
 
     def softened(self, reference: Any, base: Tensor) -> Any:
         """As in the base class."""
-        edges, hinges = reference.elements.split([2, 5], -1)
-        full = fullness(self.energy.parts[1].edge_vectors(base.movedim(-1, 0))).to(hinges)
-        factors = torch.ones_like(hinges[..., 0]).index_copy(1, self.shell.interior, full)
-        return reference._replace(elements=torch.cat([edges, factors[..., None] * hinges], -1))
+        return reference._replace(elements=fused(_Softened(self.shell), base, reference.elements)[0])
 
     def place(self, base: Tensor, reference: Any, anchors: Tensor | None = None) -> Placement:
         """As in the base class."""
@@ -132,18 +129,18 @@ class WarpModalEnergy(ModalEnergy):
         (b, n), blocks = (len(x), len(self.columns)), self.blocks.double()
         n_measures = shell.n_edges + shell.n_hinges
         # One row for each measure, the last for the volume; the residuals are a column like the others.
-        jacobian, stiffness = x.new_empty(b, n_measures + 1, blocks.shape[1]), to.stiffness.clone()
+        jacobian, totals = x.new_empty(b, n_measures + 1, blocks.shape[1]), x.new_zeros(b, 2)
         given = [shell.constants, x, to.elements, blocks, n, blocks.shape[1] // _BLOCK, n_measures + 1]
-        launch(kernels("modal").jacobian, (b, shell.n_edges), [*given, jacobian, jacobian, stiffness])
+        launch(kernels("modal").jacobian, (b, shell.n_edges), [*given, jacobian, jacobian, totals])
         volume, normal = shell.volume(x)
         root, off, last = to.stiffness.sqrt()[:, None], volume - to.volume, jacobian[:, -1]
         last[:, :n] = normal.flatten(1) @ self.flat.double().mT
         last[:, n] = off
         last *= root
         last[:, n + 1 :] = 0
-        products = jacobian.mT @ jacobian
-        gradient, inner = products[:, :n, n], products[:, :n, :n]
-        stiffest = inner.diagonal(dim1=-2, dim2=-1).amax(-1)
+        gradient = (jacobian.mT @ jacobian[..., n : n + 1])[:, :n, 0]
+        inner = gram(jacobian, second_order)[:, :n, :n]
+        stiffest, stiffness = inner.diagonal(dim1=-2, dim2=-1).amax(-1), to.stiffness + totals[:, 0]
         rounding = torch.finfo(x.dtype).eps * x.abs().amax((-1, -2))
         curved = None
         if second_order:
@@ -152,7 +149,8 @@ class WarpModalEnergy(ModalEnergy):
             dim = b, max(shell.n_edges, shell.n_faces)
             launch(kernels("modal").curved_columns, dim, [*given, blocks.shape[1] // _BLOCK, pushed])
             curved = (blocks.mT @ pushed)[:, :n, :n]
-        return Derivatives(gradient, inner, curved, rounding * (stiffest * stiffness).sqrt())
+        value = totals[:, 1] + 0.5 * to.stiffness * off**2 + to.constant
+        return Derivatives(value, gradient, inner, curved, rounding * (stiffest * stiffness).sqrt())
 
     def value_and_gradient(self, a: Tensor, placement: Placement) -> tuple[Tensor, Tensor]:
         """As in the base class."""
@@ -170,6 +168,34 @@ class WarpModalEnergy(ModalEnergy):
         if not isinstance(to, ShellReference):
             return super().gradient(a, placement)
         return fused(_Gradient(self), a, placement.base, *to[:3])[0].to(placement.base)
+
+
+class _Softened:
+    """The elements of references, softened at the needles of shapes. *Shape:* ``(B, V, 3), (B, E, 7)``."""
+
+    n_results = n_differentiable = 1
+
+    def __init__(self, shell: WarpShell) -> None:
+        self.shell = shell
+
+    def run(self, kept: list[Any] | None, base: Tensor, elements: Tensor) -> tuple[Tensor, ...]:
+        """See :class:`~torch_modal.backends.warp.function.Operation`."""
+        found, dim = torch.empty_like(elements), (len(base), self.shell.n_edges)
+        launch(kernels("modal").soften, dim, [self.shell.constants, base, elements, found])
+        return (found,)
+
+    def back(self, kept: list[Any], grads: Sequence[Tensor], *given: Tensor) -> tuple[Tensor | None, ...]:
+        """See :class:`~torch_modal.backends.warp.function.Operation`."""
+        found, dim = (torch.zeros_like(given[0]), torch.empty_like(given[1])), (len(given[0]), self.shell.n_edges)
+        launch(kernels("shell_adjoint").soften, dim, [self.shell.constants, *given, grads[0], *found])
+        return found
+
+    def by_torch(self, base: Tensor, elements: Tensor) -> tuple[Tensor, ...]:
+        """See :class:`~torch_modal.backends.warp.function.Operation`."""
+        edges, hinges = elements.split([2, 5], -1)
+        full = fullness(self.shell.energy.parts[1].edge_vectors(base.movedim(-1, 0)))
+        factors = torch.ones_like(hinges[..., 0]).index_copy(1, self.shell.interior, full)
+        return (torch.cat([edges, factors[..., None] * hinges], -1),)
 
 
 class _Gradient:

@@ -222,13 +222,10 @@ class WarpShell(nn.Module):
             to_normal = to_normal - self.mean(to_normal)[:, None]
         centre = self.centre(x)
         to_centre = None if centre is None else torch.zeros_like(centre)
-        # Where nothing is received, nothing is computed; functions of kernels add to the normal once more.
-        taken = [None if other is None else own for own, other in zip(at[2:4], others, strict=True)]
-        given = [self.constants, x, to.elements, len(x), centre, x.new_zeros(len(x), 2), at.gradient]
-        adjoints = [None, to_x, to_reference.elements, None, to_centre]
-        adjoints += [torch.stack([to_energy, to_volume], 1), to_gradient, to_normal, *others]
+        to_totals = torch.stack([to_energy, to_volume], 1)
+        given = [self.constants, x, to.elements, centre, to_totals, to_gradient, to_normal.contiguous(), *others]
         dim = len(x), max(self.n_edges, self.n_faces)
-        launch(kernels("adjoints").linearise, dim, [*given, torch.empty_like(at.normal), *taken], adjoints)
+        launch(kernels("shell_adjoint").linearise, dim, [*given, to_x, to_reference.elements, to_centre])
         self.spread(to_centre, to_x)
         off = at.moment * inverse(to.stiffness, to.stiffness <= 0)
         to_reference.stiffness.add_(to_moment * off + 0.5 * to_energy * off**2)
@@ -261,12 +258,10 @@ class _Merged:
         launch(module.sizes, (len(flat), max(shell.n_edges, shell.n_faces)), given)
         # All edges together, volume and area of each rest shape.
         lengths, volumes, areas = measured.unbind(-1)
-        sums, constant = shapes.new_zeros(*dim, 8), shapes.new_zeros(len(shapes))
-        launch(module.rest_sums, (weights.numel(), dim[1]), [*self._rest(shapes, weights, lengths, *stiffness), sums])
-        elements = shapes.new_empty(*dim, 7)
-        launch(module.merge, dim, [shell.constants, sums, elements, constant])
+        elements, constant = shapes.new_empty(*dim, 7), shapes.new_zeros(len(shapes))
+        launch(module.merge, dim, [*self._rest(shapes, weights, lengths, *stiffness), elements, constant])
         if kept is not None:
-            kept += [measured, sums]
+            kept += [measured, elements.detach()]
         return elements, volumes.clone(), torch.maximum(volumes.abs(), MIN_RELATIVE_VOLUME * areas**1.5), constant
 
     def _rest(self, shapes: Tensor, weights: Tensor, lengths: Tensor, *stiffness: Tensor) -> list[Any]:
@@ -279,24 +274,20 @@ class _Merged:
         (shapes, weights, *stiffness), (to_elements, to_volumes, to_sizes, _) = given, grads
         if not kept:
             self.run(kept, *given)
-        (measured, sums), shell, module = kept, self.shell, kernels("adjoints")
+        (measured, elements), shell = kept, self.shell
         lengths, volumes, areas = measured.unbind(-1)
-        to_sums = torch.zeros_like(sums)
-        merged = [shell.constants, sums, torch.empty_like(to_elements), None]
-        launch(module.merge, (len(shapes), shell.n_edges), merged, [None, to_sums, to_elements.clone(), None])
         found = to_shapes, to_weights, *to_stiffness = [torch.zeros_like(each) for each in given]
-        rest = [*self._rest(shapes, weights, lengths, *stiffness), torch.empty_like(sums)]
-        adjoints = [None, to_shapes, to_weights, None, *to_stiffness, None, None, None, to_sums]
-        launch(module.rest_sums, (weights.numel(), shell.n_edges), rest, adjoints)
+        rest = [*self._rest(shapes, weights, lengths, *stiffness), elements, to_elements]
+        merged = [*rest, to_shapes, to_weights, *to_stiffness]
+        launch(kernels("shell_adjoint").merge, (len(shapes), shell.n_edges), merged)
         least = MIN_RELATIVE_VOLUME * areas**1.5
         to_volumes = to_volumes + torch.where(volumes.abs() > least, volumes.sign() * to_sizes, 0)
         to_areas = torch.where(volumes.abs() > least, 0, 1.5 * MIN_RELATIVE_VOLUME * areas.sqrt() * to_sizes)
         flat, to_flat = shapes.flatten(0, 1), to_shapes.view(-1, *shapes.shape[2:])
         centre = shell.centre(flat)
         to_centre = None if centre is None else torch.zeros_like(centre)
-        to_measured = torch.stack([torch.zeros_like(to_areas), to_volumes, to_areas], -1)
-        sizes, adjoints = [shell.constants, flat, centre, measured], [None, to_flat, to_centre, to_measured]
-        launch(module.sizes, (len(flat), max(shell.n_edges, shell.n_faces)), sizes, adjoints)
+        sizes = [shell.constants, flat, centre, torch.stack([to_volumes, to_areas], -1), to_flat, to_centre]
+        launch(kernels("shell_adjoint").sizes, (len(flat), shell.n_faces), sizes)
         shell.spread(to_centre, to_flat)
         return tuple(found)
 

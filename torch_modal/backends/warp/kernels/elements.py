@@ -69,16 +69,14 @@ class Hinge:
     b: vec3
     n1: vec3
     n2: vec3
+    length: real
+    """Length of the edge."""
+    per_both: real
+    """One over the lengths of both normals."""
     per1: real
     """One over the square of a normal."""
     per2: real
     flat: bool
-
-
-@wp.func
-def is_flat(e: vec3, n: vec3):
-    bound = FLAT * wp.dot(e, e)
-    return wp.dot(n, n) <= bound * bound + TINY
 
 
 @wp.func
@@ -91,17 +89,21 @@ def hinge_of(x: wp.array(dtype=vec3), at: int, q: wp.vec4i):
     h.b = x[place(at, q[3])] - origin
     h.n1 = wp.cross(h.e, h.a)
     h.n2 = wp.cross(h.b, h.e)
-    h.per1 = real(1.0) / wp.max(wp.dot(h.n1, h.n1), TINIEST)
-    h.per2 = real(1.0) / wp.max(wp.dot(h.n2, h.n2), TINIEST)
-    h.flat = is_flat(h.e, h.n1) or is_flat(h.e, h.n2)
+    h.length = length_of(h.e)
+    square1 = wp.dot(h.n1, h.n1)
+    square2 = wp.dot(h.n2, h.n2)
+    h.per_both = real(1.0) / wp.sqrt(wp.max(square1 * square2, TINIEST))
+    h.per1 = h.per_both * h.per_both * square2
+    h.per2 = h.per_both * h.per_both * square1
+    bound = FLAT * wp.dot(h.e, h.e)
+    h.flat = wp.min(square1, square2) <= bound * bound + TINY
     return h
 
 
 @wp.func
 def phase_of(h: Hinge):
     """Cosine and sine of the dihedral angle of a hinge that is not flat."""
-    scale = wp.sqrt(h.per1 * h.per2)
-    return wp.vec2d(scale * wp.dot(h.n1, h.n2), -scale * length_of(h.e) * wp.dot(h.n1, h.b))
+    return h.per_both * wp.vec2d(wp.dot(h.n1, h.n2), -h.length * wp.dot(h.n1, h.b))
 
 
 @wp.func
@@ -113,10 +115,10 @@ def doubled(p: wp.vec2d):
 @wp.func
 def angle_gradients(h: Hinge):
     """Gradients of the dihedral angle in the edge and in both tips, of a hinge that is not flat."""
-    length = length_of(h.e)
-    ga = (-length * h.per1) * h.n1
-    gb = (-length * h.per2) * h.n2
-    ge = (real(-1.0) / wp.dot(h.e, h.e)) * (wp.dot(h.a, h.e) * ga + wp.dot(h.b, h.e) * gb)
+    ga = (-h.length * h.per1) * h.n1
+    gb = (-h.length * h.per2) * h.n2
+    per = real(1.0) / h.length
+    ge = (-per * per) * (wp.dot(h.a, h.e) * ga + wp.dot(h.b, h.e) * gb)
     return ge, ga, gb
 
 

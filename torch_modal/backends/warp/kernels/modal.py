@@ -9,6 +9,7 @@ from torch_modal.backends.warp.kernels.elements import (
     Elements,
     angle_gradients,
     bend_beyond,
+    bend_energy,
     bend_slope,
     corner,
     hinge_of,
@@ -20,7 +21,9 @@ from torch_modal.backends.warp.kernels.elements import (
     rested,
     vec3,
 )
+from torch_modal.energy.bend import NEEDLE
 
+NEEDLES = wp.constant(real(NEEDLE**2))
 wide = wp.types.vector(length=8, dtype=real)
 """A row's entries of eight columns."""
 three = wp.types.matrix(shape=(3, 8), dtype=real)
@@ -50,10 +53,10 @@ def jacobian(
     n_rows: int,
     out: wp.array(dtype=wide),
     entries: wp.array(dtype=real),
-    stiffness: wp.array(dtype=real),
+    totals: wp.array(dtype=wp.vec2d),
     threads: int,
 ):
-    """Change of each measure along the columns, and the measure's residual.
+    """Change of each measure along the columns, and the measure's residual; all stiffnesses and energies together.
 
     All by the root of its weight. The residual comes in the column after the last. A component of a vertex has a row of
     blocks of eight columns; those of the measures are the same memory twice.
@@ -62,6 +65,7 @@ def jacobian(
     s = i // threads
     v = s * mesh.n_vertices
     total = real(0.0)
+    energy = real(0.0)
     for k in range(i - s * threads, mesh.record.shape[0], threads):
         q = mesh.record[place(k, 0)]
         w = rests[place(s * mesh.record.shape[0], k)]
@@ -76,8 +80,10 @@ def jacobian(
             g = (root / length) * e
         for c in range(n_blocks):
             out[place(row * n_blocks, c)] = along_edge(columns, g, o, j, n_blocks, c)
-        entries[place(row * n_blocks * 8, n_columns)] = root * (length - w[1])
+        residual = root * (length - w[1])
+        entries[place(row * n_blocks * 8, n_columns)] = residual
         total += w[0]
+        energy += residual * residual
         if q[2] >= 0:
             row = s * n_rows + mesh.record.shape[0] + mesh.hinge[place(k, 0)]
             h = hinge_of(x, v, q)
@@ -86,12 +92,15 @@ def jacobian(
             gb = vec3()
             off = real(0.0)
             stiff = real(0.0)
+            phase = wp.vec2d(real(1.0), real(0.0))
             if not h.flat:
+                phase = phase_of(h)
                 stiff = wp.sqrt(w[2])
                 ge, ga, gb = angle_gradients(h)
                 if stiff > real(0.0):
-                    off = bend_slope(phase_of(h), w) / stiff
+                    off = bend_slope(phase, w) / stiff
                 total += w[2]
+            energy += bend_energy(phase, w)
             ge = stiff * ge
             ga = stiff * ga
             gb = stiff * gb
@@ -102,7 +111,41 @@ def jacobian(
                     + along_edge(columns, gb, o, 3 * n_blocks * q[3], n_blocks, c)
                 )
             entries[place(row * n_blocks * 8, n_columns)] = off
-    wp.atomic_add(stiffness, s, total)
+    wp.atomic_add(totals, s, wp.vec2d(total, HALF * energy))
+
+
+@wp.func
+def fullness(e: vec3, tip: vec3, normal: vec3):
+    """bend.fullness of one triangle."""
+    longest = wp.max(wp.dot(e, e), wp.max(wp.dot(tip, tip), wp.dot(tip - e, tip - e)))
+    squared = wp.dot(normal, normal)
+    found = real(0.0)
+    if longest > real(0.0):
+        found = squared / (squared + NEEDLES * longest * longest)
+    return found
+
+
+@wp.kernel(enable_backward=False)
+def soften(
+    mesh: Elements,
+    x: wp.array(dtype=vec3),
+    rests: wp.array(dtype=rested),
+    out: wp.array(dtype=rested),
+    threads: int,
+):
+    """References with less bending stiffness at the needles of shapes."""
+    i = wp.tid()
+    s = i // threads
+    v = s * mesh.n_vertices
+    for k in range(i - s * threads, mesh.record.shape[0], threads):
+        q = mesh.record[place(k, 0)]
+        at = place(s * mesh.record.shape[0], k)
+        w = rests[at]
+        if q[2] >= 0:
+            h = hinge_of(x, v, q)
+            f = fullness(h.e, h.a, h.n1) * fullness(h.e, h.b, h.n2)
+            w = rested(w[0], w[1], f * w[2], f * w[3], f * w[4], f * w[5], f * w[6])
+        out[at] = w
 
 
 @wp.func

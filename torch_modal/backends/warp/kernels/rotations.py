@@ -1,10 +1,11 @@
 """Triangles that turn between two shapes, or along a trajectory."""
 
+from math import factorial
+
 import warp as wp
 
 from torch_modal.backends.warp.kernels.elements import (
     HALF,
-    SIXTH,
     TINIEST,
     TINY,
     length_of,
@@ -25,6 +26,11 @@ FLAT = wp.constant(real(triangle_frames.FLAT))
 HEIGHT = wp.constant(real(triangle_frames.HEIGHT))
 PER_HEIGHT = wp.constant(real(1 / triangle_frames.HEIGHT))
 SMALL = wp.constant(real(rotations.SMALL))
+
+ten, five = wp.types.vector(length=10, dtype=real), wp.types.vector(length=5, dtype=real)
+SINC = wp.constant(ten(*[(-1) ** k / factorial(2 * k + 1) for k in range(10)]))
+COSINE = wp.constant(ten(*[(-1) ** k / factorial(2 * k) for k in range(10)]))
+ARC = wp.constant(five(*[(-1) ** k / (2 * k + 1) for k in range(5)]))
 
 
 @wp.struct
@@ -65,11 +71,11 @@ def triangle(p: vec3, q: vec3, r: vec3):
     xy = wp.dot(one, other)
     yy = wp.dot(other, other)
     total = wp.max(xx + yy, TINY)
-    up = (real(1.0) / total) * wp.cross(one, other)
-    area = wp.max(length_of(up), FLAT)
-    t.flat = area <= FLAT
-    t.normal = (real(1.0) / area) * up
-    lift = area * total
+    up = wp.cross(one, other)
+    lift = length_of(up)
+    t.flat = lift <= FLAT * total
+    lift = wp.max(lift, FLAT * total)
+    t.normal = (real(1.0) / lift) * up
     per = real(1.0) / wp.sqrt(total + real(2.0) * lift)
     t.xx = per * (xx + lift)
     t.xy = per * xy
@@ -168,9 +174,13 @@ def sign_votes(
                 own = -own
         sign[at] = own
         wp.atomic_add(vote, place(s * surface.n_pieces, surface.piece[place(k, 0)]), areas[at] * own * q[0])
-    for k in range(n):
-        if vote[place(s * surface.n_pieces, surface.piece[place(k, 0)])] < real(0.0):
-            sign[place(s * n, k)] = -sign[place(s * n, k)]
+    least = real(0.0)
+    for k in range(surface.n_pieces):
+        least = wp.min(least, vote[place(s * surface.n_pieces, k)])
+    if least < real(0.0):
+        for k in range(n):
+            if vote[place(s * surface.n_pieces, surface.piece[place(k, 0)])] < real(0.0):
+                sign[place(s * n, k)] = -sign[place(s * n, k)]
 
 
 @wp.func
@@ -180,23 +190,20 @@ def rotated(real_part: real, axis: vec3, v: vec3):
 
 
 @wp.func
-def sinc(squared_angle: real):
-    """Of the square: with all derivatives at zero, by a series."""
-    z = squared_angle
-    found = real(1.0) - SIXTH * z * (real(1.0) - z / real(20.0) * (real(1.0) - z / real(42.0)))
-    if z >= SMALL:
-        angle = wp.sqrt(z)
-        found = wp.sin(angle) / angle
+def sinc_near(z: real):
+    """Series of ``sin r / r`` in the square of an ``r`` of at most one."""
+    found = SINC[9]
+    for k in range(9):
+        found = found * z + SINC[8 - k]
     return found
 
 
 @wp.func
-def cosine(squared_angle: real):
-    """Likewise."""
-    z = squared_angle
-    found = real(1.0) - HALF * z * (real(1.0) - z / real(12.0) * (real(1.0) - z / real(30.0)))
-    if z >= SMALL:
-        found = wp.cos(wp.sqrt(z))
+def cosine_near(z: real):
+    """Series of ``cos r``, likewise."""
+    found = COSINE[9]
+    for k in range(9):
+        found = found * z + COSINE[8 - k]
     return found
 
 
@@ -207,15 +214,12 @@ def half_turn(q: vec4):
     sine = wp.dot(axis, axis)
     factor = real(0.0)
     if sine < SMALL * q[0] * q[0] and q[0] > real(0.0):
-        t = sine / (q[0] * q[0])
-        factor = (
-            real(1.0)
-            - t
-            * (
-                real(1.0) / real(3.0)
-                - t * (real(1.0) / real(5.0) - t * (real(1.0) / real(7.0) - t * real(1.0) / real(9.0)))
-            )
-        ) / q[0]
+        per = real(1.0) / q[0]
+        t = sine * per * per
+        factor = ARC[4]
+        for k in range(4):
+            factor = factor * t + ARC[3 - k]
+        factor = factor * per
     else:
         root = wp.sqrt(wp.max(sine, TINIEST))
         factor = wp.atan2(root, q[0]) / root
@@ -236,8 +240,16 @@ def add_sides(total: wp.array(dtype=vec4), edge: int, e: wp.vec3i, g: vec3, area
 def about(half: vec3):
     """The quaternion that turns about an axis by twice its length."""
     z = wp.dot(half, half)
-    sine = sinc(z)
-    return vec4(cosine(z), sine * half[0], sine * half[1], sine * half[2])
+    real_part = real(0.0)
+    factor = real(0.0)
+    if z < real(1.0):
+        real_part = cosine_near(z)
+        factor = sinc_near(z)
+    else:
+        angle = wp.sqrt(z)
+        real_part = wp.cos(angle)
+        factor = wp.sin(angle) / angle
+    return vec4(real_part, factor * half[0], factor * half[1], factor * half[2])
 
 
 @wp.func
@@ -322,6 +334,68 @@ def part_turned(
         wp.atomic_add(pulls, place(to, f[0]), s3 - s1)
         wp.atomic_add(pulls, place(to, f[1]), s1 - s2)
         wp.atomic_add(pulls, place(to, f[2]), s2 - s3)
+
+
+@wp.kernel(enable_backward=False)
+def volumes(surface: FaceTables, x: wp.array(dtype=vec3), found: wp.array(dtype=real), threads: int):
+    """Six times the volume, of a surface without boundary."""
+    i = wp.tid()
+    s = i // threads
+    v = s * surface.n_vertices
+    total = real(0.0)
+    for k in range(i - s * threads, surface.faces.shape[0], threads):
+        q = surface.faces[place(k, 0)]
+        total += wp.dot(x[place(v, q[0])], wp.cross(x[place(v, q[1])], x[place(v, q[2])]))
+    wp.atomic_add(found, s, total)
+
+
+# --------------------------------------------------------------------------------------------------------------- poses
+@wp.func
+def best_rotation(covariance: wp.mat33d):
+    """rigid.best_rotation."""
+    largest = real(0.0)
+    for i in range(3):
+        for j in range(3):
+            largest = wp.max(largest, wp.abs(covariance[i, j]))
+    if largest > real(0.0):
+        covariance = covariance / largest
+    u, _, v = wp.svd3(covariance)  # both of determinant one, and the singular value of least size may be negative
+    return u @ wp.transpose(v)
+
+
+@wp.func
+def matrix_of(q: vec4):
+    x = first_axis(q)
+    y = second_axis(q)
+    return wp.matrix_from_cols(x, y, wp.cross(x, y))
+
+
+@wp.func
+def half_of(rotation: wp.mat33d):
+    """Axis times half the angle, which is at most a right angle."""
+    q = quaternion_of(rotation)
+    if q[0] < real(0.0):
+        q = -q
+    return half_turn(q)
+
+
+@wp.kernel(enable_backward=False)
+def mean_pose(
+    to_reference: wp.array(dtype=wp.mat33d),
+    among: wp.array(dtype=wp.mat33d),
+    weights: wp.array(dtype=wp.vec2d),
+    turns: wp.array(dtype=wp.mat33d),
+    pose: wp.array(dtype=wp.mat33d),
+):
+    """procrustes.mean_pose of two shapes."""
+    s = wp.tid()
+    w = weights[s]
+    onto = best_rotation(among[4 * s + 1])
+    back = wp.transpose(onto)
+    first = best_rotation(w[0] * to_reference[2 * s] + w[1] * to_reference[2 * s + 1] @ back)
+    turns[2 * s] = first
+    turns[2 * s + 1] = first @ onto
+    pose[s] = matrix_of(about(w[1] * half_of(back))) @ wp.transpose(first)
 
 
 @wp.kernel(enable_backward=False)

@@ -6,7 +6,7 @@ A part ``exp(t log R)`` of a rotation turns by ``J(t theta) (t dtheta + theta dt
 
 import warp as wp
 
-from torch_modal.backends.warp.kernels.elements import HALF, place, real, vec3, vec4
+from torch_modal.backends.warp.kernels.elements import HALF, TINIEST, place, real, vec3, vec4
 from torch_modal.backends.warp.kernels.rotations import (
     HEIGHT,
     PER_HEIGHT,
@@ -15,14 +15,16 @@ from torch_modal.backends.warp.kernels.rotations import (
     Triangle,
     about,
     at_sides,
+    half_of,
     half_turn,
     quaternion,
-    sinc,
+    sinc_near,
     triangle_of,
     turned,
 )
 
 NO_LENGTH = wp.constant(real(1e-70))
+EPSILON = wp.constant(real(64 * 2.0**-52))
 
 
 @wp.func
@@ -35,7 +37,7 @@ def sinc_of(q: vec4, half: vec3):
     """Of the length of ``half``, about which the quaternion turns by twice that."""
     squared = wp.dot(half, half)
     if squared < SMALL:
-        return sinc(squared)
+        return sinc_near(squared)
     return wp.dot(vec3(q[1], q[2], q[3]), half) / squared
 
 
@@ -150,3 +152,60 @@ def from_turned(
         wp.atomic_add(to_shapes, place(other, f[1]), one)
         wp.atomic_add(to_shapes, place(other, f[2]), two)
     wp.atomic_add(to_weights, s, to_w)
+
+
+# --------------------------------------------------------------------------------------------------------------- poses
+@wp.func
+def torque_of(m: wp.mat33d):
+    """Torque on a small turn before a matrix, from the gradient of the product times the transpose of the product."""
+    return vec3(m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1])
+
+
+@wp.func
+def to_covariance(covariance: wp.mat33d, rotation: wp.mat33d, torque: vec3):
+    """Adjoint of ``rotations.best_rotation``, with the floor of rigid.best_rotation."""
+    p = covariance @ wp.transpose(rotation)
+    trace = wp.trace(p)
+    floor = EPSILON * wp.abs(trace)
+    if wp.abs(trace) <= TINIEST:
+        floor = real(1.0)
+    hessian = (trace + floor) * wp.identity(n=3, dtype=real) - HALF * (p + wp.transpose(p))
+    return wp.skew(wp.inverse(hessian) @ torque) @ rotation
+
+
+@wp.kernel(enable_backward=False)
+def mean_pose(
+    to_reference: wp.array(dtype=wp.mat33d),
+    among: wp.array(dtype=wp.mat33d),
+    weights: wp.array(dtype=wp.vec2d),
+    turns: wp.array(dtype=wp.mat33d),
+    pose: wp.array(dtype=wp.mat33d),
+    to_turns: wp.array(dtype=wp.mat33d),
+    to_pose: wp.array(dtype=wp.mat33d),
+    to_covariances: wp.array(dtype=wp.mat33d),
+    to_among: wp.array(dtype=wp.mat33d),
+    to_weights: wp.array(dtype=wp.vec2d),
+):
+    """Adjoint of ``rotations.mean_pose``."""
+    s = wp.tid()
+    w = weights[s]
+    a = to_reference[2 * s]
+    first = turns[2 * s]
+    second = turns[2 * s + 1]
+    onto = wp.transpose(first) @ second
+    back = wp.transpose(onto)
+    b = to_reference[2 * s + 1] @ back
+    # A rotation changes by a small turn about fixed axes, and receives a torque.
+    torque = torque_of(to_pose[s] @ wp.transpose(pose[s]))
+    half = half_of(back)
+    whole = about(half)
+    from_part = reached(whole, half, about(w[1] * half), w[1], torque)
+    from_second = torque_of(to_turns[2 * s + 1] @ wp.transpose(second))
+    to_first = torque_of(to_turns[2 * s] @ wp.transpose(first)) + from_second - wp.transpose(pose[s]) @ torque
+    to_onto = wp.transpose(first) @ from_second - onto @ from_part
+    to_sum = to_covariance(w[0] * a + w[1] * b, first, to_first)
+    to_onto -= w[1] * torque_of(wp.transpose(b) @ to_sum)
+    to_covariances[2 * s] = w[0] * to_sum
+    to_covariances[2 * s + 1] = w[1] * to_sum @ onto
+    to_among[4 * s + 1] = to_covariance(among[4 * s + 1], onto, to_onto)
+    to_weights[s] = wp.vec2d(wp.ddot(to_sum, a), wp.ddot(to_sum, b) + real(2.0) * wp.dot(torque, half))

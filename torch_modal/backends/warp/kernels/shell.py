@@ -7,7 +7,6 @@ from torch_modal.backends.warp.kernels.elements import (
     HALF,
     SIXTH,
     TINIEST,
-    TINY,
     Elements,
     Hinge,
     angle_gradients,
@@ -36,8 +35,6 @@ SLACKNESS = wp.constant(real(SLACK))
 RATIO = wp.constant(real(MAX_BENDING_RATIO))
 STRAIN = wp.constant(real(LARGEST_STRAIN))
 WEIGHT = wp.constant(real(LARGEST_WEIGHT))
-summed = wp.types.vector(length=8, dtype=real)
-"""Sums over rest shapes: weights of an edge, then those times its length and its square; then the moments."""
 
 
 # -------------------------------------------------------------------------------------------------------- rest shapes
@@ -58,11 +55,10 @@ def sizes(
     area = real(0.0)
     for k in range(i - s * threads, mesh.capped_faces.shape[0], threads):
         face = mesh.capped_faces[place(k, 0)]
-        a = x[place(v, face[0])] - middle
-        b = x[place(v, face[1])] - middle
-        c = corner(x, middle, v, face[2]) - middle
-        volume += SIXTH * wp.dot(a, wp.cross(b, c))
-        area += HALF * length_of(wp.cross(b - a, c - a))
+        a = x[place(v, face[0])]
+        normal = wp.cross(x[place(v, face[1])] - a, corner(x, middle, v, face[2]) - a)
+        volume += SIXTH * wp.dot(a - middle, normal)
+        area += HALF * length_of(normal)
     wp.atomic_add(found, s, vec3(length, volume, area))
 
 
@@ -71,11 +67,11 @@ def bend_weight(h: Hinge, largest: real):
     """Square of the edge over the area of both triangles, bounded."""
     base = wp.dot(h.e, h.e)
     area = HALF * (length_of(h.n1) + length_of(h.n2))
-    return base / wp.max(area, base / largest)
+    return wp.min(base / area, largest)
 
 
 @wp.kernel(enable_backward=False)
-def rest_sums(
+def merge(
     mesh: Elements,
     x: wp.array(dtype=vec3),
     pulls: wp.array(dtype=real),
@@ -85,62 +81,46 @@ def rest_sums(
     n_shapes: int,
     n_alpha: int,
     n_beta: int,
-    out: wp.array(dtype=summed),
-    threads: int,
-):
-    """Sums over the K rest shapes of each sample, one thread or more for each. Weights are doubled."""
-    i = wp.tid()
-    s = i // threads
-    v = s * mesh.n_vertices
-    sample = s // n_shapes
-    for k in range(i - s * threads, mesh.record.shape[0], threads):
-        q = mesh.record[place(k, 0)]
-        pull = real(2.0) * pulls[s]
-        length = length_of(x[place(v, q[1])] - x[place(v, q[0])])
-        edge = vec3()
-        if length > shortest[s]:
-            own = pull * alpha[place(sample * n_alpha, wp.min(k, n_alpha - 1))]
-            edge = own * vec3(real(1.0) / length, real(1.0), length)
-        bend = moments()
-        if q[2] >= 0:
-            h = hinge_of(x, v, q)
-            if not h.flat:
-                own = pull * beta[place(sample * n_beta, wp.min(mesh.hinge[place(k, 0)], n_beta - 1))]
-                p = phase_of(h)
-                t = doubled(p)
-                bend = (own * bend_weight(h, RATIO)) * moments(real(1.0), p[0], p[1], t[0], t[1])
-        found = summed(edge[0], edge[1], edge[2], bend[0], bend[1], bend[2], bend[3], bend[4])
-        wp.atomic_add(out, place(sample * mesh.record.shape[0], k), found)
-
-
-@wp.kernel(enable_backward=False)
-def merge(
-    mesh: Elements,
-    sums: wp.array(dtype=summed),
     out: wp.array(dtype=rested),
     constant: wp.array(dtype=real),
     threads: int,
 ):
-    """K rest shapes as one reference (Eq. 8), and the energy of the edges that remains, where it is wanted."""
+    """K rest shapes of each sample as one reference (Eq. 8), and the energy of the edges that remains."""
     i = wp.tid()
     s = i // threads
     left = real(0.0)
     for k in range(i - s * threads, mesh.record.shape[0], threads):
-        at = place(s * mesh.record.shape[0], k)
-        w = sums[at]
+        q = mesh.record[place(k, 0)]
+        # Sums of weights, and of those times the length and its square.
+        edge = vec3()
+        bend = moments()
+        hard = real(2.0) * alpha[place(s * n_alpha, wp.min(k, n_alpha - 1))]
+        stiff = real(0.0)
+        if q[2] >= 0:
+            stiff = real(2.0) * beta[place(s * n_beta, wp.min(mesh.hinge[place(k, 0)], n_beta - 1))]
+        for r in range(s * n_shapes, (s + 1) * n_shapes):
+            v = r * mesh.n_vertices
+            pull = pulls[place(r, 0)]
+            length = length_of(x[place(v, q[1])] - x[place(v, q[0])])
+            if length > shortest[place(r, 0)]:
+                own = pull * hard
+                edge += own * vec3(real(1.0) / length, real(1.0), length)
+            if q[2] >= 0:
+                h = hinge_of(x, v, q)
+                if not h.flat:
+                    p = phase_of(h)
+                    t = doubled(p)
+                    bend += (pull * stiff * bend_weight(h, RATIO)) * moments(real(1.0), p[0], p[1], t[0], t[1])
         # Weights below zero may outweigh the others: then there is no minimum, and no weight.
-        weight = real(0.0)
-        length = real(0.0)
-        if w[0] > real(0.0):
-            weight = w[0]
-            length = w[1] / w[0]
-            left += w[2] - w[1] * length
-        counts = real(0.0)
-        if w[3] > real(0.0):
-            counts = real(1.0)
-        out[at] = rested(weight, length, counts * w[3], counts * w[4], counts * w[5], counts * w[6], counts * w[7])
-    if constant:
-        wp.atomic_add(constant, s, HALF * left)
+        rest = real(0.0)
+        if edge[0] > real(0.0):
+            rest = edge[1] / edge[0]
+            left += edge[2] - edge[1] * rest
+        if bend[0] <= real(0.0):
+            bend = moments()
+        weight = wp.max(edge[0], real(0.0))
+        out[place(s * mesh.record.shape[0], k)] = rested(weight, rest, bend[0], bend[1], bend[2], bend[3], bend[4])
+    wp.atomic_add(constant, s, HALF * left)
 
 
 # --------------------------------------------------------------------------------------------------------- the energy
@@ -148,18 +128,17 @@ def merge(
 def enclosed(x: wp.array(dtype=vec3), middle: vec3, q: wp.vec3i, at: int, gradient: wp.array(dtype=vec3)):
     """The volume of the tetrahedron from the middle, a vertex of -1, to a triangle.
 
-    Its gradient, where the middle stays, is added where there is an array for it.
+    The gradient of all together, where the middle stays, is added where there is an array for it: the triangles around
+    a vertex close, so that each gives a sixth of its normal to its corners.
     """
-    a = x[place(at, q[0])] - middle
-    b = x[place(at, q[1])] - middle
-    c = corner(x, middle, at, q[2]) - middle
-    bc = wp.cross(b, c)
+    a = x[place(at, q[0])]
+    normal = SIXTH * wp.cross(x[place(at, q[1])] - a, corner(x, middle, at, q[2]) - a)
     if gradient:
-        wp.atomic_add(gradient, place(at, q[0]), SIXTH * bc)
-        wp.atomic_add(gradient, place(at, q[1]), SIXTH * wp.cross(c, a))
+        wp.atomic_add(gradient, place(at, q[0]), normal)
+        wp.atomic_add(gradient, place(at, q[1]), normal)
         if q[2] >= 0:
-            wp.atomic_add(gradient, place(at, q[2]), SIXTH * wp.cross(a, b))
-    return SIXTH * wp.dot(a, bc)
+            wp.atomic_add(gradient, place(at, q[2]), normal)
+    return wp.dot(a - middle, normal)
 
 
 @wp.kernel(enable_backward=False)
@@ -210,9 +189,7 @@ def linearise(
         q1 = place(v, q[1])
         e = x[q1] - x[q0]
         length = length_of(e)
-        per_length = real(0.0)
-        if wp.dot(e, e) > TINY:
-            per_length = real(1.0) / length
+        per_length = real(1.0) / length
         slope = w[0] * (length - w[1])
         own += slope * (length - w[1])
         unit = per_length * e
@@ -243,7 +220,7 @@ def linearise(
             wp.atomic_add(gradient, q1, slope * unit + moment * ge)
         if diagonal:
             width = SLACKNESS * w[0] * length
-            across = HALF * (slope + wp.sqrt(slope * slope + width * width + TINIEST)) / length
+            across = HALF * per_length * (slope + wp.sqrt(slope * slope + width * width + TINIEST))
             along = w[0] - across
             block = along * squared(unit) + symmetric(across, real(0.0), real(0.0), across, real(0.0), across)
             wp.atomic_add(diagonal, q0, block + stiffness * squared(gi))

@@ -1,0 +1,28 @@
+"""Volumes of closed shapes, to tell mirror images."""
+
+import torch
+from torch import Tensor, nn
+
+from torch_modal.geometry.connectivity import Connectivity
+from torch_modal.geometry.vectors import cross, pick
+
+
+class Volumes(nn.Module):
+    """Signed volumes, times six and without gradient, of shapes without boundary.
+
+    Args:
+        mesh: Their connectivity.
+    """
+
+    corners: Tensor
+
+    def __init__(self, mesh: Connectivity) -> None:
+        super().__init__()
+        #: Of the faces. *Shape:* ``(3, F)``.
+        self.register_buffer("corners", torch.tensor(mesh.faces).T.contiguous(), persistent=False)
+
+    def forward(self, shapes: Tensor) -> Tensor:
+        """Compute. *Shape:* ``(B, K, V, 3) -> (B, K)``."""
+        rows = shapes.detach().mT.contiguous()
+        a, b, c = (pick(rows, corner).movedim(2, 0) for corner in self.corners)
+        return (a * cross(b, c)).sum((0, -1))
