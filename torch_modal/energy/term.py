@@ -171,7 +171,10 @@ class Term(nn.Module):
         return self._each(jacrev(self.measure), edge_vectors)
 
     def linearised(self, edge_vectors: Tensor) -> tuple[Tensor, Tensor]:
-        """The measures and their gradients, for terms in which both share work. *Shape:* ``(n-1, 3, ..., M)``."""
+        """The measures and their gradients; overridden, with these, where both share work.
+
+        *Shape:* ``(n-1, 3, ..., M) -> (..., M), (n-1, 3, ..., M)``.
+        """
         return self.measures(edge_vectors), self.gradients(edge_vectors)
 
     def hessians(self, edge_vectors: Tensor) -> Tensor:
