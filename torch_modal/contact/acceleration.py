@@ -10,16 +10,19 @@ at each time and vertex. Both are second differences of consecutive shapes, in t
 import torch
 from torch import Tensor
 
+from torch_modal.contact.detect import REACH
+
 ROOM = 1.27
 """Largest acceleration of a vertex, times that of the trajectory."""
-LEAST_LIMIT = 30.0
-"""Smallest bound, at a diagonal of 100 and a duration of 1: a straight trajectory must bend, too."""
-ROUNDS = 200
+LEAST_LIMIT = 8 * 100 * REACH
+"""Smallest bound, at a diagonal of 100 and a duration of 1: that of a parabola as high as the reach of contacts."""
+ROUNDS = 400
 """Most iterations of :meth:`AccelerationLimit.nearest`."""
 TOLERANCE = 0.01
 """Relative tolerance of the bound at which the iteration stops."""
 RELAXATION = 1.7
-PENALTY = 0.5
+PENALTY = 3.0
+"""Of accelerations. Less does not converge with weights; with more, the first result within the bound is far off."""
 
 
 class AccelerationLimit:
@@ -51,15 +54,13 @@ class AccelerationLimit:
         #: Accelerations of a displacement from its values at each time. *Shape:* ``(N, T)``.
         self.differences = torch.cat([second, *(2 * each[1:-1][i][None] for i in ends)])
         self.rotations = rotations.double()
-        least = LEAST_LIMIT / (len(x) - 1) ** 2
-        self.most = max(ROOM * float(own.norm(dim=-1).max()), least) if most is None else most
+        self.most = most or max(ROOM * float(own.norm(dim=-1).max()), LEAST_LIMIT / (len(x) - 1) ** 2)
 
-    def nearest(self, wanted: Tensor) -> tuple[Tensor, Tensor]:
+    def nearest(self, wanted: Tensor, weights: Tensor | float = 1.0) -> tuple[Tensor, Tensor]:
         """Find the displacement nearest to a wanted one, in least squares, that keeps each vertex below the bound.
 
-        It is a convex problem for each vertex, solved by the alternating direction method of multipliers (Boyd et al.
-        2011). Vertices below the bound stay as they are; the others are returned, too.
-        *Shape:* ``(T, V, 3) -> (T, V, 3), (m,)``.
+        A convex problem for each vertex, solved by the alternating direction method of multipliers (Boyd et al. 2011).
+        Vertices below the bound stay; the others are returned, too. *Shape:* ``(T, V, 3), (T,) -> (T, V, 3), (m,)``.
         """
         rows, seen = self.differences, torch.einsum("tij,tvj->tvi", self.rotations, wanted.double())
         added = self.trajectory + torch.tensordot(rows, seen, 1)
@@ -68,9 +69,10 @@ class AccelerationLimit:
             return wanted, own
         # Components before vertices: sums of three long rows are fast.
         goal, trajectory = (x[:, own].movedim(-1, 1).flatten(1) for x in (seen, self.trajectory))
-        inverse = torch.linalg.inv(torch.eye(rows.shape[1]).to(rows) + PENALTY * rows.T @ rows)
+        metric = torch.eye(rows.shape[1]).to(rows) * weights
+        inverse = torch.linalg.inv(metric + PENALTY * rows.T @ rows)
         # The displacement, and its accelerations, of the accelerations that it is pulled to.
-        pull, freely = PENALTY * inverse @ rows.T, inverse @ goal
+        pull, freely = PENALTY * inverse @ rows.T, inverse @ metric @ goal
         reach, rest = rows @ pull, rows @ freely + trajectory
         split, dual = self._clipped(rows @ goal + trajectory), torch.zeros_like(trajectory)
         for _ in range(ROUNDS):

@@ -34,8 +34,8 @@ PULL = 40.0
 """Stiffness of the pull to the bounded displacement, by area; a contact has 3,000."""
 MOST_MOVED = 3.0
 """Largest displacement of a vertex of a shape alone, times the depth of its contacts."""
-FADE = 0.0625
-"""Duration over which the displacement is faded out beside a shape that it makes worse, at first."""
+GROWTH, MOST_WEIGHT = 3.0, 1e5
+"""Growth of the weight that keeps a worse shape where it was, and the weight from which it does not move at all."""
 
 
 class Timeline(NamedTuple):
@@ -161,19 +161,17 @@ def _energies(active: Contacts, pull: Pull, areas: Tensor) -> Beside:
 def _never_worse(
     start: Tensor, field: Tensor, search: ContactSearch, timeline: Timeline, n_before: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Shapes and their far pairs, with the displacement faded out, farther and farther, where it adds some."""
-    t, found, reach, bad = timeline.t, field, FADE, torch.zeros_like(n_before, dtype=torch.bool)
-    while reach <= 1:
+    """Shapes and their far pairs, with less and less of the displacement at the times where it adds some."""
+    # The others keep as much of it as the bound allows: if it faded out beside them, they would be worse in turn.
+    found, weights = field, torch.ones_like(field[:, 0, 0])
+    while True:
         n_far = search.count(start + found)
         worse = n_far > n_before
         if not bool(worse.any()):
             return start + found, n_far
-        if not bool((worse & ~bad).any()):
-            reach = 2 * reach
-        bad = bad | worse
-        distance = ((t[:, None] - t[bad]).abs().amin(1) / reach).clamp_max(1)
-        found, _ = timeline.limit.nearest(field * (distance**2 * (3 - 2 * distance))[:, None, None])
-    return start, n_before
+        weights = torch.where(worse, GROWTH * weights, weights)
+        found, _ = timeline.limit.nearest(field * (weights == 1)[:, None, None], weights)
+        found = found * (weights < MOST_WEIGHT)[:, None, None]
 
 
 def through(times: Tensor, t: Tensor) -> Tensor:
