@@ -288,7 +288,7 @@ def test_a_displacement_is_reduced_where_it_makes_shapes_worse() -> None:
         assert float(found[12].min()) == (len(worse) < n)
 
 
-def test_a_displacement_that_makes_a_shape_worse_is_not_applied(hand: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pairs_that_a_displacement_adds_in_between_are_counted(hand: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
     push_apart = path_module.push_apart
 
     def folding(core: Any, x: Tensor, u: Tensor, *given: Any) -> contact_layer.Displacement:
@@ -302,9 +302,9 @@ def test_a_displacement_that_makes_a_shape_worse_is_not_applied(hand: Shapes, mo
     with torch.no_grad():
         plain = tm.Path(hand.bases, hand.faces)(hand.keyframes, t)
         monkeypatch.setattr(path_module, "push_apart", folding)
-        kept, solution = tm.Path(hand.bases, hand.faces, contact=True).solve(hand.keyframes, t)[:2]
-    torch.testing.assert_close(kept, plain, rtol=0, atol=1e-9)
-    assert solution.n_crossing is not None and solution.n_crossing.tolist() == far(plain, hand).tolist()
+        folded, solution = tm.Path(hand.bases, hand.faces, contact=True).solve(hand.keyframes, t)[:2]
+    after = far(folded, hand)
+    assert bool((after > far(plain, hand)).all()) and solution.n_crossing.tolist() == after.tolist()
 
 
 def test_contacts_of_earlier_rounds_stay_active(fists: Shapes) -> None:
@@ -317,7 +317,7 @@ def test_contacts_of_earlier_rounds_stay_active(fists: Shapes) -> None:
 @pytest.mark.parametrize(
     ("files", "most"),
     [
-        (("mh-hand/02-fist.obj", "mh-hand/04-spread.obj"), 0.3),
+        (("mh-hand/02-fist.obj", "mh-hand/04-spread.obj"), 0.32),
         pytest.param(("mh-woman/02-walk-a.obj", "mh-woman/03-walk-b.obj"), 0.22, marks=pytest.mark.slow),
     ],
     ids=["fist", "walk"],
@@ -325,28 +325,37 @@ def test_contacts_of_earlier_rounds_stay_active(fists: Shapes) -> None:
 def test_few_shapes_stay_beside_keyframes_that_intersect_themselves(
     data_dir: Path, files: tuple[str, str], most: float
 ) -> None:
-    """Shapes that contact would make worse stay nearly as they are; the others are separated all the same."""
+    """Shapes that contact would make worse stay nearly as they are; the others are separated all the same.
+
+    Between the times that are searched, the displacement is as smooth as at these, and what it leaves is counted.
+    """
     keyframes, faces = tm.load_keyframes([data_dir / name for name in files])
     own = Shapes(keyframes, faces, tm.extract_bases(keyframes, faces, 30, progress=False))
-    t = torch.linspace(0, 1, 33, dtype=DOUBLE)
+    t = torch.linspace(0, 1, 97, dtype=DOUBLE)
     with torch.no_grad():
-        plain, pushed = (tm.Path(own.bases, faces, contact=contact)(keyframes, t) for contact in (False, True))
+        plain = tm.Path(own.bases, faces)(keyframes, t)
+        pushed, solution, *_ = tm.Path(own.bases, faces, contact=True).solve(keyframes, t)
     before, after = far(plain, own), far(pushed, own)
-    assert bool((after <= before).all())
-    assert int(after.sum()) <= most * int(before.sum())
-    assert peak_acceleration(pushed) < 1.3 * peak_acceleration(plain)
+    assert solution.n_crossing.tolist() == after.tolist()
+    assert bool((after <= before)[::3].all())
+    for some in (slice(None), slice(None, None, 3)):
+        assert int(after[some].sum()) <= most * int(before[some].sum())
+    assert peak_acceleration(pushed[::3]) < 1.3 * peak_acceleration(plain[::3])
+    # Not of the shapes: those of the fist jump without contact, too. It was 90 and 40 times as much with jumps.
+    displacement = pushed - plain
+    assert 9 * peak_acceleration(displacement) < 2 * peak_acceleration(displacement[::3])
 
 
 @pytest.mark.slow
-def test_no_shape_of_a_path_is_made_worse(frogs: Shapes) -> None:
+def test_no_shape_of_a_path_is_made_worse_at_searched_times(frogs: Shapes) -> None:
     shapes = frogs.pick(1, 2)
-    t = torch.linspace(0.06, 0.97, 9, dtype=DOUBLE)
+    t = torch.arange(3, 64, 7, dtype=DOUBLE) / 64  # every other one is searched
     with torch.no_grad():
         plain = tm.Path(shapes.bases, shapes.faces)(shapes.keyframes, t)
         pushed, solution = tm.Path(shapes.bases, shapes.faces, contact=True).solve(shapes.keyframes, t)[:2]
     before, after = far(plain, shapes), far(pushed, shapes)
-    assert int(before.max()) > 0 and bool((after <= before).all())
-    assert solution.n_crossing.tolist() in (after.tolist(), [0] * 9)
+    assert int(before.max()) > 0 and bool((after <= before)[1::2].all())
+    assert solution.n_crossing.tolist() == after.tolist()
 
 
 def test_what_contact_needs_is_said_before_any_work(hand: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:

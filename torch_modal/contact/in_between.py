@@ -72,16 +72,15 @@ class Displacement(NamedTuple):
     def apply(self, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
         """Displace shapes at any times, by a spline between those of the field; and the far pairs left in each.
 
-        A shape that would have more far pairs stays as it is. The gradient reaches shapes and times; the field is a
-        constant. *Shape:* ``(B, V, 3), (B,) -> (B, V, 3), (B,)``.
+        The gradient reaches shapes and times; the field is a constant. *Shape:* ``(B, V, 3), (B,) -> (B, V, 3), (B,)``.
         """
         if self.field is None:
             return x, torch.zeros_like(u, dtype=torch.int64)
         if torch.equal(u, self.times) and not u.requires_grad:
             return x + self.field, self.n_crossing
+        # Not undone where it adds some in between: the motion would jump.
         found = x + torch.tensordot(through(self.times, u), self.field, 1)
-        before, after = self.search.count(x), self.search.count(found)
-        return torch.where((after <= before)[:, None, None], found, x), torch.minimum(after, before)
+        return found, self.search.count(found)
 
 
 @torch.no_grad()
@@ -115,7 +114,7 @@ def push_apart(
     search = contact_search(core, ends[0], len(u))
     timeline = Timeline(u, limit, in_modes if isinstance(core.space, JointSpace) else None)
     pushed, n_crossing = separate(x, _steps(core, rests), search, timeline)
-    field = None if pushed is x else pushed - x
+    field = pushed - x if pushed is not x or bool(n_crossing.any()) else None
     return Displacement(field, u, n_crossing, contact_search(core, ends[0], 1))
 
 
