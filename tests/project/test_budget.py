@@ -21,10 +21,10 @@ import torch
 import torch_modal as tm
 
 BOUNDS = {
-    "lines": 27743,
-    "lines of code": 17796,
+    "lines": 27755,
+    "lines of code": 17804,
     "files": 198,
-    "functions": 1507,
+    "functions": 1508,
     "named tuples": 52,
     "docstrings that begin with no noun": 11,
     "functions of in-between": 128,

@@ -58,8 +58,12 @@ class SparseSolver:
 
     def __init__(self, matrix: sparse.spmatrix, free: IntArray | None = None) -> None:
         self.n = matrix.shape[0]
-        self.free = np.arange(self.n) if free is None else free
-        self._inner = matrix.tocsr() if free is None else matrix.tocsr()[free][:, free]
+        self.fixed = np.zeros(0, dtype=np.int64) if free is None else np.setdiff1d(np.arange(self.n), free)
+        # Rows of the identity in the place of the others: no right side has to be gathered, and no solution scattered.
+        kept = np.ones(self.n)
+        kept[self.fixed] = 0
+        self._inner = sparse.csr_matrix(sparse.diags(kept) @ matrix @ sparse.diags(kept) + sparse.diags(1 - kept))
+        self._inner.eliminate_zeros()
         self._solves: dict[torch.device, Solve] = {}
 
     def __getstate__(self) -> dict[str, Any]:
@@ -76,16 +80,15 @@ class SparseSolver:
             return torch.empty_like(right)
         device = right.device if _is_served(right.device) else torch.device("cpu")
         columns = right.detach().to(device, torch.float64).movedim(-2, 0)
-        out = columns.new_zeros(columns.shape)
-        if len(self.free) and out.numel():
-            if device not in self._solves:
-                _SOLVERS.add(self)
-                self._solves[device] = _superlu(self._inner) if cholespy is None else _cholesky(self._inner, device)
-            free = torch.from_numpy(self.free).to(device)
-            parts = columns.index_select(0, free).flatten(1).split(MOST_COLUMNS, 1)
-            solved = [self._solves[device](part.contiguous()) for part in parts]
-            out.flatten(1).index_copy_(0, free, solved[0] if len(solved) == 1 else torch.cat(solved, 1))
-        return out.movedim(0, -2).to(right).contiguous()
+        if not columns.numel():
+            return torch.zeros_like(right)
+        if device not in self._solves:
+            _SOLVERS.add(self)
+            self._solves[device] = _superlu(self._inner) if cholespy is None else _cholesky(self._inner, device)
+        solved = [self._solves[device](part.contiguous()) for part in columns.flatten(1).split(MOST_COLUMNS, 1)]
+        out = solved[0] if len(solved) == 1 else torch.cat(solved, 1)
+        out.index_fill_(0, torch.from_numpy(self.fixed).to(device), 0)
+        return out.view(columns.shape).movedim(0, -2).to(right).contiguous()
 
 
 _SOLVERS: weakref.WeakSet[SparseSolver] = weakref.WeakSet()

@@ -51,7 +51,7 @@ def no_worse(
     with torch.no_grad():
         found = distortion(shapes, rests)
     numbers = plain(found)
-    if numbers and not bool((_part(found[0], found[1:], slack) > 0).any()):
+    if numbers and bool((found[0] <= _least(slack) * found[1:]).all()):
         return x, solution
     # Added to the distortions of the starts: where nothing is strained, nothing is worse.
     slight = distortion.slight(rests.stiffness, x)
@@ -83,9 +83,14 @@ def blended(
     return x, replaced
 
 
+def _least(slack: float) -> float:
+    """Distortion over that of a start up to which a shape does not give way."""
+    return 1 + MARGIN * (slack - 1)
+
+
 def _part(own: Tensor, other: Tensor, slack: float) -> Tensor:
     """Part by which a shape gives way to one of its starts, 0 to 1. *Shape:* ``(B,), (..., B) -> (..., B)``."""
-    least = 1 + MARGIN * (slack - 1)
+    least = _least(slack)
     part = ((own / other - least) / (slack - least)).clamp(0, 1)
     part = torch.where(own.isfinite(), part * part * (3 - 2 * part), 1)
     return torch.where(other.isfinite(), part, 0)

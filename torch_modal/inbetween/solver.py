@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from torch_modal.autograd import plain
 from torch_modal.backends.choice import choose
 from torch_modal.backends.torch.backend import TorchBackend
 from torch_modal.energy.energy import Energy, RestShapes
@@ -106,8 +107,9 @@ class InBetweenSolver(nn.Module):
         compared = rests._replace(weights=weights.clamp_min(0))
         x, solution = no_worse(x, [base, straight], solution, self.distortion, compared, SLACK)
         x, solution = self.finished(x, solution, rests)
-        valid = (solution.status != Status.INVALID)[:, None, None]
-        return InBetweenResult(torch.where(valid, self.alignment.restore(x, pose), torch.nan), solution)
+        valid, x = solution.status != Status.INVALID, self.alignment.restore(x, pose)
+        x = x if plain(valid) and valid.all() else torch.where(valid[:, None, None], x, torch.nan)
+        return InBetweenResult(x, solution)
 
     def paired(self, straight: Tensor, rests: RestShapes, solution: Solution, pose: Pose) -> InBetweenResult:
         """The two shapes of Eq. 4, interpolated locally, and their mean: the paper's, with nothing in its place."""

@@ -132,7 +132,7 @@ def minimise(
     """
     found, norm, n_steps = a.clone(), a.new_zeros(len(a)), torch.zeros(len(a), dtype=torch.int64, device=a.device)
     reached, start, goal, drowned = norm, norm, norm, norm > 0
-    eye, rows = torch.eye(a.shape[-1]).to(a), torch.arange(len(a), device=a.device)
+    rows = torch.arange(len(a), device=a.device)
     for used in range(0, max(max_steps, 1), MOST_EVALUATIONS):
         some = placement if len(rows) == len(a) else trees.rows(placement, rows)
         derivatives = energy.derivatives(found[rows], some, second_order=False)
@@ -147,7 +147,9 @@ def minimise(
             reached, start = derivatives.value.clone(), own_norm.clone()
             goal = torch.maximum(tolerance * own_norm, derivatives.floor)
         regular = (info == 0) & own_norm.isfinite() & reached[rows].isfinite()
-        inverse = torch.cholesky_inverse(torch.where(regular[:, None, None], factor, eye)).contiguous()
+        if not bool(regular.all()):
+            factor = torch.where(regular[:, None, None], factor, torch.eye(a.shape[-1]).to(a))
+        inverse = torch.cholesky_inverse(factor).contiguous()
         length, before = (regular & (own_norm > goal[rows])).to(a), n_steps[rows]
         stiffest = derivatives.gauss_newton.diagonal(dim1=-2, dim2=-1).amax(-1)
         rounding = derivatives.resolution / stiffest.clamp_min(torch.finfo(a.dtype).tiny).sqrt()
