@@ -36,11 +36,10 @@ class SquaredBend(Term):
 
     def weights(self, edge_vectors: Tensor, measures: Tensor) -> Tensor:
         """Square of the edge over the area of both triangles."""
-        e, a, b = edge_vectors
-        n1, n2 = cross(e, a), cross(b, e)
-        squared, area = (e * e).sum(0), 0.5 * (norm(n1) + norm(n2))
+        n1, n2, flat, _ = normals(edge_vectors)
+        squared, area = (edge_vectors[0] * edge_vectors[0]).sum(0), 0.5 * (norm(n1) + norm(n2))
         floored = torch.maximum(area, squared / MAX_BENDING_RATIO)
-        return squared * inverse(floored, collapsed(e, n1) | collapsed(e, n2))
+        return squared * inverse(floored, flat)
 
     def difference(self, measures: Tensor, rest: Tensor) -> Tensor:
         """The short way round."""

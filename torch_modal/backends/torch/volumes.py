@@ -8,7 +8,7 @@ from torch_modal.geometry.vectors import cross, pick
 
 
 class Volumes(nn.Module):
-    """Signed volumes, times six and without gradient, of shapes without boundary.
+    """Signed volumes, without gradient, of shapes without boundary.
 
     Args:
         mesh: Their connectivity.
@@ -25,4 +25,4 @@ class Volumes(nn.Module):
         """Compute. *Shape:* ``(B, K, V, 3) -> (B, K)``."""
         rows = shapes.detach().mT.contiguous()
         a, b, c = (pick(rows, corner).movedim(2, 0) for corner in self.corners)
-        return (a * cross(b, c)).sum((0, -1))
+        return (a * cross(b, c)).sum((0, -1)) / 6

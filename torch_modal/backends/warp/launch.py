@@ -26,11 +26,11 @@ Module = Literal[
     "steps",
     "rotations",
     "rotations_adjoint",
-    "adjoints",
+    "procrustes",
     "crossings",
 ]
 PACKAGE = "torch_modal.backends.warp.kernels"
-IN_BETWEENS: tuple[Module, ...] = ("rotations", "shell", "modal", "quasi_newton", "steps")
+IN_BETWEENS: tuple[Module, ...] = ("procrustes", "rotations", "shell", "modal", "quasi_newton", "steps")
 """The modules for in-betweens without gradients."""
 NO_DRIVER = b"Warp CUDA warning: Could not find or load the NVIDIA CUDA driver"
 """What Warp says where there is no GPU, with no setting that turns it off: in every run, it looks like an error."""

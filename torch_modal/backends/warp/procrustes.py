@@ -29,7 +29,7 @@ class _MeanPose:
     def run(kept: list[Any] | None, *given: Tensor) -> tuple[Tensor, ...]:
         """See :class:`~torch_modal.backends.warp.function.Operation`."""
         turns, pose = torch.empty_like(given[0]), torch.empty_like(given[0][:, 0])
-        launch(kernels("rotations").mean_pose, (len(pose),), [*given, turns, pose])
+        launch(kernels("procrustes").mean_pose, (len(pose),), [*given, turns, pose])
         return turns, pose
 
     @staticmethod

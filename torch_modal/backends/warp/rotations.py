@@ -160,7 +160,7 @@ class _OnTrajectory:
         to_packed, to_t = torch.zeros_like(packed), torch.zeros_like(t)
         given = [own.constants, packed, self._index(packed, which), t, total.clone()]
         adjoints = [None, to_packed, None, to_t, to_total]
-        launch(kernels("adjoints").trajectory_edges, (len(t), len(own.faces)), given, adjoints)
+        launch(kernels("rotations_adjoint").trajectory_edges, (len(t), len(own.faces)), given, adjoints)
         return to_packed, None, to_t
 
     def by_torch(self, packed: Tensor, which: Tensor, t: Tensor) -> tuple[Tensor, ...]:

@@ -1,4 +1,4 @@
-"""Adjoints of :mod:`torch_modal.backends.warp.kernels.rotations`: from sides of rotated triangles to shapes.
+"""Adjoints of kernels of rotations and poses: from sides of rotated triangles, and from rotations, to shapes.
 
 A part ``exp(t log R)`` of a rotation turns by ``J(t theta) (t dtheta + theta dt)`` where ``R = exp(theta)`` turns by
 ``J(theta) dtheta``, with the left Jacobian ``J`` of the rotations (Chirikjian 2012, section 10.6).
@@ -7,6 +7,7 @@ A part ``exp(t log R)`` of a rotation turns by ``J(t theta) (t dtheta + theta dt
 import warp as wp
 
 from torch_modal.backends.warp.kernels.elements import HALF, TINIEST, place, real, vec3, vec4
+from torch_modal.backends.warp.kernels.procrustes import half_of
 from torch_modal.backends.warp.kernels.rotations import (
     HEIGHT,
     PER_HEIGHT,
@@ -15,10 +16,10 @@ from torch_modal.backends.warp.kernels.rotations import (
     Triangle,
     about,
     at_sides,
-    half_of,
     half_turn,
     quaternion,
     sinc_near,
+    trajectory_edges,
     triangle_of,
     turned,
 )
@@ -163,7 +164,7 @@ def torque_of(m: wp.mat33d):
 
 @wp.func
 def to_covariance(covariance: wp.mat33d, rotation: wp.mat33d, torque: vec3):
-    """Adjoint of ``rotations.best_rotation``, with the floor of rigid.best_rotation."""
+    """Adjoint of ``procrustes.best_rotation``, with the floor of rigid.best_rotation."""
     p = covariance @ wp.transpose(rotation)
     trace = wp.trace(p)
     floor = EPSILON * wp.abs(trace)
@@ -186,7 +187,7 @@ def mean_pose(
     to_among: wp.array(dtype=wp.mat33d),
     to_weights: wp.array(dtype=wp.vec2d),
 ):
-    """Adjoint of ``rotations.mean_pose``."""
+    """Adjoint of ``procrustes.mean_pose``."""
     s = wp.tid()
     w = weights[s]
     a = to_reference[2 * s]
@@ -209,3 +210,7 @@ def mean_pose(
     to_covariances[2 * s + 1] = w[1] * to_sum @ onto
     to_among[4 * s + 1] = to_covariance(among[4 * s + 1], onto, to_onto)
     to_weights[s] = wp.vec2d(wp.ddot(to_sum, a), wp.ddot(to_sum, b) + real(2.0) * wp.dot(torque, half))
+
+
+# Generated, which repeats the work on a triangle first: what `add_sides` adds is done once more, in scratch memory.
+trajectory_edges = wp.kernel(trajectory_edges.func, module=__name__, enable_backward=True)

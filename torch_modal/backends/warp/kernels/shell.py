@@ -150,7 +150,7 @@ def volume(
     normal: wp.array(dtype=vec3),
     threads: int,
 ):
-    """The volume, the second of the totals, and its gradient alone."""
+    """The volume, the second of the totals, and its gradient, where there is an array for it."""
     i = wp.tid()
     s = i // threads
     middle = middle_of(mesh, x, centre, s)

@@ -60,6 +60,12 @@ def from_square(d: symmetric, g: vec3):
 
 
 @wp.func
+def from_normals(h: Hinge, to_n1: vec3, to_n2: vec3):
+    """Gradients of the edge and both tips of a hinge, from those of the normals."""
+    return wp.cross(h.a, to_n1) + wp.cross(to_n2, h.b), wp.cross(to_n1, h.e), wp.cross(h.e, to_n2)
+
+
+@wp.func
 def from_angle_gradients(h: Hinge, ga: vec3, gb: vec3, to_ge: vec3, to_ga: vec3, to_gb: vec3):
     """Gradients of the edge and both tips of a hinge, from those of the gradients of its angle."""
     per_length = real(1.0) / h.length
@@ -74,9 +80,10 @@ def from_angle_gradients(h: Hinge, ga: vec3, gb: vec3, to_ge: vec3, to_ga: vec3,
     along_b = h.per2 * wp.dot(h.n2, to_gb)
     to_n1 = (-h.length * h.per1) * (to_ga - (TWO * along_a) * h.n1)
     to_n2 = (-h.length * h.per2) * (to_gb - (TWO * along_b) * h.n2)
-    to_e = to_part_a * (h.a - (TWO * part_a) * h.e) + to_part_b * (h.b - (TWO * part_b) * h.e)
-    to_e += wp.cross(h.a, to_n1) + wp.cross(to_n2, h.b) - ((along_a + along_b) * per_length) * h.e
-    return to_e, to_part_a * h.e + wp.cross(to_n1, h.e), to_part_b * h.e + wp.cross(h.e, to_n2)
+    to_e, to_a, to_b = from_normals(h, to_n1, to_n2)
+    to_e += to_part_a * (h.a - (TWO * part_a) * h.e) + to_part_b * (h.b - (TWO * part_b) * h.e)
+    to_e -= ((along_a + along_b) * per_length) * h.e
+    return to_e, to_a + to_part_a * h.e, to_b + to_part_b * h.e
 
 
 @wp.func
@@ -204,9 +211,10 @@ def merge(
                         scale = own * found / area
                         to_n1 = (-HALF * scale * weight / first) * h.n1
                         to_n2 = (-HALF * scale * weight / second) * h.n2
-                        to_e += (TWO * scale) * e + wp.cross(h.a, to_n1) + wp.cross(to_n2, h.b)
-                        to_a += wp.cross(to_n1, h.e)
-                        to_b += wp.cross(h.e, to_n2)
+                        own_e, own_a, own_b = from_normals(h, to_n1, to_n2)
+                        to_e += (TWO * scale) * e + own_e
+                        to_a += own_a
+                        to_b += own_b
             add_hinge(to_x, v, q, to_e, to_a, to_b)
             wp.atomic_add(to_pulls, place(r, 0), TWO * to_pull)
 
@@ -259,10 +267,10 @@ def soften(
             first = fullness(h.e, h.a, h.n1)
             second = fullness(h.e, h.b, h.n2)
             found = to[2] * w[2] + to[3] * w[3] + to[4] * w[4] + to[5] * w[5] + to[6] * w[6]
-            e1, to_a, to_n1 = from_fullness(h.e, h.a, h.n1, found * second)
-            e2, to_b, to_n2 = from_fullness(h.e, h.b, h.n2, found * first)
-            to_e = e1 + e2 + wp.cross(h.a, to_n1) + wp.cross(to_n2, h.b)
-            add_hinge(to_x, v, q, to_e, to_a + wp.cross(to_n1, h.e), to_b + wp.cross(h.e, to_n2))
+            first_e, first_a, to_n1 = from_fullness(h.e, h.a, h.n1, found * second)
+            second_e, second_b, to_n2 = from_fullness(h.e, h.b, h.n2, found * first)
+            to_e, to_a, to_b = from_normals(h, to_n1, to_n2)
+            add_hinge(to_x, v, q, to_e + first_e + second_e, to_a + first_a, to_b + second_b)
             f = first * second
             to = rested(to[0], to[1], f * to[2], f * to[3], f * to[4], f * to[5], f * to[6])
         to_rests[at] = to
