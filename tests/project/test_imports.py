@@ -115,6 +115,7 @@ def test_modes_are_without_torch() -> None:
 def test_layers_are_torch_only() -> None:
     """Bases are what comes in; only the coarse mesh and segments, made once on the host, use more."""
     allowed = {"inbetween.coarse": {"modes.coarsening"}, "inbetween.regions": {"numpy"}}
+    allowed["inbetween.free_vertices"] = {"numpy", "scipy"}  # sparse factors
     # What kernels are given once comes in arrays of the host, which are NumPy's for Warp.
     allowed |= {name: {"numpy"} for name in MODULES if name.startswith("backends.warp.")}
     foreign = {

@@ -14,8 +14,12 @@ MAX_BENDING_RATIO = 1e3
 # Altitude of a triangle over its edge below which the triangle has no normal worth the name.
 COLLAPSED = 1e-6
 
-# Altitude of a triangle over its longest side at which fullness() is a half; an equilateral one has 0.87.
-NEEDLE = 0.2
+# Altitude of a triangle over its longest side at which fullness() is a half, in the modal solve and for the steps of
+# all vertices; an equilateral one has 0.87.
+NEEDLE, NEEDLE_OF_STEPS = 0.2, 0.3
+
+# Fullness at rest below which a hinge is softened even if it has as much where steps start.
+LEAST_FULLNESS = 1e-3
 
 
 class SquaredBend(Term):
@@ -144,13 +148,31 @@ def dihedral_hessian(edge_vectors: Tensor) -> Tensor:
     return torch.stack([torch.stack(row, 1) for row in rows])
 
 
-def fullness(edge_vectors: Tensor) -> Tensor:
+def fullness(edge_vectors: Tensor, needle: float) -> Tensor:
     """0 to 1 by how far both triangles of a hinge are from needles. *Shape:* ``(3, 3, ..., H) -> (..., H)``."""
     e, both = edge_vectors[0].unsqueeze(1), edge_vectors[1:].transpose(0, 1)  # (3, 1, ..., H), (3, 2, ..., H)
     normal = cross(e.expand_as(both), both)
     longest = reduce(torch.maximum, [(x * x).sum(0) for x in (e, both, both - e)])
     squared = (normal * normal).sum(0)
-    return (squared * inverse(squared + (NEEDLE * longest).square(), longest <= 0)).prod(0)
+    return (squared * inverse(squared + (needle * longest).square(), longest <= 0)).prod(0)
+
+
+def softening(edge_vectors: Tensor, weights: Tensor | None = None) -> Tensor:
+    """Factors of bending stiffness where steps start: by :func:`fullness`, or by its ratio to that of rest shapes.
+
+    Args:
+        edge_vectors: Of the start alone, or of the start and K rest shapes. *Shape:* ``(3, 3, B, 1 or 1 + K, H)``.
+        weights: Of the rest shapes. *Shape:* ``(B, K)``.
+
+    Returns:
+        *Shape:* ``(B, H)``.
+    """
+    if weights is None:
+        return fullness(edge_vectors, NEEDLE)[:, 0]
+    own, usual = fullness(edge_vectors, NEEDLE_OF_STEPS).split([1, weights.shape[1]], 1)
+    usual = (weights[..., None] * usual).sum(1).clamp_min(LEAST_FULLNESS)
+    part = (own[:, 0] / usual).clamp_max(1)
+    return part * part * (3 - 2 * part)
 
 
 def collapsed(edge: Tensor, normal: Tensor) -> Tensor:

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from torch_modal.autograd import lasting
+from torch_modal.energy.bend import Bend, softening
 from torch_modal.energy.term import Mesh, Term
 from torch_modal.geometry.vectors import pick
 
@@ -315,6 +316,21 @@ class RestShapes(NamedTuple):
         anchors = None if self.anchors is None else self.anchors[some]
         return RestShapes(self.shapes[some], self.weights[some], [each[some] for each in self.stiffness], anchors)
 
-    def reference(self, energy: Energy) -> Reference:
-        """Merge the rest shapes into one reference of an energy, of the terms that the stiffnesses belong to."""
-        return energy.among([energy.rest_of(x) for x in self.shapes.unbind(1)], self.weights, self.stiffness)
+    def reference(self, energy: Energy, start: Tensor | None = None, relative: bool = False) -> Reference:
+        """Merge the rest shapes into one reference of an energy, of the terms that the stiffnesses belong to.
+
+        Args:
+            energy: The energy.
+            start: Where a minimisation starts. Hinges with a needle there have less bending stiffness: their gradient
+                has no bound, and the minimiser would turn their normals over. *Shape:* ``(B, V, 3)``.
+            relative: Hinges with a needle in the rest shapes, too, keep their stiffness.
+        """
+        found = energy.among([energy.rest_of(x) for x in self.shapes.unbind(1)], self.weights, self.stiffness)
+        if start is None:
+            return found
+        compared = (self.shapes, self.weights) if relative else ()
+        rows, weights = torch.cat([start[:, None], *compared[:1]], 1).movedim(-1, 0), list(found.weights)
+        for i, part in enumerate(energy.parts):
+            if isinstance(part.term, Bend):
+                weights[i] = softening(part.edge_vectors(rows), *compared[1:]) * weights[i]
+        return found._replace(weights=tuple(weights))

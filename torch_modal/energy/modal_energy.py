@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from torch_modal.energy.bend import Bend, fullness
 from torch_modal.energy.energy import Energy, Linearised, Reference, RestShapes
 from torch_modal.energy.shell import ShellEnergy
 from torch_modal.energy.term import Term
@@ -91,24 +90,9 @@ class ModalEnergy(nn.Module):
         """Number of amplitudes, n."""
         return len(self.columns)
 
-    def reference(self, rests: RestShapes) -> Any:
-        """Merge rest shapes into the reference of a :class:`Placement`."""
-        return rests.reference(self.energy)
-
-    def softened(self, reference: Any, base: Tensor) -> Any:
-        """A reference with less bending stiffness at hinges with a needle.
-
-        The minimiser would turn their normals over, at little cost, and end at the kink where they collapse.
-
-        Args:
-            reference: Of :meth:`reference`.
-            base: The shape at amplitudes of zero. *Shape:* ``(B, V, 3)``.
-        """
-        rows, weights = base.movedim(-1, 0), list(reference.weights)
-        for i, part in enumerate(self.energy.parts):
-            if isinstance(part.term, Bend):
-                weights[i] = fullness(part.edge_vectors(rows)) * weights[i]
-        return reference._replace(weights=tuple(weights))
+    def reference(self, rests: RestShapes, base: Tensor | None = None) -> Any:
+        """Merge rest shapes into the reference of a :class:`Placement`; arguments as :meth:`RestShapes.reference`."""
+        return rests.reference(self.energy, base)
 
     def place(self, base: Tensor, reference: Reference, anchors: Tensor | None = None) -> Placement:
         """The space of each sample.

@@ -29,6 +29,7 @@ except ImportError:
     cholespy = None
 
 Solve = Callable[[Tensor], Tensor]
+"""Products with the inverse of a symmetric matrix. *Shape:* ``(..., V, m) -> (..., V, m)``."""
 
 # Right-hand sides per solve: more are not faster and use more memory; CUDA allows at most 128.
 MOST_COLUMNS = 48
@@ -139,7 +140,7 @@ def _cholesky(matrix: sparse.csr_matrix, device: torch.device) -> Solve:
     return solve
 
 
-def solve_by(solver: Callable[[], SparseSolver], right: Tensor) -> Tensor:
+def solve_by(solver: Callable[[], Solve], right: Tensor) -> Tensor:
     """Solve with gradients, which are solves, too. *Shape:* ``(..., V, m) -> (..., V, m)``.
 
     The solver is made lazily: inside ``torch.func`` transforms, tensors cannot be read earlier.
@@ -151,7 +152,7 @@ def solve_by(solver: Callable[[], SparseSolver], right: Tensor) -> Tensor:
 
 class _Solve(torch.autograd.Function):
     @staticmethod
-    def forward(solver: Callable[[], SparseSolver], right: Tensor) -> Tensor:
+    def forward(solver: Callable[[], Solve], right: Tensor) -> Tensor:
         return solver()(right)
 
     @staticmethod
@@ -167,9 +168,7 @@ class _Solve(torch.autograd.Function):
         return None, _Solve.apply(ctx.solver, grads[0])
 
     @staticmethod
-    def vmap(
-        info: Any, in_dims: tuple[Any, ...], solver: Callable[[], SparseSolver], right: Tensor
-    ) -> tuple[Tensor, int]:
+    def vmap(info: Any, in_dims: tuple[Any, ...], solver: Callable[[], Solve], right: Tensor) -> tuple[Tensor, int]:
         return _Solve.apply(solver, right.movedim(in_dims[1], 0)), 0
 
 

@@ -43,7 +43,7 @@ def no_worse(
         slack: How many times as much distortion as its start a shape may have.
 
     Returns:
-        The shapes, and the solution, in which those that a start has replaced are marked.
+        The shapes, and the solution with ratios of distortions, in which those that a start has replaced are marked.
     """
     if not len(x):
         return x, solution
@@ -51,10 +51,12 @@ def no_worse(
     with torch.no_grad():
         found = distortion(shapes, rests)
     numbers = plain(found)
-    if numbers and bool((found[0] <= _least(slack) * found[1:]).all()):
-        return x, solution
-    # Added to the distortions of the starts: where nothing is strained, nothing is worse.
+    # Added to the distortions of the starts: where nobody sees a strain, nothing is worse.
     slight = distortion.slight(rests.stiffness, x)
+    ratio = (found[0] / (found[1:] + slight)).amax(0)
+    solution = solution._replace(distortion_ratio=ratio)
+    if numbers and bool((ratio <= _least(slack)).all()):
+        return x, solution
     if torch.is_grad_enabled():
         parts = _part(found[0], found[1:] + slight, slack)
         # To first order, the shapes depend on the distortions where they are blended.

@@ -76,8 +76,7 @@ class JointSpace(nn.Module):
                 each = anchors.split(self.n_anchors, 1)
                 anchors = torch.cat([each[i] for i in members], 1)
             stiffness = self._stiffness(part.energy, members, rests.stiffness)
-            reference = part.reference(RestShapes(seen, rests.weights, stiffness))
-            reference = part.softened(reference, own) if soften else reference
+            reference = part.reference(RestShapes(seen, rests.weights, stiffness), own if soften else None)
             placed.append(part.place(own, reference, anchors))
         return placed
 

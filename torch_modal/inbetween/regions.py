@@ -4,7 +4,8 @@
   fitted to that;
 - *segments* are parts that move nearly rigidly in all modes (Huang et al. 2009);
 - the *regions*, the segments of the largest mean error, are interpolated by examples (Froehlich and Botsch 2011): their
-  lengths, angles and volume are half-way between those of the key-frames, and all else is fixed.
+  lengths, angles and volume are half-way between those of the key-frames, and all else is fixed. They are minimised to
+  convergence, with angles by the periodic function of the joint space: their gradient is that of the minimiser.
 
 The paper's examples are ``x1*`` and the second key-frame, and ``x2*`` and the first. But both shapes are a part of the
 way there already: half-way on the rest of it, their regions have passed each other, and the mean is too short.
@@ -12,23 +13,23 @@ way there already: half-way on the rest of it, their regions have passed each ot
 
 import heapq
 from collections.abc import Sequence
-from functools import partial
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
-from torch.utils.checkpoint import checkpoint
 
 from torch_modal.arrays import FloatArray, IntArray
-from torch_modal.autograd import plain
-from torch_modal.backends.torch.fine_steps import relax
+from torch_modal.energy.bend import NEEDLE, Bend, fullness
 from torch_modal.energy.energy import Energy, Rest, RestShapes
-from torch_modal.energy.shell import N_SHELL_TERMS
+from torch_modal.energy.stretch import Stretch
 from torch_modal.energy.term import Mesh
+from torch_modal.energy.volume import Volume
 from torch_modal.geometry.canonical import CANONICAL_SIZE
 from torch_modal.inbetween.coarse import stretching
+from torch_modal.inbetween.free_vertices import FreeVertices
 from torch_modal.inbetween.paired import PairedSpace
+from torch_modal.solve.implicit import solve_implicit
+from torch_modal.solve.minimise import Status
 
 N_SEGMENTS = 24
 
@@ -41,8 +42,8 @@ RIDGE = 1e-3
 # Rings of faces around the regions: one that is free, where the modes end; two for hinges, of two faces each.
 RINGS = 3
 
-# Newton steps, and products with the Hessian in each.
-N_STEPS, N_PRODUCTS = 10, 100
+# Newton steps at most: five or six, as a rule.
+N_STEPS = 100
 
 
 def fitting_error(space: PairedSpace, references: Tensor) -> FloatArray:
@@ -161,42 +162,47 @@ class LocalInterpolation(nn.Module):
         for _ in range(RINGS):
             rings.append(rings[-1].index_fill(0, faces[rings[-1][faces].any(1)].flatten(), True))
         used, numbered = faces[rings[-1][faces].all(1)].unique(return_inverse=True)
-        self.energy = Energy(Mesh.of(numbered.view(-1, 3), len(used)), [p.term for p in fine.parts[:N_SHELL_TERMS]])
+        # Smooth at half a turn, where squared differences of angles have a kink that minimisers would end at.
+        energy = Energy(Mesh.of(numbered.view(-1, 3), len(used)), [Stretch(), Bend(), Volume()])
+        self.problem = FreeVertices(energy, torch.nonzero(rings[1][used]).flatten())
         self.register_buffer("used", used, persistent=False)
         #: True for the vertices that move. *Shape:* ``(V,)``, bool.
         self.register_buffer("region", rings[1], persistent=False)
         #: The elements of the regions among those of the mesh.
         self.elements: list[Tensor | None] = []
-        for part, own in zip(fine.parts, self.energy.parts, strict=False):
+        for part, own in zip(fine.parts, energy.parts, strict=False):
             self.elements.append(None if own.term.total else _places(used[own.corners], part.corners))
 
-    def forward(self, ends: Sequence[Tensor], rests: RestShapes) -> list[Tensor]:
+    def forward(self, ends: Sequence[Tensor], rests: RestShapes, usable: Tensor) -> tuple[list[Tensor], Tensor]:
         """Interpolate.
 
         Args:
-            ends: Shapes that are fixed beside the regions. *Shape of each:* ``(B, V, 3)``.
+            ends: Shapes that are fixed outside the regions. *Shape of each:* ``(B, V, 3)``.
             rests: The key-frames. *Shape:* ``(B, 2, V, 3)``.
+            usable: False for samples that are left out. *Shape:* ``(B,)``.
+
+        Returns:
+            The shapes, and the worse :class:`~torch_modal.solve.minimise.Status` of both, *shape* ``(B,)``.
         """
-        energy, rest = self.energy, self.energy.rest_of(rests.shapes[:, :, self.used])
+        energy, shapes = self.problem.energy, rests.shapes[:, :, self.used].double()
+        rest = energy.rest_of(shapes)
         measures, stiffness = [], []
         for part, q, some, value in zip(energy.parts, rest.measures, self.elements, rests.stiffness, strict=False):
             measures.append(q[:, 0] + 0.5 * part.term.difference(q[:, 1], q[:, 0]))
-            stiffness.append(value if some is None or value.shape[-1] == 1 else value[:, some.to(value.device)])
+            own = value if some is None or value.shape[-1] == 1 else value[:, some.to(value.device)]
+            own = own.double()
+            if isinstance(part.term, Bend):  # needles turn over at little cost, and would end where they collapse
+                own = own * fullness(part.edge_vectors(shapes.movedim(-1, 0)), NEEDLE).prod(1)
+            stiffness.append(own)
         reference = energy.against(Rest(tuple(measures), tuple(w.mean(1) for w in rest.weights)), stiffness)
-        step: Any = partial(
-            relax, energy, reference=reference, n_steps=1, n_products=N_PRODUCTS, free=self.region[self.used]
-        )
-        if torch.compiler.is_compiling() and not torch.compiler.is_exporting():
-            step = torch.compiler.disable(step)  # to trace hundreds of products takes minutes
-        # Where gradients are recorded, steps are computed twice: they would take ten times the memory.
-        again = torch.is_grad_enabled() and plain(ends[0])
-        found = []
+        found, status = [], torch.full_like(usable, Status.CONVERGED, dtype=torch.int64)
         for x in ends:
-            own = x[:, self.used]
-            for _ in range(N_STEPS):
-                own = checkpoint(step, own, use_reentrant=False) if again else step(own)
-            found.append(x.index_copy(1, self.used, own))
-        return found
+            place = x[:, self.used].double(), reference
+            method = FreeVertices.minimise, FreeVertices.inverse
+            solution = solve_implicit(self.problem, place, usable, N_STEPS, 0.0, *method)
+            found.append(x.index_copy(1, self.used, self.problem.shapes(solution.amplitudes, place[0]).to(x)))
+            status = torch.where(status == Status.CONVERGED, solution.status, status)
+        return found, status
 
 
 def _places(some: Tensor, corners: Tensor) -> Tensor:

@@ -77,10 +77,11 @@ def report(solution: Solution, solver: Solver) -> None:
     """
     if not traced(solution.status) and solver.gradient == "implicit":
         forbid = solver.unconverged == "raise" and torch.is_grad_enabled()
-        made_outside(partial(_report, max_steps=solver.max_steps, forbid=forbid), solution.status)
+        seen = [x for x in (solution.status, solution.distortion_ratio) if x is not None]
+        made_outside(partial(_report, max_steps=solver.max_steps, forbid=forbid), *seen)
 
 
-def _report(status: Tensor, max_steps: int, forbid: bool) -> None:
+def _report(status: Tensor, ratio: Tensor | None = None, *, max_steps: int, forbid: bool) -> None:
     if not bool((status != Status.CONVERGED).any()):
         return
     counts = {kind.name: int((status == kind).sum()) for kind in Status if kind}
@@ -95,9 +96,10 @@ def _report(status: Tensor, max_steps: int, forbid: bool) -> None:
             raise ConvergenceError(message)
         warnings.warn(message, ConvergenceWarning, stacklevel=2)
     if fell:
+        most = "more" if ratio is None else f"up to {float(ratio[status == Status.FELL_BACK].max()):.3g} times"
         warnings.warn(
-            f"{fell} of {status.numel()} in-betweens came out worse than what they started from, the blend by local "
-            "rotations or linear interpolation, which is returned in their place (status FELL_BACK); more coarse faces "
+            f"{fell} of {status.numel()} in-betweens had {most} the distortion of what they started from, the blend by "
+            "local rotations or linear interpolation, which is returned instead (status FELL_BACK); more coarse faces "
             "or local steps may help: Objective(coarse_faces=...), Solver(local_steps=...)",
             ConvergenceWarning,
             stacklevel=2,

@@ -114,7 +114,9 @@ class InBetweenSolver(nn.Module):
     def paired(self, straight: Tensor, rests: RestShapes, solution: Solution, pose: Pose) -> InBetweenResult:
         """The two shapes of Eq. 4, interpolated locally, and their mean: the paper's, with nothing in its place."""
         ends = self.space.lift(solution.amplitudes, rests.shapes)
-        ends = ends if self.local is None else self.local(ends, rests)
+        if self.local is not None:
+            ends, status = self.local(ends, rests, solution.status != Status.INVALID)
+            solution = solution._replace(status=torch.where(solution.converged, status, solution.status))
         x = self.relaxed((ends[0] + ends[1]) / 2, rests)
         energies = [self.mean_energy(shape.detach(), rests) for shape in (x, straight)]
         valid = (solution.status != Status.INVALID)[:, None, None]

@@ -134,7 +134,7 @@ class InBetweenLayer(PreciseModule):
             weights: *Shape:* ``(*lead, K)``, likewise.
             lead: The leading dimensions.
         """
-        if self.solver.gradient == "implicit" or self.solver.local_steps:
+        if self.solver.gradient == "implicit" or self.solver.local_steps or self.solver.regions:
             require_numbers(type(self).__name__, keyframes)
         n, item = weights.shape[-1], keyframes.shape[-2:]
         flat = keyframes.to(self.dtype).expand(*lead, n, *item).reshape(-1, n, *item)

@@ -12,6 +12,8 @@ from torch_modal.autograd import applied, flattened, recorded, transposed
 from torch_modal.solve.gauss_newton import GaussNewtonStep
 from torch_modal.solve.minimise import AmplitudeEnergy, Solution, Status, minimise, ridged
 
+Inverse = Callable[[Any, Tensor, Any, Tensor], Callable[[Tensor], Tensor]]
+
 
 class ConvergenceWarning(UserWarning):
     """A minimisation stopped before its gradient vanished, or has no gradient where it stopped."""
@@ -30,7 +32,7 @@ class _ArgMin(torch.autograd.Function):
     def forward(
         energy: AmplitudeEnergy, limits: tuple[Any, ...], tree: Any, usable: Tensor, *tensors: Tensor
     ) -> tuple[Tensor, ...]:
-        method, max_steps, tolerance = limits
+        method, max_steps, tolerance, _ = limits
         start = usable.new_zeros(len(usable), energy.n_amplitudes, dtype=tensors[0].dtype)
         solution = method(energy, start, trees.filled(tree, tensors), max_steps, tolerance)
         solution = solution._replace(status=torch.where(usable, solution.status, Status.INVALID))
@@ -38,7 +40,7 @@ class _ArgMin(torch.autograd.Function):
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
-        ctx.energy, _, ctx.tree, _, *tensors = inputs
+        ctx.energy, (*_, ctx.inverse), ctx.tree, _, *tensors = inputs
         amplitudes, *diagnostics = output
         ctx.mark_non_differentiable(*diagnostics)
         ctx.n_diagnostics = len(diagnostics)
@@ -48,13 +50,13 @@ class _ArgMin(torch.autograd.Function):
     @staticmethod
     def jvp(ctx: Any, *tangents: Tensor | None) -> tuple[Tensor | None, ...]:
         amplitudes, _, *tensors = ctx.saved_tensors
-        pull_back = _adjoint(ctx.energy, ctx.tree, *ctx.saved_tensors)
+        pull_back = _adjoint(ctx.energy, ctx.inverse, ctx.tree, *ctx.saved_tensors)
         moved = transposed(pull_back, torch.zeros_like(amplitudes), tensors, tangents[4:])
         return moved, *(None,) * ctx.n_diagnostics
 
     @staticmethod
     def backward(ctx: Any, to_amplitudes: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:
-        pull_back = _adjoint(ctx.energy, ctx.tree, *ctx.saved_tensors)
+        pull_back = _adjoint(ctx.energy, ctx.inverse, ctx.tree, *ctx.saved_tensors)
         return (None,) * 4 + pull_back(to_amplitudes)
 
     @staticmethod
@@ -66,24 +68,16 @@ class _ArgMin(torch.autograd.Function):
 
 
 def _adjoint(
-    energy: AmplitudeEnergy, tree: Any, amplitudes: Tensor, status: Tensor, *tensors: Tensor
+    energy: AmplitudeEnergy, inverse: Inverse, tree: Any, amplitudes: Tensor, status: Tensor, *tensors: Tensor
 ) -> Callable[[Tensor], tuple[Tensor, ...]]:
     """From gradients in the amplitudes, ``(B, n)``, to those in the tensors of the placement: linear."""
-    placement = trees.filled(tree, tensors)
-    converged = (status == Status.CONVERGED)[:, None]
-    derivatives = energy.derivatives(amplitudes, placement)
-    hessian = ridged(derivatives.hessian)
-    eye = torch.eye(hessian.shape[-1], dtype=hessian.dtype, device=hessian.device)
-    matrix = torch.where(converged[..., None], hessian, eye)
+    solve = inverse(energy, amplitudes, trees.filled(tree, tensors), status == Status.CONVERGED)
 
     def slope(*tensors: Tensor) -> Tensor:
         return energy.gradient(amplitudes, trees.filled(tree, tensors))
 
     def pull_back(to_amplitudes: Tensor) -> tuple[Tensor, ...]:
-        adjoint, info = torch.linalg.solve_ex(matrix, to_amplitudes)
-        singular = (info != 0)[:, None]
-        _warn_of_singular(singular)
-        adjoint = torch.where(converged & ~singular, adjoint, 0)
+        adjoint = solve(to_amplitudes)
         if recorded(adjoint, *tensors):
             return tuple(torch.func.vjp(slope, *tensors)[1](-adjoint))
         with torch.enable_grad():  # by kernels, which the tensors of a transform would not reach
@@ -91,6 +85,23 @@ def _adjoint(
             return torch.autograd.grad(slope(*leaves), leaves, -adjoint, allow_unused=True, materialize_grads=True)
 
     return pull_back
+
+
+def dense_inverse(
+    energy: AmplitudeEnergy, amplitudes: Tensor, placement: Any, converged: Tensor
+) -> Callable[[Tensor], Tensor]:
+    """Products with the inverse of the full Hessian; zero for samples that did not converge. *Shape:* ``(B, n)``."""
+    hessian = ridged(energy.derivatives(amplitudes, placement).hessian)
+    eye = torch.eye(hessian.shape[-1], dtype=hessian.dtype, device=hessian.device)
+    matrix = torch.where(converged[:, None, None], hessian, eye)
+
+    def solve(right: Tensor) -> Tensor:
+        found, info = torch.linalg.solve_ex(matrix, right)
+        singular = (info != 0)[:, None]
+        _warn_of_singular(singular)
+        return torch.where(converged[:, None] & ~singular, found, 0)
+
+    return solve
 
 
 def _warn_of_singular(singular: Tensor) -> None:
@@ -107,24 +118,26 @@ def _warn_of_singular(singular: Tensor) -> None:
 
 
 def solve_implicit(
-    energy: AmplitudeEnergy,
+    energy: Any,
     placement: Any,
     usable: Tensor,
     max_steps: int,
     tolerance: float,
     method: Callable[..., Solution] = minimise,
+    inverse: Inverse = dense_inverse,
 ) -> Solution:
     """Minimise from zeros; gradients of the amplitudes by the implicit function theorem.
 
     Args:
-        energy: The energy of the amplitudes.
+        energy: The energy of the amplitudes, as the method and the inverse need it.
         placement: What the energy depends on: nested tuples of tensors. *Shape of each:* ``(B, ...)``.
         usable: False for samples whose status is ``INVALID`` whatever comes out. *Shape:* ``(B,)``.
         max_steps: Of :func:`~torch_modal.solve.minimise.minimise`.
         tolerance: Likewise.
         method: Minimises, with the arguments of :func:`~torch_modal.solve.minimise.minimise`.
+        inverse: Gives products with the inverse of the Hessian, with the arguments of :func:`dense_inverse`.
     """
-    given = energy, (method, max_steps, tolerance), trees.skeleton(placement), usable, *trees.leaves(placement)
+    given = energy, (method, max_steps, tolerance, inverse), trees.skeleton(placement), usable, *trees.leaves(placement)
     return Solution(*applied(_ArgMin, *given))
 
 

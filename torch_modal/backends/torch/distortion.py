@@ -21,7 +21,7 @@ LARGEST_STRAIN = 4.0
 LARGEST_WEIGHT = 8.0
 
 # Strain of edges below which nobody sees a difference.
-SLIGHT = 1e-4
+SLIGHT = 0.01
 
 
 class Distortion(nn.Module):

@@ -119,7 +119,6 @@ def relax(
     n_products: int,
     anchors: Tensor | None = None,
     beside: Sequence[FurtherEnergy] = (),
-    free: Tensor | None = None,
 ) -> Tensor:
     """Steps of a truncated Newton method on all vertices, shortened where the energy would rise.
 
@@ -135,7 +134,6 @@ def relax(
         n_products: Iterations of conjugate gradients in each.
         anchors: Of the energy's terms, where there are some. *Shape:* ``(B, P, 3)``.
         beside: Further energies.
-        free: False where a vertex stays. *Shape:* ``(V,)``, bool.
 
     Returns:
         *Shape:* ``(B, V, 3)``.
@@ -146,8 +144,7 @@ def relax(
         at = energy.linearise(energy.extend(rows, fixed), reference) if at is None else at
         more = [one.at(rows.movedim(0, -1).contiguous()) for one in beside]
         right = -sum((one.gradient.movedim(-1, 0) for one in more), start=energy.fold(energy.gradient(at)))
-        right = right if free is None else free * right
-        direction = _solved(energy, ConvexHessian(energy, at), right, n_products, more, free)
+        direction = _solved(energy, ConvexHessian(energy, at), right, n_products, more)
         reached = rows + direction
         there = reached.movedim(0, -1).contiguous()
         before = sum((one.value for one in more), start=energy.value_at(at, reference))
@@ -195,7 +192,6 @@ def _solved(
     right: Tensor,
     n_products: int,
     more: Sequence[FurtherDerivatives],
-    free: Tensor | None,
 ) -> Tensor:
     """An approximate solution. *Shape:* ``(3, B, V)``."""
     blocks = hessian.diagonal()[..., : right.shape[-1]]
@@ -205,7 +201,6 @@ def _solved(
 
     def product(field: Tensor) -> Tensor:
         own = energy.fold(hessian(energy.extend(field)))
-        own = own if free is None else free * own
         return sum((one.product(field.movedim(0, -1).contiguous()).movedim(-1, 0) for one in more), start=own)
 
     def precondition(residual: Tensor) -> Tensor:
@@ -325,7 +320,7 @@ class FineEnergy(nn.Module):
         self, x: Tensor, rests: RestShapes, stages: Sequence[tuple[int, int]], beside: Sequence[FurtherEnergy]
     ) -> Tensor:
         """:meth:`relax` of samples that fit into the caches, with their own further energies."""
-        reference = rests.reference(self.energy)
+        reference = rests.reference(self.energy, x, relative=True)
         for n_steps, n_products in stages:
             x = relax(self.energy, x, reference, n_steps, n_products, rests.anchors, beside)
         return x

@@ -34,7 +34,7 @@ class WarpFineEnergy(FineEnergy):
         if not alone and ((torch.is_grad_enabled() and x.requires_grad) or not plain(x)):
             return super().relax_chunk(x, rests, stages, beside)
         others = [*beside, *([] if self.further is None else [FurtherTerms(self.further, rests)])]
-        to, moved = self.steps.reference(rests), x
+        to, moved = self.steps.reference(rests, x, relative=True), x
         for n_steps, n_products in stages:
             if alone:
                 moved = self.steps(moved, to, n_steps, n_products)

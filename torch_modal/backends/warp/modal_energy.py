@@ -11,7 +11,6 @@ from torch_modal.autograd import plain
 from torch_modal.backends.warp.function import fused
 from torch_modal.backends.warp.launch import kernels, launch
 from torch_modal.backends.warp.shell import ShellReference, WarpShell
-from torch_modal.energy.bend import fullness
 from torch_modal.energy.energy import Energy, RestShapes
 from torch_modal.energy.modal_energy import Derivatives, ModalEnergy, Placement, gram
 from torch_modal.energy.term import Mesh
@@ -48,13 +47,9 @@ class WarpModalEnergy(ModalEnergy):
         #: Columns of each component of each vertex and of the centre, with room for two more, and zeros.
         self.register_buffer("blocks", blocks, persistent=False)
 
-    def reference(self, rests: RestShapes) -> ShellReference:
+    def reference(self, rests: RestShapes, base: Tensor | None = None) -> ShellReference:
         """As in the base class."""
-        return self.shell.reference(rests)
-
-    def softened(self, reference: Any, base: Tensor) -> Any:
-        """As in the base class."""
-        return reference._replace(elements=fused(_Softened(self.shell), base, reference.elements)[0])
+        return self.shell.reference(rests, base)
 
     def place(self, base: Tensor, reference: Any, anchors: Tensor | None = None) -> Placement:
         """As in the base class."""
@@ -168,34 +163,6 @@ class WarpModalEnergy(ModalEnergy):
         if not isinstance(to, ShellReference):
             return super().gradient(a, placement)
         return fused(_Gradient(self), a, placement.base, *to[:3])[0].to(placement.base)
-
-
-class _Softened:
-    """The elements of references, softened at the needles of shapes. *Shape:* ``(B, V, 3), (B, E, 7)``."""
-
-    n_results = n_differentiable = 1
-
-    def __init__(self, shell: WarpShell) -> None:
-        self.shell = shell
-
-    def run(self, kept: list[Any] | None, base: Tensor, elements: Tensor) -> tuple[Tensor, ...]:
-        """See :class:`~torch_modal.backends.warp.function.Operation`."""
-        found, dim = torch.empty_like(elements), (len(base), self.shell.n_edges)
-        launch(kernels("modal").soften, dim, [self.shell.constants, base, elements, found])
-        return (found,)
-
-    def back(self, kept: list[Any], grads: Sequence[Tensor], *given: Tensor) -> tuple[Tensor | None, ...]:
-        """See :class:`~torch_modal.backends.warp.function.Operation`."""
-        found, dim = (torch.zeros_like(given[0]), torch.empty_like(given[1])), (len(given[0]), self.shell.n_edges)
-        launch(kernels("shell_adjoint").soften, dim, [self.shell.constants, *given, grads[0], *found])
-        return found
-
-    def by_torch(self, base: Tensor, elements: Tensor) -> tuple[Tensor, ...]:
-        """See :class:`~torch_modal.backends.warp.function.Operation`."""
-        edges, hinges = elements.split([2, 5], -1)
-        full = fullness(self.shell.energy.parts[1].edge_vectors(base.movedim(-1, 0)))
-        factors = torch.ones_like(hinges[..., 0]).index_copy(1, self.shell.interior, full)
-        return (torch.cat([edges, factors[..., None] * hinges], -1),)
 
 
 class _Gradient:

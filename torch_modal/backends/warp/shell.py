@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from torch_modal.backends.warp.function import fused
 from torch_modal.backends.warp.launch import Constants, kernels, launch, records
+from torch_modal.energy.bend import softening
 from torch_modal.energy.energy import Energy, Reference, RestShapes
 from torch_modal.energy.shell import N_SHELL_TERMS
 from torch_modal.energy.stretch import MIN_RELATIVE_LENGTH
@@ -87,8 +88,8 @@ class WarpShell(nn.Module):
         self.register_buffer("used", used.to(energy.used.device), persistent=False)
 
     # ---------------------------------------------------------------------------------------------------- the reference
-    def reference(self, rests: RestShapes) -> ShellReference:
-        """Merge rest shapes into one reference (Eq. 8)."""
+    def reference(self, rests: RestShapes, start: Tensor | None = None, relative: bool = False) -> ShellReference:
+        """Merge rest shapes into one reference (Eq. 8); arguments as :meth:`RestShapes.reference`."""
         alpha, beta, gamma = rests.stiffness[:N_SHELL_TERMS]
         elements, volumes, sizes, constant = fused(_Merged(self), rests.shapes, rests.weights, alpha, beta)
         pulls = rests.weights * gamma / sizes**2
@@ -96,6 +97,9 @@ class WarpShell(nn.Module):
         whole = pulls.sum(1).clamp_min(0)
         volume = (pulls * volumes).sum(1) * inverse(whole, whole <= 0)
         constant = constant + torch.where(whole > 0, (pulls * (volumes - volume[:, None]) ** 2).sum(1), 0)
+        if start is not None:
+            rest = (rests.shapes, rests.weights) if relative else ()
+            (elements,) = fused(_Softened(self), start, elements, *rest)
         return ShellReference(elements, 2 * whole, volume, constant)
 
     def packed(self, reference: Reference) -> ShellReference:
@@ -305,3 +309,40 @@ class _Merged:
         hinges = ((weights[..., None] * bends)[..., None] * torch.stack(trigonometric, -1)).sum(1)
         hinges = torch.where(hinges[..., :1] > 0, 2 * beta[..., None] * hinges, 0)
         return self.shell._joined(edges, hinges), volumes.squeeze(-1), hard.squeeze(-1).rsqrt(), constant
+
+
+class _Softened:
+    """The elements of references, softened at the needles of shapes, or at those that rest shapes do not have.
+
+    *Shape:* ``(B, V, 3), (B, E, 7)``, and ``(B, K, V, 3), (B, K)``.
+    """
+
+    n_results = n_differentiable = 1
+
+    def __init__(self, shell: WarpShell) -> None:
+        self.shell = shell
+
+    def run(self, kept: list[Any] | None, start: Tensor, elements: Tensor, *rest: Tensor) -> tuple[Tensor, ...]:
+        """See :class:`~torch_modal.backends.warp.function.Operation`."""
+        found, dim = torch.empty_like(elements), (len(start), self.shell.n_edges)
+        launch(kernels("modal").soften, dim, [*self._given(start, elements, *rest), found])
+        return (found,)
+
+    def back(self, kept: list[Any], grads: Sequence[Tensor], *given: Tensor) -> tuple[Tensor | None, ...]:
+        """See :class:`~torch_modal.backends.warp.function.Operation`."""
+        found, dim = tuple(map(torch.zeros_like, given)), (len(given[0]), self.shell.n_edges)
+        rest = found[2:] or (None, None)
+        launch(kernels("shell_adjoint").soften, dim, [*self._given(*given), grads[0], *found[:2], *rest])
+        return found
+
+    def by_torch(self, start: Tensor, elements: Tensor, *rest: Tensor) -> tuple[Tensor, ...]:
+        """See :class:`~torch_modal.backends.warp.function.Operation`."""
+        edges, hinges = elements.split([2, 5], -1)
+        rows = torch.cat([start[:, None], *rest[:1]], 1).movedim(-1, 0)
+        factor = softening(self.shell.energy.parts[1].edge_vectors(rows), *rest[1:])
+        factors = torch.ones_like(hinges[..., 0]).index_copy(1, self.shell.interior, factor)
+        return (torch.cat([edges, factors[..., None] * hinges], -1),)
+
+    def _given(self, start: Tensor, elements: Tensor, *rest: Tensor) -> list[Any]:
+        shapes, weights = rest or (None, None)
+        return [self.shell.constants, start, elements, shapes, weights, 0 if shapes is None else shapes.shape[1]]

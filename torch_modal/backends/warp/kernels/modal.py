@@ -7,6 +7,7 @@ from torch_modal.backends.warp.kernels.elements import (
     SIXTH,
     TINY,
     Elements,
+    Hinge,
     angle_gradients,
     bend_beyond,
     bend_energy,
@@ -21,9 +22,11 @@ from torch_modal.backends.warp.kernels.elements import (
     rested,
     vec3,
 )
-from torch_modal.energy.bend import NEEDLE
+from torch_modal.energy.bend import LEAST_FULLNESS, NEEDLE, NEEDLE_OF_STEPS
 
 NEEDLES = wp.constant(real(NEEDLE**2))
+NEEDLES_OF_STEPS = wp.constant(real(NEEDLE_OF_STEPS**2))
+LEAST = wp.constant(real(LEAST_FULLNESS))
 wide = wp.types.vector(length=8, dtype=real)
 """A row's entries of eight columns."""
 three = wp.types.matrix(shape=(3, 8), dtype=real)
@@ -115,14 +118,30 @@ def jacobian(
 
 
 @wp.func
-def fullness(e: vec3, tip: vec3, normal: vec3):
+def fullness(e: vec3, tip: vec3, normal: vec3, needles: real):
     """bend.fullness of one triangle."""
     longest = wp.max(wp.dot(e, e), wp.max(wp.dot(tip, tip), wp.dot(tip - e, tip - e)))
     squared = wp.dot(normal, normal)
     found = real(0.0)
     if longest > real(0.0):
-        found = squared / (squared + NEEDLES * longest * longest)
+        found = squared / (squared + needles * longest * longest)
     return found
+
+
+@wp.func
+def fullness_of(h: Hinge, needles: real):
+    return fullness(h.e, h.a, h.n1, needles) * fullness(h.e, h.b, h.n2, needles)
+
+
+@wp.func
+def usual_fullness(
+    mesh: Elements, shapes: wp.array(dtype=vec3), pulls: wp.array(dtype=real), s: int, n_shapes: int, q: wp.vec4i
+):
+    """Fullness at rest, the weighted mean, with a lower bound."""
+    usual = real(0.0)
+    for r in range(s * n_shapes, (s + 1) * n_shapes):
+        usual += pulls[place(r, 0)] * fullness_of(hinge_of(shapes, r * mesh.n_vertices, q), NEEDLES_OF_STEPS)
+    return wp.max(usual, LEAST)
 
 
 @wp.kernel(enable_backward=False)
@@ -130,10 +149,13 @@ def soften(
     mesh: Elements,
     x: wp.array(dtype=vec3),
     rests: wp.array(dtype=rested),
+    shapes: wp.array(dtype=vec3),
+    pulls: wp.array(dtype=real),
+    n_shapes: int,
     out: wp.array(dtype=rested),
     threads: int,
 ):
-    """References with less bending stiffness at the needles of shapes."""
+    """References with less bending stiffness at the needles of shapes: bend.softening."""
     i = wp.tid()
     s = i // threads
     v = s * mesh.n_vertices
@@ -143,7 +165,14 @@ def soften(
         w = rests[at]
         if q[2] >= 0:
             h = hinge_of(x, v, q)
-            f = fullness(h.e, h.a, h.n1) * fullness(h.e, h.b, h.n2)
+            f = real(0.0)
+            if n_shapes == 0:
+                f = fullness_of(h, NEEDLES)
+            else:
+                f = wp.min(
+                    fullness_of(h, NEEDLES_OF_STEPS) / usual_fullness(mesh, shapes, pulls, s, n_shapes, q), real(1.0)
+                )
+                f = f * f * (real(3.0) - real(2.0) * f)
             w = rested(w[0], w[1], f * w[2], f * w[3], f * w[4], f * w[5], f * w[6])
         out[at] = w
 

@@ -33,7 +33,14 @@ from torch_modal.backends.warp.kernels.elements import (
     symmetric,
     vec3,
 )
-from torch_modal.backends.warp.kernels.modal import NEEDLES, fullness
+from torch_modal.backends.warp.kernels.modal import (
+    LEAST,
+    NEEDLES,
+    NEEDLES_OF_STEPS,
+    fullness,
+    fullness_of,
+    usual_fullness,
+)
 from torch_modal.backends.warp.kernels.shell import RATIO, SLACKNESS, bend_weight
 
 TWO = wp.constant(real(2.0))
@@ -220,7 +227,7 @@ def merge(
 
 
 @wp.func
-def from_fullness(e: vec3, tip: vec3, normal: vec3, to_found: real):
+def from_fullness(e: vec3, tip: vec3, normal: vec3, needles: real, to_found: real):
     """Gradients of the edge, the tip and the normal."""
     across = tip - e
     longest = wp.max(wp.dot(e, e), wp.max(wp.dot(tip, tip), wp.dot(across, across)))
@@ -229,10 +236,10 @@ def from_fullness(e: vec3, tip: vec3, normal: vec3, to_found: real):
     to_tip = vec3()
     to_normal = vec3()
     if longest > real(0.0):
-        bound = NEEDLES * longest * longest
+        bound = needles * longest * longest
         scale = TWO * to_found / ((squared + bound) * (squared + bound))
         to_normal = (scale * bound) * normal
-        to_longest = -TWO * scale * squared * NEEDLES * longest
+        to_longest = -TWO * scale * squared * needles * longest
         if wp.dot(e, e) == longest:
             to_e = to_longest * e
         elif wp.dot(tip, tip) == longest:
@@ -243,14 +250,30 @@ def from_fullness(e: vec3, tip: vec3, normal: vec3, to_found: real):
     return to_e, to_tip, to_normal
 
 
+@wp.func
+def add_fullness(to_x: wp.array(dtype=vec3), v: int, q: wp.vec4i, h: Hinge, needles: real, to_found: real):
+    """Adjoint of ``modal.fullness_of``."""
+    first = to_found * fullness(h.e, h.a, h.n1, needles)
+    second = to_found * fullness(h.e, h.b, h.n2, needles)
+    first_e, first_a, to_n1 = from_fullness(h.e, h.a, h.n1, needles, second)
+    second_e, second_b, to_n2 = from_fullness(h.e, h.b, h.n2, needles, first)
+    to_e, to_a, to_b = from_normals(h, to_n1, to_n2)
+    add_hinge(to_x, v, q, to_e + first_e + second_e, to_a + first_a, to_b + second_b)
+
+
 @wp.kernel(enable_backward=False)
 def soften(
     mesh: Elements,
     x: wp.array(dtype=vec3),
     rests: wp.array(dtype=rested),
+    shapes: wp.array(dtype=vec3),
+    pulls: wp.array(dtype=real),
+    n_shapes: int,
     to_out: wp.array(dtype=rested),
     to_x: wp.array(dtype=vec3),
     to_rests: wp.array(dtype=rested),
+    to_shapes: wp.array(dtype=vec3),
+    to_pulls: wp.array(dtype=real),
     threads: int,
 ):
     """Adjoint of ``modal.soften``."""
@@ -264,14 +287,24 @@ def soften(
         if q[2] >= 0:
             w = rests[at]
             h = hinge_of(x, v, q)
-            first = fullness(h.e, h.a, h.n1)
-            second = fullness(h.e, h.b, h.n2)
             found = to[2] * w[2] + to[3] * w[3] + to[4] * w[4] + to[5] * w[5] + to[6] * w[6]
-            first_e, first_a, to_n1 = from_fullness(h.e, h.a, h.n1, found * second)
-            second_e, second_b, to_n2 = from_fullness(h.e, h.b, h.n2, found * first)
-            to_e, to_a, to_b = from_normals(h, to_n1, to_n2)
-            add_hinge(to_x, v, q, to_e + first_e + second_e, to_a + first_a, to_b + second_b)
-            f = first * second
+            f = real(0.0)
+            if n_shapes == 0:
+                f = fullness_of(h, NEEDLES)
+                add_fullness(to_x, v, q, h, NEEDLES, found)
+            else:
+                usual = usual_fullness(mesh, shapes, pulls, s, n_shapes, q)
+                part = wp.min(fullness_of(h, NEEDLES_OF_STEPS) / usual, real(1.0))
+                f = part * part * (real(3.0) - TWO * part)
+                to_part = real(6.0) * part * (real(1.0) - part) * found
+                add_fullness(to_x, v, q, h, NEEDLES_OF_STEPS, to_part / usual)
+                if usual > LEAST:
+                    to_usual = -to_part * part / usual
+                    for r in range(s * n_shapes, (s + 1) * n_shapes):
+                        rest = hinge_of(shapes, r * mesh.n_vertices, q)
+                        pull = pulls[place(r, 0)]
+                        add_fullness(to_shapes, r * mesh.n_vertices, q, rest, NEEDLES_OF_STEPS, to_usual * pull)
+                        wp.atomic_add(to_pulls, place(r, 0), to_usual * fullness_of(rest, NEEDLES_OF_STEPS))
             to = rested(to[0], to[1], f * to[2], f * to[3], f * to[4], f * to[5], f * to[6])
         to_rests[at] = to
 

@@ -1,0 +1,234 @@
+"""An energy of some free vertices, minimised to convergence by Newton's method with sparse factors."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from scipy import sparse
+from torch import Tensor, nn
+
+from torch_modal import trees
+from torch_modal.autograd import made_outside, recorded
+from torch_modal.energy.energy import Energy, Linearised, OnMesh, Reference, energy_rounding
+from torch_modal.geometry.canonical import CANONICAL_SIZE
+from torch_modal.geometry.sparse import Solve, factorize, solve_by
+from torch_modal.solve.minimise import Solution, Status
+
+# Stiffness towards the start, relative to that of the mean edge: a vertex in a flat fan has none along its normal, and
+# a loose piece none against rigid motions.
+RIDGE = 1e-6
+
+# A step that is smaller than this leads to the minimum: the next would be its square.
+SMALL_STEP = 1e-8 * CANONICAL_SIZE
+
+# Armijo's constant, and the part of a step that is the shortest.
+DECREASE, SHORTEST = 1e-4, 1e-6
+
+# Iterations of conjugate gradients at most; their residuals of a step, and of a gradient. With factors of all but the
+# volume, which is of low rank, two to five are enough.
+MOST_ITERATIONS = 100
+RESIDUAL_OF_STEP, RESIDUAL_OF_GRADIENT = 1e-3, 1e-13
+
+Placement = tuple[Tensor, Reference]
+"""Where the vertices start, *shape* ``(B, V, 3)``, and what the energy compares with."""
+
+
+class FreeVertices(nn.Module):
+    """The energy in the displacements of some vertices, with the others fixed, in float64.
+
+    It is an :class:`~torch_modal.solve.minimise.AmplitudeEnergy`; instead of a dense Hessian it has :meth:`inverse`.
+
+    Args:
+        energy: The energy.
+        free: Vertices that move. *Shape:* ``(n,)``.
+    """
+
+    free: Tensor
+
+    def __init__(self, energy: Energy, free: Tensor) -> None:
+        super().__init__()
+        self.energy = energy
+        self.register_buffer("free", free, persistent=False)
+        numbers = np.full(energy.n_extended, -1)
+        numbers[free.numpy()] = np.arange(len(free))
+        #: Of each term that is no total, the entries of its elements' Hessians between free coordinates, and where.
+        self.entries = [_entries(part, numbers) for part in energy.parts if not part.term.total]
+
+    @property
+    def n_amplitudes(self) -> int:
+        """Number of coordinates of the free vertices."""
+        return 3 * len(self.free)
+
+    def shapes(self, a: Tensor, start: Tensor) -> Tensor:
+        """All vertices. *Shape:* ``(B, 3 n), (B, V, 3) -> (B, V, 3)``."""
+        return start.index_add(1, self.free, a.unflatten(-1, (-1, 3)))
+
+    def gradient(self, a: Tensor, placement: Placement) -> Tensor:
+        """Gradient at ``a``, to be differentiated in all that the placement holds. *Shape:* ``(B, 3 n)``."""
+        found = self.energy.fold(self.energy.gradient(self._linearise(a, placement)))
+        return found.movedim(0, -1)[:, self.free].flatten(1) + self._ridge(placement) * a
+
+    def value(self, a: Tensor, placement: Placement) -> Tensor:
+        """Energy at ``a``. *Shape:* ``(B, 3 n) -> (B,)``."""
+        rows = self.energy.extend(self.shapes(a, placement[0]).movedim(-1, 0))
+        return self.energy.value(rows, placement[1]) + 0.5 * (self._ridge(placement) * a * a).sum(-1)
+
+    def _linearise(self, a: Tensor, placement: Placement) -> list[Linearised]:
+        rows = self.shapes(a, placement[0]).movedim(-1, 0).contiguous()
+        return self.energy.linearise(self.energy.extend(rows), placement[1])
+
+    @staticmethod
+    def _ridge(placement: Placement) -> Tensor:
+        return RIDGE * placement[1].weights[0].mean(-1, keepdim=True).clamp_min(1)
+
+    # ------------------------------------------------------------------------------------------------ Newton's method
+    @torch.no_grad()
+    def minimise(self, a: Tensor, placement: Placement, max_steps: int, tolerance: float) -> Solution:
+        """Newton steps of each sample alone; arguments as for :func:`~torch_modal.solve.minimise.minimise`.
+
+        A sample has converged where a step is below :data:`SMALL_STEP`; the tolerance plays no part.
+        """
+        each = [self._minimised(a[i : i + 1], trees.rows(placement, slice(i, i + 1)), max_steps) for i in range(len(a))]
+        if not each:
+            return Solution(a, a.sum(-1), a.sum(-1), *(torch.zeros(0, dtype=torch.int64, device=a.device),) * 2)
+        amplitudes, energies, norms, n_steps, status = zip(*each, strict=True)
+        counts = (torch.tensor(values, device=a.device) for values in (n_steps, status))
+        return Solution(torch.cat(amplitudes), torch.cat(energies), torch.cat(norms), *counts)
+
+    def _minimised(self, a: Tensor, placement: Placement, max_steps: int) -> tuple[Tensor, Tensor, Tensor, int, Status]:
+        value, gradient, status, n_steps = self.value(a, placement), self.gradient(a, placement), Status.OUT_OF_STEPS, 0
+        first = gradient.norm(dim=-1).clamp_min(torch.finfo(a.dtype).tiny)
+        if not first.isfinite():
+            return a, value, first, 0, Status.INVALID
+        while n_steps < max_steps:
+            step = self._solver(a, placement, RESIDUAL_OF_STEP)(-gradient)
+            if bool(step.abs().max() <= SMALL_STEP):  # energies do not resolve it
+                a, status = a + step, Status.CONVERGED
+                break
+            slope, length = (gradient * step).sum(), 1.0
+            slack = energy_rounding(a.dtype) * value.abs()
+            while not (there := self.value(a + length * step, placement)) <= value + DECREASE * length * slope + slack:
+                length *= 0.5
+                if not length > SHORTEST:
+                    return a, value, gradient.norm(dim=-1) / first, n_steps, Status.STALLED
+            a, value, n_steps = a + length * step, there, n_steps + 1
+            gradient = self.gradient(a, placement)
+        return a, value, gradient.norm(dim=-1) / first, n_steps, status
+
+    # -------------------------------------------------------------------------------------------- the Hessian's inverse
+    def inverse(self, a: Tensor, placement: Placement, converged: Tensor) -> Solve:
+        """Products with the inverse of the Hessian, differentiable in the vector, the amplitudes and the placement.
+
+        Those of samples that did not converge are zero. *Shape:* ``(B, 3 n) -> (B, 3 n)``.
+        """
+        tensors, tree = trees.leaves(placement), trees.skeleton(placement)
+
+        def make(a: Tensor, converged: Tensor, *tensors: Tensor) -> list[Solve]:
+            flat = [x.flatten(0, x.dim() - n) for x, n in zip((a, converged, *tensors), ranks, strict=True)]
+            n = max(map(len, flat))  # under vmap, some are those of all samples
+            a, converged, *others = (x.repeat(n // len(x), *[1] * (x.dim() - 1)) for x in flat)
+            place = trees.filled(tree, others)
+            rows = [slice(i, i + 1) for i in range(n)]
+            return [
+                self._solver(a[i], trees.rows(place, i), RESIDUAL_OF_GRADIENT)
+                if bool(converged[i])
+                else torch.zeros_like
+                for i in rows
+            ]
+
+        ranks = [x.dim() for x in (a, converged, *tensors)]
+        solvers: list[Solve] = made_outside(make, a, converged, *tensors)
+
+        def solve_all(right: Tensor) -> Tensor:
+            rows = right.flatten(0, -2).split(1)
+            return torch.cat([solvers[i % len(solvers)](own) for i, own in enumerate(rows)]).view_as(right)
+
+        def solve(right: Tensor) -> Tensor:
+            found = solve_by(lambda: solve_all, right)
+            if recorded(found, a, *tensors):
+                # Its derivative: that of the Hessian's product, solved once more.
+                product = torch.func.vjp(lambda a: self.gradient(a, placement), a)[1](found)[0]
+                found = found + solve_by(lambda: solve_all, torch.where(converged[:, None], right - product, 0))
+            return found
+
+        return solve
+
+    @torch.no_grad()
+    def _solver(self, a: Tensor, placement: Placement, tolerance: float) -> Solve:
+        """Solves with the Hessian of one sample by conjugate gradients, preconditioned by factors of all but totals.
+
+        Where that is indefinite, it ends early, in a direction that goes downhill.
+        """
+        at = self._linearise(a, placement)
+        try:
+            precondition = self._factors(at, placement, False)
+        except (ValueError, RuntimeError):  # the latter where it is singular
+            precondition = self._factors(at, placement, True)
+
+        def product(field: Tensor) -> Tensor:
+            with torch.enable_grad():
+                leaf = a.detach().requires_grad_()
+                return torch.autograd.grad(self.gradient(leaf, placement), leaf, field)[0]
+
+        def solve(right: Tensor) -> Tensor:
+            residual, solution = right, torch.zeros_like(right)
+            direction = preconditioned = precondition(residual)
+            size = first = (residual * preconditioned).sum()
+            for k in range(MOST_ITERATIONS):
+                along = product(direction)
+                curvature = (direction * along).sum()
+                if not curvature > 0:
+                    return solution if k else preconditioned
+                solution = solution + size / curvature * direction
+                residual = residual - size / curvature * along
+                preconditioned = precondition(residual)
+                previous, size = size, (residual * preconditioned).sum()
+                if not size > tolerance**2 * first:
+                    break
+                direction = preconditioned + size / previous * direction
+            return solution
+
+        return solve
+
+    def _factors(self, at: Sequence[Linearised], placement: Placement, convex: bool) -> Solve:
+        """The inverse of the Hessian of all but totals, or of its part that is never negative.
+
+        Raises:
+            ValueError: It is not positive definite.
+        """
+        n, own, values = self.n_amplitudes, iter(self.entries), []
+        rows, columns = (np.concatenate(each) for each in zip(*(entry[1:] for entry in self.entries), strict=True))
+        for part, one in zip(self.energy.parts, at, strict=True):
+            if not part.term.total:
+                blocks = _hessians(part, one, convex)[..., 0, :].cpu().numpy()
+                values.append(blocks.reshape(-1)[next(own)[0]])
+        whole = sparse.coo_matrix((np.concatenate(values), (rows, columns)), shape=(n, n)).tocsr()
+        # Not CHOLMOD, which prints where a matrix is indefinite.
+        factors = factorize(whole + float(self._ridge(placement)) * sparse.eye(n, format="csr"))
+        if not factors.U.diagonal().min() > 0:
+            raise ValueError("the Hessian is not positive definite")
+        return lambda right: torch.from_numpy(factors.solve(right.cpu().numpy().T).T).to(right)
+
+
+def _entries(part: OnMesh, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Places among the entries of all elements' Hessians, ``(n, 3, n, 3, M)``; rows and columns of the matrix."""
+    vertex = numbers[part.corners.numpy()]  # (n, M)
+    coordinate = np.where(vertex[:, None] >= 0, 3 * vertex[:, None] + np.arange(3)[:, None], -1)  # (n, 3, M)
+    shape = (*coordinate.shape[:2], *coordinate.shape)
+    rows = np.broadcast_to(coordinate[:, :, None, None], shape).reshape(-1)
+    columns = np.broadcast_to(coordinate, shape).reshape(-1)
+    places = np.flatnonzero((rows >= 0) & (columns >= 0))
+    return places, rows[places], columns[places]
+
+
+def _hessians(part: OnMesh, one: Linearised, convex: bool) -> Tensor:
+    """Hessians of the energies of elements in their vertices. *Shape:* ``(n, 3, n, 3, B, M)``."""
+    curvature = one.curvature if convex or one.beyond is None else one.curvature + one.beyond
+    slope = one.slope
+    if convex:  # what stretched elements of two vertices have across; others may have any sign
+        slope = slope.clamp_min(0) if len(one.gradients) == 1 else torch.zeros_like(slope)
+    outer = (curvature * one.gradients)[:, :, None, None] * one.gradients
+    blocks = outer + slope * part.term.hessians(one.edge_vectors)
+    for _ in range(2):
+        blocks = torch.stack(part.on_corners(blocks)).movedim((0, 1), (2, 3))
+    return blocks
