@@ -15,6 +15,8 @@ from .data.random_transforms import RandomBlend as RandomBlend
 from .data.random_transforms import RandomExtrapolation as RandomExtrapolation
 from .data.random_transforms import RandomInBetween as RandomInBetween
 from .data.random_transforms import RandomRigidMotion as RandomRigidMotion
+from .data.samples import Sample as Sample
+from .data.samples import load_sample as load_sample
 from .data.shape_batch import ShapeBatch as ShapeBatch
 from .data.space import ShapeSpace as ShapeSpace
 from .data.stored import StoredSet as StoredSet

@@ -1,6 +1,8 @@
 """The documentation's site: it builds without a warning, and has every page and every public name in it."""
 
 import ast
+import inspect
+import pydoc
 import re
 import shutil
 import subprocess
@@ -12,10 +14,12 @@ from types import ModuleType
 import nbformat
 import pytest
 from nbclient import NotebookClient
-from snippets import ROOT, blocks
+from snippets import PAGES, ROOT, blocks, run_python
 from test_examples import load_example
 
 import torch_modal as tm
+from torch_modal.backends.torch.backend import TorchBackend
+from torch_modal.cli.main import COMMANDS, build_parser
 
 DOCS = ROOT / "docs"
 NOTEBOOKS = sorted((DOCS / "notebooks").glob("*.ipynb"))
@@ -55,6 +59,117 @@ def test_every_command_and_benchmark_is_shown(extension: ModuleType) -> None:
     assert {"quality.py", "speed.py", "motion.py"} <= set(shown)
     for name in re.findall(r"`(\w+\.py)`", (DOCS / "benchmarks.md").read_text()):
         assert name in shown, name
+
+
+# ------------------------------------------------------------------------------------------- what the pages speak of
+TABLES = {
+    ("extending", "member"): tm.Term,
+    ("extending", "method"): TorchBackend,
+    ("registration", "field"): tm.Registration,
+}
+"""Classes whose members the first column of a table names, by page and heading; others are headed ``tm.NAME``."""
+VARIABLES: dict[str, type] = {
+    **{"space": tm.ShapeSpace, "layer": tm.InBetween, "editor": tm.PathEditor, "passengers": tm.Passengers},
+    **{"augment": tm.AugmentationSequential, "components": tm.Components, "found": tm.Fitted, "solution": tm.Solution},
+}
+"""Names by which the pages call objects of the package in running text."""
+
+
+def has_member(owner: type, name: str) -> bool:
+    """Members of a class, and attributes that its methods set."""
+    sources = [inspect.getsource(each) for each in owner.__mro__ if each.__module__.startswith("torch_modal.")]
+    own = rf"self\.{name}\b.* = |^    {name}: |register_buffer\(\"{name}\""
+    return hasattr(owner, name) or any(re.search(own, source, re.M) for source in sources)
+
+
+def options() -> dict[str, set[str]]:
+    """Options of each command, and of all of them together with those of the scripts as ``""``."""
+    (commands,) = (action.choices for action in build_parser()._actions if isinstance(action.choices, dict))
+    found = {name: set(parser._option_string_actions) for name, parser in commands.items()}
+    scripts = [*(ROOT / "tests" / "benchmarks").glob("*.py"), *(ROOT / "examples").rglob("*.py")]
+    words = [word for file in scripts for word in re.findall(r'"(--[a-z][\w-]*)"', file.read_text())]
+    return {**found, "": set(words).union(*found.values())}
+
+
+def missing(text: str, page: str = "") -> set[str]:
+    """Commands, options, public names, members and files that a page names and that do not exist."""
+    known, found, tables = options(), set(), dict(TABLES)
+    for command, rest in re.findall(r"torch-modal ([a-z][\w-]*)([^`#\n]*)", text.replace("\\\n", " ")):
+        if command in COMMANDS:
+            wrong = set(re.findall(r"(?<!\S)--[a-z][\w-]*", rest)) - known[command]
+            found |= {f"torch-modal {command} {option}" for option in wrong}
+        else:
+            found.add(f"torch-modal {command}")
+    found |= set(re.findall(r"`(--[a-z][\w-]*)", text)) - known[""]
+    for name in re.findall(r"\b(?:tm|torch_modal)((?:\.[A-Za-z_]\w*)+)", text):
+        if pydoc.locate(f"torch_modal{name}") is None:
+            found.add(f"tm{name}")
+    for path, test in re.findall(r"(?<![\w./-])((?:torch_modal|tests|examples|docs)/[\w./-]*\w)(?:::(\w+))?", text):
+        if not (ROOT / path).exists() or (test and f"def {test}(" not in (ROOT / path).read_text()):
+            found.add(f"{path}::{test}" if test else path)
+    files = [f"/{file.relative_to(ROOT).as_posix()}" for file in ROOT.rglob("*.py")]
+    found |= {
+        path for path in re.findall(r"`((?:\w+/)*\w+\.py)\b", text) if not any(f.endswith(f"/{path}") for f in files)
+    }
+    for variable, member in re.findall(r"`(\w+)\.(?!py\b)([A-Za-z_]\w*)", text):
+        owner = VARIABLES.get(variable) or getattr(tm, variable, None)
+        if inspect.isclass(owner) and not has_member(owner, member):
+            found.add(f"{variable}.{member}")
+    heading: str | None = None
+    for line in text.splitlines():
+        first = re.match(r"\| ([^|]+) \|", line)
+        if first is None:
+            heading = heading if line.startswith("|") else None
+        elif heading is None:
+            heading = first[1]
+            if match := re.match(r"`tm\.(\w+)`", heading):
+                tables[page, heading] = getattr(tm, match[1])
+        else:
+            names = re.findall(r"`([A-Za-z_]\w*)[^`]*`", first[1])
+            if heading == "folder":
+                folder, *_ = re.findall(r"`(\w+)/`", first[1])
+                named = [f"{folder}/{name}" for name in re.findall(r"`(\w+(?:\.py|/))`", line.partition(" | ")[2])]
+                found |= {name for name in named if not (ROOT / "torch_modal" / name).exists()}
+            elif owner := tables.get((page, heading)):
+                found |= {f"{owner.__name__}.{name}" for name in names if not has_member(owner, name)}
+    return found
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_what_a_page_names_exists(page: Path) -> None:
+    assert missing(page.read_text(encoding="utf-8"), page.stem) == set()
+
+
+def test_what_does_not_exist_is_found() -> None:
+    text = """
+`torch-modal compress a.obj`, `torch-modal view --bones 3 --lines` and `--faster`; tm.InBetween and `tm.Between` of
+torch_modal.layers.in_betwixt, tm.losses.Shell, `tests/project/test_docs.py::test_nothing`, `examples/walk.py`,
+`solve/minimize.py`, `solve/minimise.py`, `space.sample(3)`, `space.samples` and `Solution.state`.
+
+| member | meaning |
+|---|---|
+| `weights(edge_vectors)`, `blocks` | |
+
+| `tm.Solver`: how |
+|---|
+| `max_steps=80`, `min_steps=1` |
+
+| folder | contents |
+|---|---|
+| `solve/` | `implicit.py`, `explicit.py` |
+"""
+    assert missing(text, "extending") == {
+        *("torch-modal compress", "torch-modal view --lines", "--faster", "tm.Between", "tm.losses.Shell"),
+        *("tm.layers.in_betwixt", "tests/project/test_docs.py::test_nothing", "examples/walk.py"),
+        *("solve/minimize.py", "solve/explicit.py", "space.samples", "Solution.state", "Term.blocks"),
+        *("Solver.min_steps", "explicit.py"),
+    }
+
+
+def test_the_first_block_runs_in_an_empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    run_python(blocks(ROOT / "README.md")[0], names := {})
+    assert names["frames"].shape == (17, 3782, 3) and [file.name for file in tmp_path.iterdir()] == ["grasp.glb"]
 
 
 # -------------------------------------------------------------------------------------------------------- messages
