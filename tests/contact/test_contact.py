@@ -504,6 +504,20 @@ def test_scanned_like_figure_walks_with_few_crossings(women: Shapes) -> None:
     assert int(pushed.solution.n_crossing) <= 0.2 * before
 
 
+@pytest.mark.parametrize("goes_on", [(False, False), (True, False), (False, True), (True, True)])
+def test_each_side_has_half_of_the_room_at_a_keyframe(goes_on: tuple[bool, bool]) -> None:
+    """Where the motion goes on, twice the displacement beside it is within the bound, added to the acceleration."""
+    x = torch.zeros(4, 1, 3, dtype=DOUBLE)
+    x[[0, 3], 0, 0] = torch.tensor([0.4, 0.2], dtype=DOUBLE)
+    turn = torch.tensor([[0, -1, 0], [1, 0, 0], [0, 0, 1]], dtype=DOUBLE)  # the viewer sees -y as x
+    limit = AccelerationLimit(x, turn.repeat(2, 1, 1), goes_on, 1.0)
+    found, limited = limit.nearest(torch.tensor([0, -0.7, 0], dtype=DOUBLE).expand(2, 1, 3))
+    assert len(limited) == any(goes_on)  # |0.4 - 2 * 0.7 + 0.7| and |0.2 + 0.7 - 2 * 0.7| are below 1
+    for side, bounded in zip((0.4 - 2 * found[0, 0, 1], 0.2 - 2 * found[1, 0, 1]), goes_on, strict=True):
+        assert float(side) < 1.011 or not bounded
+    assert float(found[:, 0, 1].max()) < -0.1 and float(found[..., [0, 2]].abs().max()) < 1e-9
+
+
 def test_shapes_rest_as_far_as_accelerations_allow(generator: torch.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
     """Shapes on springs of different stiffness, held below the limit: SciPy finds the same rest."""
     n, places = 7, 2 * torch.randn(7, 3, 3, dtype=DOUBLE, generator=generator)

@@ -1,7 +1,9 @@
 """Local interpolation of the regions that the modes reach worst, and the preset "paper" as a whole."""
 
+from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from conftest import Shapes
@@ -14,7 +16,8 @@ from torch_modal.energy.shell import ShellEnergy
 from torch_modal.energy.stretch import Stretch
 from torch_modal.energy.term import Mesh
 from torch_modal.energy.volume import Volume
-from torch_modal.inbetween.regions import LocalInterpolation, fitting_error, segments, worst_regions
+from torch_modal.inbetween import regions as regions_module
+from torch_modal.inbetween.regions import NO_ERROR, LocalInterpolation, fitting_error, segments, worst_regions
 from torch_modal.inbetween.settings import Objective, Solver
 from torch_modal.layers.mid_shape import MidShape
 from torch_modal.solve.minimise import Status
@@ -44,6 +47,77 @@ def test_segments_are_connected_and_regions_are_the_worst_of_them(layer: MidShap
     faces = layer.in_between.core.mesh.faces
     grown = regions[2].index_fill(0, faces[regions[2][faces].any(1)].flatten(), True)
     assert torch.equal(inner(layer), grown) and grown.sum() > regions[2].sum()
+
+
+@pytest.fixture
+def strip(generator: torch.Generator) -> tuple[Any, Tensor]:
+    """Two shapes of a strip of 24 vertices with unequal areas, and a random mode of each; the shapes."""
+    i = torch.arange(18).view(3, 6)[:, :5].flatten()
+    faces = torch.cat([torch.stack([i, i + 6, i + 1], 1), torch.stack([i + 1, i + 6, i + 7], 1)])
+    grid = torch.cartesian_prod(torch.arange(4), torch.arange(6)).double()
+    x = torch.stack([torch.nn.functional.pad(grid, (0, 1)), torch.nn.functional.pad(1.3 * grid, (1, 0))])
+    x = x + 0.2 * torch.randn(x.shape, dtype=x.dtype, generator=generator)
+    areas = torch.rand(24, dtype=x.dtype, generator=generator) ** 3
+    coarse = SimpleNamespace(weights=areas / areas.sum(), mesh=Mesh.of(faces, 24), restrict=lambda shapes: shapes)
+    ends = []
+    for _ in range(2):
+        mode = torch.randn(1, 24, 3, dtype=x.dtype, generator=generator)
+        mode = mode / (coarse.weights * mode.square().sum(-1)).sum().sqrt()
+        ends.append(SimpleNamespace(coarse=coarse, basis=SimpleNamespace(coarse=mode)))
+    return SimpleNamespace(first=ends[0], second=ends[1]), x
+
+
+def test_segments_are_those_of_a_slow_search(strip: tuple[Any, Tensor]) -> None:
+    """Of all neighbours the pair whose union adds least to the distances from rigid motions, by least squares."""
+    space, shapes = strip
+    mesh, areas = space.first.coarse.mesh, space.first.coarse.weights
+    ends = []
+    for end, x in zip((space.first, space.second), shapes, strict=True):
+        (mode,) = end.basis.coarse
+        side, rate = (y[mesh.edges[:, 1]] - y[mesh.edges[:, 0]] for y in (x, mode))
+        stiffness = ((rate * side).sum(1) ** 2 / side.norm(dim=1) ** 3).sum()  # of the energy, but for a factor
+        turns = torch.linalg.cross(torch.eye(3).to(x)[None], x[:, None]).mT
+        rigid = torch.cat([torch.eye(3).to(x).expand_as(turns), turns], 2)
+        ends.append((rigid * areas.sqrt()[:, None, None], mode * (areas / stiffness).sqrt()[:, None]))
+
+    def cost(part: frozenset[int]) -> float:
+        some = sorted(part)
+        each = ((rigid[some].flatten(0, 1).numpy(), mode[some].flatten().numpy()) for rigid, mode in ends)
+        return sum(float(((a @ np.linalg.lstsq(a, b, rcond=None)[0] - b) ** 2).sum()) for a, b in each)
+
+    parts = [frozenset([i]) for i in range(24)]
+    while len(parts) > 4:
+        joined = {
+            a | b: (a, b) for i, j in mesh.edges.tolist() for a in parts for b in parts if i in a and j in b and a != b
+        }
+        a, b = joined[min(joined, key=lambda whole: cost(whole) - cost(joined[whole][0]) - cost(joined[whole][1]))]
+        parts = [part for part in parts if part not in (a, b)] + [a | b]
+    found = segments(space, shapes, 4)
+    assert {frozenset(np.flatnonzero(found == i).tolist()) for i in range(4)} == set(parts)
+
+
+def test_fitting_error_is_that_of_weighted_least_squares(strip: tuple[Any, Tensor]) -> None:
+    space, shapes = strip
+    way, root = shapes[1] - shapes[0], space.first.coarse.weights.sqrt()[:, None]
+    squares = torch.zeros(24, dtype=way.dtype)
+    for end in (space.first, space.second):
+        (mode,) = end.basis.coarse
+        amplitude = torch.linalg.lstsq((root * mode).view(-1, 1), (root * way).view(-1, 1)).solution
+        squares += (way - amplitude * mode).square().sum(1)
+    torch.testing.assert_close(torch.from_numpy(fitting_error(space, shapes)), squares.sqrt())
+
+
+def test_the_worst_region_is_that_of_the_largest_mean_over_its_area(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Means of 1.3, 2 and nearly nothing, by hand; without areas the first would be 2.5."""
+    error = NO_ERROR * 100 * np.array([1e6, 4e6, 2e6, 2e6, 0.99, 0.99])
+    monkeypatch.setattr(regions_module, "segments", lambda *given: np.array([0, 0, 1, 1, 2, 2]))
+    monkeypatch.setattr(regions_module, "fitting_error", lambda *given: error)
+    weights, clusters = torch.tensor([9.0, 1, 1, 1, 1, 1]).double(), torch.tensor([5, 4, 3, 3, 1, 0])
+    space: Any = SimpleNamespace(first=SimpleNamespace(coarse=SimpleNamespace(weights=weights, clusters=clusters)))
+    found = [worst_regions(space, torch.zeros(2, 6, 3), n).nonzero().flatten().tolist() for n in (1, 2, 3)]
+    assert found == [[2, 3], [2, 3, 4, 5], [2, 3, 4, 5]]
+    error[4:] *= 1.02
+    assert bool(worst_regions(space, torch.zeros(2, 6, 3), 3).all())
 
 
 def test_minimises_eq_5_against_measures_half_way_and_moves_nothing_else(
