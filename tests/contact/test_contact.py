@@ -1,12 +1,15 @@
 """In-betweens whose parts do not pass through each other: alone, along a trajectory, and their gradients."""
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from conftest import Shapes
+from scipy.integrate import quad
+from scipy.interpolate import CubicSpline
 from scipy.optimize import minimize
 from torch import Tensor
 
@@ -314,6 +317,17 @@ def test_contacts_of_earlier_rounds_stay_active(fists: Shapes) -> None:
     assert int(solution.n_crossing) == 0
 
 
+def test_edges_that_cross_beside_all_vertices_come_apart(data_dir: Path) -> None:
+    """Thumb and palm of long triangles: with the gap of the first rounds kept, 4, 4 and 8 pairs stay."""
+    keyframes, faces = tm.load_keyframes([data_dir / "mh-hand-path" / f"0{i}.obj" for i in (4, 8)])
+    hand = Shapes(keyframes, faces, tm.extract_bases(keyframes, faces, 30, mesher="lattice", progress=False))
+    t = torch.tensor([0.1875, 0.4375, 0.5], dtype=DOUBLE)
+    with torch.no_grad():
+        plain = tm.InBetween(hand.bases, faces)(*keyframes, t)
+        pushed = tm.InBetween(hand.bases, faces, contact=True)(*keyframes, t)
+    assert int(far(plain, hand).min()) > 30 and far(pushed, hand).tolist() == [0, 0, 0]
+
+
 @pytest.mark.parametrize(
     ("files", "most"),
     [
@@ -502,6 +516,48 @@ def test_scanned_like_figure_walks_with_few_crossings(women: Shapes) -> None:
     before, after = (len(crossings.far_pairs(result.shapes.numpy())) for result in (plain, pushed))
     assert before > 50 and after <= 0.2 * before
     assert int(pushed.solution.n_crossing) <= 0.2 * before
+
+
+def test_shapes_beside_keyframes_that_intersect_themselves_all_take_steps() -> None:
+    t = torch.arange(1, 64, dtype=DOUBLE) / 64
+    for pairs, some in (([], [1]), ([(0, 1)], range(1, 8))):
+        search: Any = SimpleNamespace(search=SimpleNamespace(crossings=SimpleNamespace(known_pairs=pairs)))
+        wanted = {*range(4, 64, 4), *some, *(64 - i for i in some)}
+        assert separate._chosen(t, search).tolist() == [i - 1 for i in sorted(wanted)]
+
+
+def test_neighbours_in_time_are_watched_on_either_side(hand: Shapes) -> None:
+    search = ContactSearch(Mesh.of(hand.faces, 3782), hand.keyframes, torch.ones(3782), 9)
+    search.watch(Contacts(torch.tensor([4]), hand.faces[:1, [0, 1, 2, 0]]), 2)
+    rings = search.search.crossings.grown(hand.faces[0].numpy(), 2)
+    assert 3 < rings.sum() < 100
+    assert [bool((row == rings).all()) for row in search.watched] == [2 <= i <= 6 for i in range(9)]
+
+
+def test_the_first_displacement_is_smooth_as_its_integral_says(generator: torch.Generator) -> None:
+    """Forces on one mode at four times, and springs: the minimum with the squared acceleration by quadrature."""
+    n, times = 400, torch.tensor([0.2, 0.4, 0.5, 0.8], dtype=DOUBLE)
+    mode, x = torch.randn(2, 1, 5, 3, dtype=DOUBLE, generator=generator)
+    masses = torch.rand(5, dtype=DOUBLE, generator=generator)
+    slope, springs = torch.randn(4, 1, dtype=DOUBLE, generator=generator), torch.tensor([5.0, 1, 2, 3], dtype=DOUBLE)
+    spline = through(times, torch.linspace(0, 1, n + 1, dtype=DOUBLE))
+    nothing = Contacts(torch.zeros(0, dtype=torch.int64), torch.zeros(0, 4, dtype=torch.int64))
+    shapes = x.expand(4, -1, -1).contiguous()
+    energy = ContactEnergy(nothing, masses, shapes)
+    given: Any = slope, springs[:, None, None], shapes, energy, spline[2:] - 2 * spline[1:-1] + spline[:-2]
+    found = modal.modal_displacement(mode, masses, *given)
+    knots = np.array([0, 0.2, 0.4, 0.5, 0.8, 1])
+    rates = CubicSpline(knots, np.eye(6)[:, 1:-1], bc_type="natural").derivative(2)
+    bend = [
+        [quad(lambda t, i=i, j=j: rates(t)[i] * rates(t)[j], 0, 1, points=knots[1:-1])[0] for i in range(4)]
+        for j in range(4)
+    ]
+    inertia = float((masses * mode[0].square().sum(-1)).sum())
+    hessian = torch.diag(springs) + 2 * modal.SMOOTHNESS * inertia * torch.tensor(bend, dtype=DOUBLE)
+    amplitudes = torch.linalg.solve(hessian, -slope)
+    torch.testing.assert_close(
+        found, amplitudes[:, :, None] * mode, rtol=0.02, atol=1e-4 * float(amplitudes.abs().max())
+    )
 
 
 @pytest.mark.parametrize("goes_on", [(False, False), (True, False), (False, True), (True, True)])

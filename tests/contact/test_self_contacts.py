@@ -21,9 +21,9 @@ from torch_modal.geometry.triangle_pairs import pierce_nearly, triangles_cross
 pytest.importorskip("ipctk")
 
 
-def two_boxes(overlap: float, levels: int = 2) -> tuple[torch.Tensor, torch.Tensor]:
+def two_boxes(overlap: float, levels: int = 2, width: float = 0.613) -> tuple[torch.Tensor, torch.Tensor]:
     """A cube of side 1 and a thinner box that overlap along x by so much: one mesh of two pieces."""
-    first, second = trimesh.creation.box((1, 1, 1)), trimesh.creation.box((1, 0.613, 0.587))
+    first, second = trimesh.creation.box((1, 1, 1)), trimesh.creation.box((1, width, 0.587))
     for _ in range(levels):
         first, second = first.subdivide(), second.subdivide()
     second.apply_translation((1 - overlap, 0.031, 0.017))
@@ -159,6 +159,16 @@ def test_depth_is_that_of_the_overlap(overlap: float) -> None:
     assert float(found.depth.max()) == pytest.approx(overlap, abs=1e-9)
     apart = tm.self_contacts(two_boxes(-0.01)[0], faces)
     assert int(apart.number) == 0 and float(apart.depth.max()) == 0
+
+
+def test_depth_is_not_the_thickness_of_what_went_in() -> None:
+    """The corners at its end face its own sides, which are nearer than the surface that they went through."""
+    x, faces = two_boxes(0.065, levels=1, width=0.05)
+    place = torch.where(torch.arange(len(x)) < len(x) // 2, torch.nan, x[:, 0] - 0.435)  # along the thin one
+    x[(place - 0.5).abs() < 1e-9, 0] = 0.435 + 0.063  # a row of its faces is inside as a whole
+    end = place.abs() < 1e-9
+    assert int(end.sum()) == 9
+    torch.testing.assert_close(tm.self_contacts(x, faces).depth[end], torch.full_like(x[end, 0], 0.065))
 
 
 def test_what_crosses_in_a_keyframe_is_not_new() -> None:

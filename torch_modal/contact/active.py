@@ -113,11 +113,9 @@ class ContactSearch:
 
     def watch(self, contacts: Contacts, around: int) -> None:
         """Watch the surroundings of contacts, in their shapes and in so many neighbours in time on either side."""
-        before = self.watched.copy()
         for i in contacts.shapes.unique().tolist():
             vertices = contacts.elements[contacts.shapes == i].unique().cpu().numpy()
-            before[max(0, i - around) : i + around + 1] |= self.search.crossings.grown(vertices, 2)
-        self.watched = before
+            self.watched[max(0, i - around) : i + around + 1] |= self.search.crossings.grown(vertices, 2)
 
 
 def _numbers(x: Tensor) -> FloatArray:
@@ -127,8 +125,8 @@ def _numbers(x: Tensor) -> FloatArray:
 class ContactEnergy:
     """Energy of the active contacts of a batch, from areas of the vertices. *Shape:* ``(V,), (B, V, 3)``."""
 
-    def __init__(self, contacts: Contacts, areas: Tensor, like: Tensor) -> None:
-        self.shapes, elements = contacts
+    def __init__(self, contacts: Contacts, areas: Tensor, like: Tensor, gap: float = GAP) -> None:
+        self.gap, (self.shapes, elements) = gap, contacts
         #: The vertices of each contact, in rows of all shapes. *Shape:* ``(4, N)``.
         self.corners = (elements + (self.shapes * like.shape[1])[:, None]).T.contiguous()
         self.weights = STIFFNESS * areas.to(like)[elements[:, 3]]
@@ -148,7 +146,7 @@ class ContactEnergy:
         height = (normal * to_vertex).sum(0)
         within = (to_vertex - height * normal) * per_length
         gradients = torch.stack([cross(other, within), cross(within, side), normal])
-        return (height - GAP).clamp_max(0), torch.cat([-gradients.sum(0)[None], gradients])
+        return (height - self.gap).clamp_max(0), torch.cat([-gradients.sum(0)[None], gradients])
 
     def value(self, x: Tensor) -> Tensor:
         """Energy of each shape. *Shape:* ``(B, V, 3) -> (B,)``."""

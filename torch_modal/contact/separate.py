@@ -18,7 +18,7 @@ from torch import Tensor
 
 from torch_modal.backends.torch.fine_steps import Beside
 from torch_modal.contact.acceleration import AccelerationLimit
-from torch_modal.contact.active import ContactEnergy, Contacts, ContactSearch, Pull
+from torch_modal.contact.active import GAP, ContactEnergy, Contacts, ContactSearch, Pull
 
 LOOKED_AT = 8
 """Number of shapes that are looked at first: without intersections there, nothing is done."""
@@ -30,6 +30,8 @@ AROUND = 2
 """Neighbours in time of shapes with contacts, in which the same vertices are watched."""
 ROUNDS = 4, 8
 """Least and largest number of rounds."""
+WIDER = 0.075
+"""Growth of the gap of a shape alone in each further round: edges of long triangles cross before a vertex is inside."""
 PULL = 40.0
 """Stiffness of the pull to the bounded displacement, by area; a contact has 3,000."""
 MOST_MOVED = 3.0
@@ -119,7 +121,9 @@ def _settled(
     # Shapes that relax on their own, what the bound took from them so far, and springs of the vertices it limits.
     alone, dual, springs = x, torch.zeros_like(x), torch.zeros_like(x[0, :, 0])
     for k in range(1, ROUNDS[1] + 1):
-        energies = _energies(active.rows(chosen), Pull((x - dual)[chosen].detach(), springs), search.areas)
+        # Of a trajectory, wider gaps where it cannot be separated would disturb the shapes beside.
+        gap = GAP if timeline is not None else GAP + WIDER * max(0, k - ROUNDS[0])
+        energies = _energies(active.rows(chosen), Pull((x - dual)[chosen].detach(), springs), search.areas, gap)
         alone = x.index_copy(0, chosen, relax(alone[chosen], chosen, energies))
         if timeline is None:
             x = alone
@@ -145,15 +149,13 @@ def _settled(
     return best, n_best
 
 
-def _energies(active: Contacts, pull: Pull, areas: Tensor) -> Beside:
+def _energies(active: Contacts, pull: Pull, areas: Tensor, gap: float = GAP) -> Beside:
     """Energies beside the elastic one of the shapes that take steps, of which a slice is relaxed at a time."""
 
     def beside(own: slice, like: Tensor) -> Sequence[ContactEnergy | Pull]:
         some = torch.arange(len(pull.to), device=like.device)[own]
-        energies: list[ContactEnergy | Pull] = [ContactEnergy(active.rows(some), areas, like)]
-        if bool(pull.weights.any()):
-            energies.append(Pull(pull.to[own].to(like), pull.weights.to(like)))
-        return energies
+        springs = [Pull(pull.to[own].to(like), pull.weights.to(like))] if bool(pull.weights.any()) else []
+        return [ContactEnergy(active.rows(some), areas, like, gap), *springs]
 
     return beside
 
