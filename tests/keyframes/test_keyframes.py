@@ -12,6 +12,7 @@ import torch
 import trimesh
 from bodies import twisted_plate
 
+from torch_modal import open_asset, save_animation
 from torch_modal.geometry import inspect
 from torch_modal.geometry.inspect import signed_volume
 from torch_modal.geometry.rigid import looks_mirrored
@@ -181,6 +182,27 @@ def test_paths_that_are_refused(tmp_path):
     ):
         with pytest.raises(error, match=match):
             load_keyframes(paths)
+
+
+def test_a_glb_that_moves_by_itself_is_said_once(tmp_path):
+    scene = trimesh.Scene(trimesh.Trimesh(CUBE, CUBE_FACES, process=False))
+    still = write(tmp_path / "still.glb", scene.export(file_type="glb"))
+    asset = open_asset(still)
+    moving = save_animation(TWO, asset.faces, tmp_path / "moving.glb", asset=asset)
+    text = r"moving\.glb has animations and morph targets: .*at rest.*bake the pose.*\(2 such key-frames\)"
+    with pytest.warns(MeshWarning, match=text) as said:
+        keyframes, _ = load_keyframes([still, moving, moving])
+    assert len(said) == 1
+    np.testing.assert_allclose(keyframes, np.stack([CUBE] * 3), atol=1e-6)
+
+
+def test_equal_key_frames_in_a_row_are_said_once():
+    text = "1 key-frames are equal to the one before; the first is key-frame 2$"
+    with pytest.warns(MeshWarning, match=text) as said:
+        check_keyframes(TWO[[0, 1, 1, 0]], CUBE_FACES)
+    assert len(said) == 1
+    check_keyframes(TWO[[0, 1, 0]], CUBE_FACES)
+    check_keyframes(TWO[[0, 0]], CUBE_FACES, warn=False)
 
 
 CYCLE = {"asset": {"version": "2.0"}, "nodes": [{"children": [0]}], "scenes": [{"nodes": [0]}], "scene": 0}

@@ -77,6 +77,9 @@ def checked_surface(
     if orientable and not (mesh.counts % 2).any():
         _refuse_mirrored(scaled, mesh.faces)
     if flaws is not None:
+        same = np.flatnonzero((shapes[1:] == shapes[:-1]).all(axis=(1, 2))) + 1
+        if len(same):
+            flaws.append(f"{len(same)} key-frames are equal to the one before; the first is key-frame {same[0]}")
         _note_flaws(scaled, mesh, _RESOLUTION[positions.dtype], notes.append)
     return positions, mesh
 

@@ -1,14 +1,15 @@
 """Key-frames from files."""
 
 import os
+import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 import torch
 
-from torch_modal.errors import MeshError
-from torch_modal.io.read import read_mesh, require_same_mesh
+from torch_modal.errors import MeshError, MeshWarning
+from torch_modal.io.read import open_asset, require_same_mesh
 from torch_modal.keyframes.check import Keyframes
 from torch_modal.progress import Progress
 
@@ -56,6 +57,9 @@ def load_keyframes(
         MeshError: A file cannot be read, or differs from the first in its number of vertices or in its faces; or,
             with ``register``, a registration is doubtful.
         MissingPackageError: With ``register``, the extra of that name is not installed.
+
+    Warns:
+        MeshWarning: A file has a skeleton, animations or morph targets.
     """
     if isinstance(paths, (str, bytes, os.PathLike)):
         raise MeshError(f"paths is one path, {os.fspath(paths)!r}; pass a list with one file per key-frame")
@@ -64,7 +68,13 @@ def load_keyframes(
         raise MeshError("paths is empty; pass one file per key-frame")
     if landmarks is not None and not register:
         raise MeshError("landmarks are for registration; pass register=True too")
-    meshes = [read_mesh(path) for path in paths]
+    meshes, posed = [], []
+    for asset in map(open_asset, paths):
+        meshes.append((asset.positions, asset.faces))
+        posed += [f"{asset.path} has {asset.carries['posing']}"] if "posing" in asset.carries else []
+    if posed:
+        text = f"{posed[0]}: the shape at rest is read, so bake the pose to have it ({len(posed)} such key-frames)"
+        warnings.warn(text, MeshWarning, stacklevel=2)
     marks = None
     if landmarks is not None:
         from torch_modal.registration.landmarks import landmark_table
