@@ -104,6 +104,19 @@ def test_any_flipped_bit_and_any_cut_is_noticed(tmp_path: Path) -> None:
             assert entry.read_bytes() == good, f"the entry with byte {place} changed, or cut there, was replaced"
 
 
+def test_the_entry_of_another_computation_is_not_taken(tmp_path: Path) -> None:
+    """A whole entry under the name of another, as of a folder that was copied by hand, is computed again."""
+    other, compute = Counted(), Counted()
+    get(tmp_path, other, POINTS + 1)
+    (entry,) = tmp_path.iterdir()
+    name = entry_name("thing", {"points": POINTS}, {})
+    entry.rename(tmp_path / name)
+    for calls in (1, 1):
+        assert_right(get(tmp_path, compute))
+        assert compute.calls == calls
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
 def test_folder_that_cannot_be_made(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("in the way")
     with pytest.warns(CacheWarning, match="TORCH_MODAL_CACHE or cache_dir"):

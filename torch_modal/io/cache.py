@@ -112,6 +112,8 @@ class Cache:
         path = self.folder / entry_name(kind, inputs, parameters)
         with contextlib.suppress(OSError, ValueError):  # missing or damaged
             file = TensorFile(path, FORMAT, str(CACHE_VERSION))
+            if file.metadata.get("entry") != path.name:
+                raise ValueError(f"{path} holds another's content")
             found = {name: tensor.numpy() for name, tensor in file.tensors().items()}
             with contextlib.suppress(OSError):  # removed meanwhile, or not writable
                 os.utime(path)  # the time of the last use
@@ -120,7 +122,7 @@ class Cache:
         tensors = {name: torch.from_numpy(np.array(array)) for name, array in result.items()}
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            write_tensors(path, FORMAT, str(CACHE_VERSION), tensors)
+            write_tensors(path, FORMAT, str(CACHE_VERSION), tensors, {"entry": path.name})
             self._make_room(path)
         except OSError as error:
             warnings.warn(
