@@ -32,7 +32,7 @@ import torch_modal as tm
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.data.samples import sample_files
 from torch_modal.geometry.decimation import decimate
-from torch_modal.io.read import read_mesh
+from torch_modal.io.read import open_asset
 from torch_modal.registration.surface import MeshSurface, referenced
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "examples"))
@@ -58,7 +58,7 @@ HAND_LANDMARKS = (850, 29, 221, 416, 605, 1500, 1291, 1267)
 @cache
 def poses(name: str) -> tuple[FloatArray, IntArray]:
     """All poses of a body. *Shape:* ``(K, V, 3), (F, 3)``."""
-    meshes = [read_mesh(path) for path in BODIES[name]]
+    meshes = [(asset.positions, asset.faces) for asset in map(open_asset, BODIES[name])]
     return np.stack([vertices for vertices, _ in meshes]), meshes[0][1]
 
 

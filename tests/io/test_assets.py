@@ -19,6 +19,7 @@ from textured import BLUE, RED, bend, png, textured_glb, textured_obj, triangles
 import torch_modal as tm
 from torch_modal.errors import MeshError, MeshWarning
 from torch_modal.io.asset import as_png_or_jpeg
+from torch_modal.io.gltf import Document
 from torch_modal.io.obj import ObjAsset
 
 TURN = Rotation.from_rotvec([0.4, -1.1, 0.7]).as_matrix()
@@ -101,15 +102,74 @@ def test_obj_with_its_textures_loads_in_trimesh(tmp_path):
     assert colors == {RED, BLUE}
 
 
-def test_textures_from_elsewhere_get_a_place_beside_the_copy(tmp_path):
+def files_of(folder: Path) -> set[str]:
+    return {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_what_an_obj_names_below_its_folder_keeps_its_place_in_a_copy(tmp_path):
+    """Libraries and textures of one file name in two folders, absolute names, names relative to the OBJ file."""
+    source = textured_obj(tmp_path / "in", "bar.obj")
+    for place, color in (("skins/a.png", RED), ("caps/a.png", BLUE), ("a.png", BLUE)):
+        (tmp_path / "in" / place).parent.mkdir(exist_ok=True)
+        (tmp_path / "in" / place).write_bytes(png(color))
+    (tmp_path / "in" / "skins" / "x.mtl").write_bytes(b"newmtl skin\r\nmap_Kd a.png\r\nbump ../a.png\r\n")
+    caps = f"newmtl cap\nmap_Kd -s 1 1 1 {tmp_path}/in/caps/a.png\nbump blue.png"
+    (tmp_path / "in" / "caps" / "x.mtl").write_text(caps)
+    text = source.read_text().replace("mtllib my bar.mtl", f"mtllib skins/x.mtl {tmp_path}/in/caps/x.mtl")
+    source.write_text(text)
+    asset = tm.open_asset(source)
+    out = write(asset, tmp_path / "out" / "b.obj", asset.positions)
+    wanted = {"skins/x.mtl", "caps/x.mtl", "skins/a.png", "caps/a.png", "a.png", "blue.png"}
+    assert files_of(out.parent) == {"b.obj", *wanted}
+    assert lines_of(out)[1] == "mtllib skins/x.mtl caps/x.mtl"
+    for name in wanted - {"caps/x.mtl"}:
+        assert (out.parent / name).read_bytes() == (source.parent / name).read_bytes()
+    # The copy names its own.
+    library = (out.parent / "caps" / "x.mtl").read_text()
+    assert library == "newmtl cap\nmap_Kd -s 1 1 1 a.png\nbump ../blue.png"
+    for part, color in zip(tm.open_asset(out).parts(), (RED, BLUE), strict=True):
+        assert Image.open(io.BytesIO(part.material.texture)).getpixel((4, 4)) == color
+
+
+def test_what_an_obj_names_outside_its_folder_is_neither_read_nor_copied(tmp_path):
     source = textured_obj(tmp_path / "in" / "deep", "bar.obj")
     (tmp_path / "in" / "outside.png").write_bytes(png(RED))
-    (source.parent / "my bar.mtl").write_text(
-        f"newmtl skin\nmap_Kd ../outside.png\nnewmtl cap\nmap_Kd {source.parent / 'blue.png'}\n"
-    )
-    out = write(tm.open_asset(source), tmp_path / "out" / "a.obj", tube()[0])
-    assert (out.parent / "my bar.mtl").read_text() == "newmtl skin\nmap_Kd outside.png\nnewmtl cap\nmap_Kd blue.png\n"
-    assert (out.parent / "outside.png").read_bytes() == png(RED)
+    (source.parent / "my bar.mtl").write_text("newmtl skin\nmap_Kd ../outside.png\nbump ../outside.png\n")
+    (tmp_path / "in" / "x.mtl").write_text("newmtl cap\nmap_Kd deep/blue.png\n")
+    source.write_text(source.read_text() + "mtllib ../x.mtl\n")
+    asset = tm.open_asset(source)
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        out = write(asset, tmp_path / "out" / "a.obj", tube()[0])
+    why = "is not read, as it lies outside the folder of bar.obj; move it there"
+    assert sorted(str(warning.message) for warning in said) == [
+        f"bar.obj is without a material library: '../x.mtl' {why}",
+        f"bar.obj is without a texture of my bar.mtl: '../outside.png' {why}",
+    ]
+    assert files_of(tmp_path / "out") == {"a.obj", "my bar.mtl"}
+    assert (out.parent / "my bar.mtl").read_bytes() == (source.parent / "my bar.mtl").read_bytes()
+    assert lines_of(out)[-1] == "mtllib ../x.mtl"
+    assert [part.material.texture for part in asset.parts()] == [None, None]
+
+
+def test_a_copy_does_not_take_the_name_of_a_texture(tmp_path):
+    source = textured_obj(tmp_path / "in", "bar.obj")
+    (tmp_path / "in" / "frame-000.obj").write_bytes(png(BLUE))
+    (tmp_path / "in" / "my bar.mtl").write_text("newmtl cap\nmap_Kd frame-000.obj\n")
+    asset = tm.open_asset(source)
+    for out in ("out", "in"):
+        with pytest.raises(ValueError, match=r"frame-000\.obj is the name of a texture or library of bar\.obj"):
+            tm.save_frames(asset.positions[None], asset.faces, tmp_path / out, asset=asset, overwrite=True)
+    assert (tmp_path / "in" / "frame-000.obj").read_bytes() == png(BLUE) and not (tmp_path / "out").exists()
+
+
+def test_a_copy_beside_its_source_leaves_the_library_as_it_is(tmp_path):
+    source = textured_obj(tmp_path, "bar.obj")
+    library = f"newmtl cap\r\nmap_Kd {tmp_path}/blue.png".encode()
+    (tmp_path / "my bar.mtl").write_bytes(library)
+    asset = tm.open_asset(source)
+    write(asset, tmp_path / "again.obj", asset.positions, overwrite=True)
+    assert (tmp_path / "my bar.mtl").read_bytes() == library
 
 
 def test_companions_are_not_overwritten_unasked(tmp_path):
@@ -126,11 +186,38 @@ def test_companions_are_not_overwritten_unasked(tmp_path):
 def test_missing_materials_are_said(tmp_path):
     source = textured_obj(tmp_path, "bar.obj")
     (tmp_path / "blue.png").unlink()
-    with pytest.warns(MeshWarning, match=r"my bar.mtl names the texture blue\.png, which is not there"):
+    with pytest.warns(MeshWarning, match=r"bar.obj is without a texture of my bar.mtl: 'blue\.png' is not there"):
         write(tm.open_asset(source), tmp_path / "new" / "a.obj", tube()[0])
     (tmp_path / "my bar.mtl").unlink()
-    with pytest.warns(MeshWarning, match="which are not there"):
+    with pytest.warns(MeshWarning, match="bar.obj is without a material library: 'my' is not there"):
         write(tm.open_asset(source), tmp_path / "newer" / "a.obj", tube()[0])
+
+
+@pytest.mark.parametrize(
+    ("lines", "wanted"),
+    [
+        ("Kd 0.1 0.2 0.3\nd 0.25", {"color": (0.1, 0.2, 0.3, 0.25)}),
+        ("Kd 0.1 0.2 0.3\nTr 0.25", {"color": (0.1, 0.2, 0.3, 0.75)}),
+        ("d -3", {"color": (0.8, 0.8, 0.8, 0.0)}),
+        ("Tr -3", {"color": (0.8, 0.8, 0.8, 1.0)}),
+        ("Ns 30", {"roughness": 0.5}),  # (2 / 32) ** (1 / 4)
+        ("Ns -1", {"roughness": 1.0}),
+        ("Pr 0.3\nPm 7", {"roughness": 0.3, "metallic": 1.0}),
+        ("Kd nan 0 0\nd nan\nNs inf\nPr -inf\nPm nan\nKd x y z", {"color": (0.8, 0.8, 0.8, 1.0), "roughness": 0.85}),
+        ("map_Kd red.png\nKd 0 0 0", {"color": (0.0, 0.0, 0.0, 1.0)}),
+        (
+            "Kd 0 0 0\nd 0.5\nmap_Kd -clamp on -o 1 2 -mm 0 1 red.png",
+            {"color": (1.0, 1.0, 1.0, 0.5), "texture": png(RED)},
+        ),
+    ],
+)
+def test_lines_of_a_material(tmp_path, lines, wanted):
+    source = textured_obj(tmp_path, "bar.obj")
+    (tmp_path / "red.png").write_bytes(png(RED))
+    (tmp_path / "my bar.mtl").write_text(f"newmtl skin\n{lines}\n")
+    material = tm.open_asset(source).parts()[0].material
+    for name, value in wanted.items():
+        assert getattr(material, name) == (value if name == "texture" else pytest.approx(value))
 
 
 # --------------------------------------------------------------------------------------------------------- PLY, OFF
@@ -347,6 +434,16 @@ def test_glb_accessors_of_all_kinds(tmp_path):
     assert not gltf_validator.issues(out)
     new = trimesh.load_scene(out, process=False)
     assert len(new.geometry) == 2
+
+
+@pytest.mark.parametrize(("code", "dtype"), [(5120, "i1"), (5121, "u1"), (5122, "i2"), (5123, "u2")])
+def test_normalised_integers_are_fractions(code, dtype):
+    """glTF 2.0, 3.6.2.2: the least number of a signed type, too, is -1."""
+    most, least = np.iinfo(dtype).max, np.iinfo(dtype).min
+    document = Document()
+    document.add(np.array([most, 0, least], dtype), "SCALAR", normalized=True)
+    assert document.get("accessors", 0)["componentType"] == code
+    np.testing.assert_array_equal(document.floats(0)[:, 0], [1, 0, -1 if least else 0])
 
 
 def test_glb_keeps_what_this_package_does_not_know(tmp_path):

@@ -79,10 +79,10 @@ def run(args: argparse.Namespace) -> None:
 def _landmarks(args: argparse.Namespace) -> tuple[Page, str]:
     """A page to pick landmarks on meshes of any connectivity, and what it shows."""
     import torch_modal as tm
-    from torch_modal.io.read import read_mesh
+    from torch_modal.io.read import open_asset
     from torch_modal.registration.landmarks import landmark_vertices
 
-    meshes = [read_mesh(path) for path in args.meshes]
+    meshes = [(asset.positions, asset.faces) for asset in map(open_asset, args.meshes)]
     rows = None if args.landmarks is True else landmark_vertices(args.landmarks, [points for points, _ in meshes])
     names = _numbered([path.name for path in args.meshes])
     page = tm.show_landmarks(dict(zip(names, meshes, strict=True)), rows, title="Landmarks")

@@ -28,8 +28,11 @@ def as_png_or_jpeg(data: bytes) -> bytes | None:
 
     stream = io.BytesIO()
     try:
-        Image.open(io.BytesIO(data)).save(stream, format="PNG")
-    except OSError:
+        picture = Image.open(io.BytesIO(data))
+        if picture.width * picture.height > 2**26:  # a small file may promise any size
+            return None
+        picture.save(stream, format="PNG")
+    except Exception:  # damaged pictures may raise any
         return None
     return stream.getvalue()
 

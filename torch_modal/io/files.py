@@ -1,13 +1,18 @@
-"""Atomic writes: a file is whole or absent."""
+"""Atomic writes, where a file is whole or absent, and reads of the files that a mesh file names."""
 
 import contextlib
 import logging
 import os
 import uuid
+import warnings
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
+from torch_modal.errors import MeshWarning
+
 logger = logging.getLogger("torch_modal")
+
+LARGEST_COMPANION = 2**30  # bytes
 
 
 @contextlib.contextmanager
@@ -36,6 +41,34 @@ def temporary_beside(path: Path, ending: str = ".tmp") -> Iterator[Path]:
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink()
+
+
+def read_companion(document: Path, name: str, most: int = LARGEST_COMPANION) -> tuple[str, bytes]:
+    """Path below the folder of a mesh file, and content, of a file that it names.
+
+    Raises:
+        ValueError: It is not there, not below that folder where links lead, not regular, or larger than ``most`` bytes.
+    """
+    folder, shown = document.parent.resolve(), f"{name[:100]!r} is not "
+    try:
+        path = (folder / name).resolve(strict=True)
+        size = path.stat().st_size
+    except (OSError, RuntimeError, ValueError):  # also loops of links, and names that are too long or have a null
+        raise ValueError(f"{shown}there") from None
+    if not path.is_relative_to(folder):
+        raise ValueError(f"{shown}read, as it lies outside the folder of {document.name}; move it there")
+    if not path.is_file() or size > most:
+        raise ValueError(f"{shown}read, as it is no file, or larger than {most} bytes")
+    return path.relative_to(folder).as_posix(), path.read_bytes()
+
+
+def try_companion(document: Path, name: str, what: str, most: int = LARGEST_COMPANION) -> tuple[str, bytes] | None:
+    """Call :func:`read_companion`; None, with a warning that the document is without it, if it is not read."""
+    try:
+        return read_companion(document, name, most)
+    except ValueError as error:
+        warnings.warn(f"{document.name} is without {what}: {error}", MeshWarning, stacklevel=6)
+    return None
 
 
 def write_file(path: Path, data: bytes) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import chain
+from os.path import realpath
 from pathlib import Path
 
 from torch_modal.arrays import Array, FloatArray, IntArray
@@ -95,8 +96,11 @@ def _write(shapes: FloatArray, faces: IntArray, paths: list[Path], asset: Asset 
         asset.check(shapes)
     if asset is not None and asset.suffix == suffix:
         asset.warn_lost(paths[0].name, asset.keeps)
-        beside = [(folder / name, data) for name, data in asset.companions.items()]
-        beside = [(path, data) for path, data in beside if not (path.is_file() and path.read_bytes() == data)]
+        companions = {folder / name: data for name, data in asset.companions.items()}
+        if taken := companions.keys() & paths:
+            raise ValueError(f"{taken.pop()} is the name of a texture or library of {asset.path.name}; take another")
+        if realpath(folder) != realpath(asset.path.parent):  # where they are
+            beside = [(p, data) for p, data in companions.items() if not (p.is_file() and p.read_bytes() == data)]
         for path, _ in beside:
             refuse_existing(path, overwrite)
         files = ((path, asset.with_positions(x)) for path, x in zip(paths, shapes, strict=True))

@@ -9,6 +9,8 @@ from __future__ import annotations
 import base64
 import json
 import struct
+import warnings
+from functools import cache
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -18,26 +20,29 @@ from numpy.typing import NDArray
 from trimesh.transformations import quaternion_matrix
 
 from torch_modal.arrays import FloatArray
+from torch_modal.errors import MeshWarning
 from torch_modal.geometry.skin import STEPS
+from torch_modal.io.files import read_companion
 
 Json = dict[str, Any]
 
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963
-LARGEST_ACCESSOR = 2**31
-"""Numbers; a damaged file may promise any count."""
+WHITE = base64.b64decode("iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAAAAAA6fptVAAAACklEQVR42mP4DwABAQEAHLCMmQAAAABJRU5ErkJggg==")
+"""A PNG file of one pixel."""
 
 
 class Document:
-    """A glTF document in memory: its JSON and the binary part of a GLB file. URIs are relative to the folder."""
+    """A glTF document in memory: its JSON and the binary part of a GLB file. URIs are relative to the path."""
 
-    def __init__(self, root: Json | None = None, folder: Path = Path(), binary: bytes = b"") -> None:
+    def __init__(self, root: Json | None = None, path: Path = Path(), binary: bytes = b"") -> None:
         self.root: Json = {"asset": {"version": "2.0", "generator": "torch_modal"}} if root is None else root
-        self.folder = folder
-        #: Documents that are written have one.
-        self.buffers = [
-            bytearray(self.resource(buffer["uri"]) if "uri" in buffer else binary) for buffer in self.get("buffers")
+        self.path = path
+        resource = cache(self.resource)  # any number of buffers may name the same file
+        #: Documents that are written have one, a bytearray.
+        self.buffers: list[Any] = [
+            resource(buffer["uri"]) if "uri" in buffer else binary for buffer in self.get("buffers")
         ] or [bytearray()]
 
     @classmethod
@@ -60,9 +65,10 @@ class Document:
         else:
             text = data
         root = json.loads(text.decode("utf-8"))
+        json.dumps(root, allow_nan=False)  # raises for NaN and infinite numbers, which Python reads
         if not isinstance(root, dict) or not str(root.get("asset", {}).get("version", "")).startswith("2"):
             raise ValueError("not glTF 2")
-        return cls(root, path.parent, binary)
+        return cls(root, path, binary)
 
     # --------------------------------------------------------------------------------------------------------- reading
     def get(self, kind: str, index: int | None = None) -> Any:
@@ -70,36 +76,38 @@ class Document:
         items = self.root.get(kind, [])
         if index is None:
             return items
-        if not isinstance(index, int) or index < 0:  # in damaged files; Python accepts negative ones
-            raise ValueError(f"an index {index!r}")
+        if not isinstance(index, int) or not 0 <= index < len(items):  # Python accepts negative ones
+            raise ValueError(f"an index {index!r} of {len(items)} {kind}")
         return items[index]
 
     def resource(self, uri: str) -> bytes:
         """The data in a URI, or of the file that it names."""
         if uri.startswith("data:"):
             return base64.b64decode(uri.partition(",")[2])
-        return (self.folder / unquote(uri)).read_bytes()
+        return read_companion(self.path, unquote(uri))[1]
 
     def view(self, index: int) -> bytes:
         """The bytes of a buffer view."""
         view = self.get("bufferViews", index)
         start, number = view.get("byteOffset", 0), view["buffer"]
-        data = self.buffers[number][start : start + view["byteLength"]]
-        if min(start, number) < 0 or len(data) < view["byteLength"]:
+        data = self.buffers[number][start : start + view["byteLength"]] if 0 <= number < len(self.buffers) else b""
+        if start < 0 or len(data) < view["byteLength"]:
             raise ValueError("a buffer is too short")
         return bytes(data)
 
     def image(self, index: int) -> bytes:
-        """The bytes of an image."""
+        """The bytes of an image; those of a white one, with a warning, if they cannot be read."""
         image = self.get("images", index)
-        return self.view(image["bufferView"]) if "bufferView" in image else self.resource(image["uri"])
+        try:
+            return self.view(image["bufferView"]) if "bufferView" in image else self.resource(image.get("uri", ""))
+        except (ValueError, TypeError, LookupError) as error:
+            warnings.warn(f"{self.path.name} is without image {index}, now white: {error}", MeshWarning, stacklevel=6)
+        return WHITE
 
     def accessor(self, index: int) -> NDArray[Any]:
         """The numbers of an accessor, in its component type. *Shape:* ``(count, width)``."""
         accessor = self.get("accessors", index)
         kind, width, count = accessor["componentType"], WIDTHS[accessor["type"]], accessor["count"]
-        if not 0 <= count * width < LARGEST_ACCESSOR:
-            raise ValueError(f"an accessor of {count} elements")
         array = self._rows(accessor, kind, count, width)
         if "sparse" in accessor:
             n, indices, values = (accessor["sparse"][key] for key in ("count", "indices", "values"))
@@ -111,6 +119,9 @@ class Document:
         """Numbers in a buffer view, zeros without one. *Shape:* ``(count, width)``."""
         dtype = np.dtype(COMPONENTS[kind])
         if "bufferView" not in place:
+            # Other accessors of as many elements have their bytes in the file.
+            if count * width > sum(map(len, self.buffers)):
+                raise ValueError(f"an accessor of {count} elements")
             return np.zeros((count, width), dtype)
         data, offset, size = self.view(place["bufferView"]), place.get("byteOffset", 0), dtype.itemsize * width
         stride = self.get("bufferViews", place["bufferView"]).get("byteStride") or size
@@ -175,7 +186,7 @@ class Document:
         accessor: Json = {"bufferView": view, "componentType": code, "count": len(rows), "type": kind}
         if normalized:
             accessor["normalized"] = True
-        if bounds:
+        if bounds and np.isfinite(rows).all():  # texture coordinates may be NaN, JSON may not
             accessor |= {"min": rows.min(axis=0).tolist(), "max": rows.max(axis=0).tolist()}
         return self.append("accessors", accessor)
 

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.errors import MeshError
 from torch_modal.io.asset import Asset, Material, Part, as_png_or_jpeg
-from torch_modal.io.gltf import ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER, Document, Json, world_transforms
+from torch_modal.io.gltf import ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER, WHITE, Document, Json, world_transforms
 from torch_modal.io.normals import carry_together
 
 _COMPRESSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
@@ -43,6 +43,13 @@ class GltfAsset(Asset):
         self.document = Document.read(path)
         if compressed := sorted({*self.document.get("extensionsRequired")} & {*_COMPRESSED}):
             raise MeshError(f"{path}: its meshes are compressed ({compressed[0]}); export it without compression")
+        for texture in self.document.get("textures"):
+            if "source" in texture:
+                self.document.get("images", texture["source"])
+        for material in self.document.get("materials"):
+            for key, used in {**material, **material.get("pbrMetallicRoughness", {})}.items():
+                if key.endswith("Texture"):
+                    self.document.get("textures", used["index"])
         self._world = world_transforms(self.document)
         self._primitives: list[_Primitive] = []
         positions, faces, n = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], 0
@@ -68,10 +75,17 @@ class GltfAsset(Asset):
                     positions.append(local @ world[:3, :3].T + world[:3, 3])
                     n += len(local)
                 points = shared[accessor]
+                count = points.stop - points.start
+                if any(len(self.document.accessor(number)) != count for number in primitive["attributes"].values()):
+                    raise ValueError("a primitive whose attributes have different lengths")
+                if "material" in primitive:
+                    self.document.get("materials", primitive["material"])
                 if "indices" in primitive:
                     indices = self.document.accessor(primitive["indices"])[:, 0].astype(np.int64)
                 else:
-                    indices = np.arange(points.stop - points.start)
+                    indices = np.arange(count)
+                if indices.max(initial=0) >= max(count, 1):
+                    raise ValueError("a primitive with indices beyond its vertices")
                 triangles = indices[: len(indices) // 3 * 3].reshape(-1, 3)
                 mirrored = np.linalg.det(world[:3, :3]) < 0  # which turns the winding over
                 faces.append((triangles[:, ::-1] if mirrored else triangles) + points.start)
@@ -150,8 +164,10 @@ class GltfAsset(Asset):
         document = Document(root)
         for number, image in enumerate(document.get("images")):
             image.pop("uri", None)
-            added = document.add_image(old.image(number))
-            image.setdefault("mimeType", added["mimeType"])
+            data = old.image(number)
+            added = document.add_image(data)
+            if data is WHITE or "mimeType" not in image:
+                image["mimeType"] = added["mimeType"]
             image["bufferView"] = added["bufferView"]
         for node_json in document.get("nodes"):
             for key in ("mesh", "skin", "weights"):

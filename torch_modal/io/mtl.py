@@ -2,80 +2,89 @@
 
 from __future__ import annotations
 
+import math
+import os
+import posixpath
 import re
 import warnings
+from functools import cache, partial
 from pathlib import Path
+from typing import Any
 
 from torch_modal.errors import MeshWarning
 from torch_modal.io.asset import Material, as_png_or_jpeg
+from torch_modal.io.files import try_companion
 
-_OPTION = re.compile(r"-(?:[ost](?:\s+-?[\d.]+){1,3}|mm\s+\S+\s+\S+|\w+\s+\S+)\s+")
-"""An option of a texture line with its values: those of coordinates have up to three numbers."""
+_OPTIONS = re.compile(r"(?:-(?:[ost](?:\s+-?[\d.]+){1,3}|mm\s+\S+\s+\S+|\w+\s+\S+)\s+)*")
+"""Options of a texture line with their values: those of coordinates have up to three numbers."""
+LARGEST_LIBRARY = 2**24  # bytes
 
 
-def read_libraries(path: Path, names: list[str]) -> tuple[dict[str, Material], dict[str, bytes]]:
-    """Read the material libraries that an OBJ file names.
-
-    A copy has textures from outside the file's folder beside it, and the library names them there.
+def read_libraries(path: Path, lines: dict[int, str]) -> tuple[dict[str, Material], dict[str, bytes], dict[int, str]]:
+    """Read the material libraries that an OBJ file names, by the numbers of its lines.
 
     Returns:
-        The materials; the libraries and their textures, by their names beside a copy of the OBJ file.
+        The materials; the libraries and their textures, by their paths below the folder of the file or of a copy; the
+        names in those lines that differ in a copy.
 
     Warns:
-        MeshWarning: A library or a texture is not there.
+        MeshWarning: A library or a texture cannot be read, or lies outside the folder of the file.
     """
     materials: dict[str, Material] = {}
     files: dict[str, bytes] = {}
-    for line in names:
+    changed: dict[int, str] = {}
+    read = cache(partial(try_companion, path))  # materials share textures
+    for line, written in lines.items():
         # One name may hold blanks; blanks also separate several names.
-        for name in [line] if (path.parent / line).is_file() else line.split():
-            if (path.parent / name).is_file():
-                files[_name_in_copy(name)] = _read_library(path.parent, name, materials, files)
-            else:
-                warnings.warn(f"{path.name} names the materials {name}, which are not there", MeshWarning, stacklevel=5)
-    return materials, files
+        names = [written] if os.path.isfile(path.parent / written) else written.split()
+        for number, name in enumerate(names):
+            if found := read(name, "a material library", LARGEST_LIBRARY):
+                files[found[0]] = _read_library(path, *found, read, materials, files)
+                if posixpath.normpath(name) != found[0]:
+                    names[number] = found[0]
+                    changed[line] = " ".join(names)
+    return materials, files, changed
 
 
-def _read_library(folder: Path, name: str, materials: dict[str, Material], files: dict[str, bytes]) -> bytes:
+def _read_library(
+    path: Path, library: str, data: bytes, read: Any, materials: dict[str, Material], files: dict[str, bytes]
+) -> bytes:
     """Add the materials and textures of a library; returns its content for a copy."""
-    library = folder / name
-    lines = library.read_bytes().decode("utf-8", errors="surrogateescape").splitlines()
+    folder = posixpath.dirname(library)
+    lines = re.split(r"(\r\n|\n|\r)", data.decode("utf-8", errors="surrogateescape"))  # and their ends
     material = ""
     for number, line in enumerate(lines):
         key, *words = line.partition("#")[0].split() or [""]
         key = key.lower()
         if key == "newmtl":
-            material = line.split(None, 1)[1].strip()
+            material = line.strip()[len(key) :].strip()
             materials[material] = Material(material, (0.8, 0.8, 0.8, 1.0))
-        elif key.startswith("map_") or key in ("bump", "norm", "disp", "decal", "refl"):
+        elif words and (key.startswith("map_") or key in ("bump", "norm", "disp", "decal", "refl")):
             # The file stands after the options, and may hold blanks.
-            written = "".join(line.strip().split(None, 1)[1:])
-            while option := _OPTION.match(written):
-                written = written[option.end() :]
+            written = _OPTIONS.sub("", line.strip().split(None, 1)[1], count=1)
             texture = written.replace("\\", "/")
-            place = next((base / texture for base in (library.parent, folder) if (base / texture).is_file()), None)
-            if place is None:
-                if texture:
-                    said = f"{library.name} names the texture {texture}, which is not there"
-                    warnings.warn(said, MeshWarning, stacklevel=6)
+            base = folder if os.path.isfile(path.parent / folder / texture) else ""
+            if not (found := read(posixpath.join(base, texture), f"a texture of {library}")):
                 continue
-            kept = _name_in_copy(texture)
-            files[kept] = place.read_bytes()
-            if kept != texture:
+            place, files[found[0]] = found
+            if posixpath.normpath(texture) != (kept := posixpath.relpath(place, folder or ".")):
                 lines[number] = line.rstrip().removesuffix(written) + kept
             if key == "map_kd" and material in materials:
                 old = materials[material]
                 # Exporters that paint by the texture alone leave black here, which would multiply it away.
                 color = (1.0, 1.0, 1.0, old.color[3]) if not any(old.color[:3]) else old.color
-                materials[material] = old._replace(texture=as_png_or_jpeg(files[kept]), color=color)
+                image = as_png_or_jpeg(files[place])
+                if image is None:
+                    warnings.warn(f"{path.name} is without a texture: {place} is no picture", MeshWarning, stacklevel=6)
+                materials[material] = old._replace(texture=image, color=color)
         elif material in materials:
             materials[material] = _with_property(materials[material], key, words)
-    return ("\n".join(lines) + "\n").encode("utf-8", errors="surrogateescape")
+    return "".join(lines).encode("utf-8", errors="surrogateescape")
 
 
 def _with_property(material: Material, key: str, words: list[str]) -> Material:
     try:
-        numbers = [float(word) for word in words]
+        numbers = [number for number in map(float, words) if math.isfinite(number)]
     except ValueError:
         return material
     *rgb, alpha = material.color
@@ -91,9 +100,3 @@ def _with_property(material: Material, key: str, words: list[str]) -> Material:
         case "pm", [x, *_]:
             return material._replace(metallic=min(max(x, 0.0), 1.0))
     return material
-
-
-def _name_in_copy(name: str) -> str:
-    """Relative to the copy and inside of its folder."""
-    place = Path(name)
-    return place.name if place.is_absolute() or ".." in place.parts else place.as_posix()

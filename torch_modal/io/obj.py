@@ -33,8 +33,8 @@ class ObjAsset(Asset):
         self.lines = re.split(r"\r\n|\n|\r", text.removesuffix("\n").removesuffix("\r"))
         numbers: dict[str, list[list[float]]] = {"v": [], "vt": [], "vn": []}
         self._line_of: dict[str, list[int]] = {"v": [], "vt": [], "vn": [], "f": []}
-        self._libraries: list[str] = []
-        self._materials: list[str] = []
+        self._libraries: dict[int, str] = {}
+        materials: dict[str, int] = {}
         corners: list[tuple[int, ...]] = []  # vertex, texture coordinate, normal; -1 where there is none
         known: dict[str, tuple[int, ...]] = {}
         sizes, material_of, material, groups = [], [], -1, set()
@@ -59,13 +59,12 @@ class ObjAsset(Asset):
                 sizes.append(len(words))
                 material_of.append(material)
             elif kind == "usemtl":
-                if rest not in self._materials:
-                    self._materials.append(rest)
-                material = self._materials.index(rest)
+                material = materials.setdefault(rest, len(materials))
             elif kind == "mtllib":
-                self._libraries.append(rest)
+                self._libraries[number] = rest
             elif kind in ("g", "o", "s"):
                 groups.add(line.strip())
+        self._materials = list(materials)
         self.positions = _columns(numbers["v"], 0, 3)
         self._texcoords, self._normals = _columns(numbers["vt"], 0, 2), _columns(numbers["vn"], 0, 3)
         self._colors = _columns(numbers["v"], 3, 6) if all(len(row) >= 6 for row in numbers["v"]) else None
@@ -99,6 +98,8 @@ class ObjAsset(Asset):
         lines = list(self.lines)
         for number, (x, y, z) in zip(self._line_of["v"], positions.tolist(), strict=True):
             lines[number] = " ".join([f"v {x!r} {y!r} {z!r}", *lines[number].split(None, 4)[4:]])
+        for number, names in self._read[2].items():
+            lines[number] = f"mtllib {names}"
         if "normals" in self.carries:
             self._write_normals(lines, positions)
         return ("\n".join(lines) + "\n").encode("utf-8", errors="surrogateescape")
@@ -135,7 +136,7 @@ class ObjAsset(Asset):
             lines[number] = " ".join([kind, *words])
 
     @cached_property
-    def _read(self) -> tuple[dict[str, Material], dict[str, bytes]]:
+    def _read(self) -> tuple[dict[str, Material], dict[str, bytes], dict[int, str]]:
         return read_libraries(self.path, self._libraries)
 
     @property

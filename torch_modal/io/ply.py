@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.errors import MeshError
 from torch_modal.io.asset import Asset, Material, Part, as_png_or_jpeg, linear
+from torch_modal.io.files import try_companion
 from torch_modal.io.normals import CarriedNormals
 
 _TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4"}
@@ -35,12 +36,12 @@ class PlyFile:
         textures: Names of pictures in the header.
 
     Raises:
-        ValueError: It has no header, or no vertices.
+        ValueError: It has no header, no vertices, or fewer bytes than the header promises.
     """
 
     def __init__(self, path: Path) -> None:
         self.data = path.read_bytes()
-        match = re.search(rb"end_header[^\n]*\n|end_header\r", self.data)
+        match = re.search(rb"end_header[^\n]{0,99}\n|end_header\r", self.data)
         if match is None:
             raise ValueError("no end_header")
         self._start = match.end()
@@ -61,6 +62,10 @@ class PlyFile:
         if "vertex" not in self.elements:
             raise ValueError("no vertices")
         self.n_vertices, self.properties = self.elements["vertex"]
+        for name, (length, properties) in self.elements.items():  # in text, a number has one byte or more
+            row = sum(np.dtype(kinds[0]).itemsize if self._order else 1 for kinds in properties.values())
+            if not 0 <= length * max(row, 1) <= len(self.data) - self._start:
+                raise ValueError(f"the header promises {length} of {name[:40]!r}; it was cut off or is damaged")
 
     @cached_property
     def _content(self) -> tuple[bytes, NDArray[Any], bytes]:
@@ -77,9 +82,10 @@ class PlyFile:
             return self.data[: self._start] + b"".join(lines[:first]), words, b"".join(lines[last:])
         place = self._start
         for length, properties in before:
-            for _ in range(length):
+            fixed = all(len(kinds) == 1 for kinds in properties.values())
+            for _ in range(1 if fixed else length):
                 for *of_list, kind in properties.values():
-                    repeat = 1
+                    repeat = length if fixed else 1
                     if of_list:
                         count = np.dtype(self._order + of_list[0])
                         repeat = int(np.frombuffer(self.data, count, 1, place)[0])
@@ -150,8 +156,7 @@ class PlyAsset(Asset):
     @cached_property
     def companions(self) -> dict[str, bytes]:
         """Textures that the header names."""
-        paths = {name: self.path.parent / name for name in self._file.textures if not Path(name).is_absolute()}
-        return {name: path.read_bytes() for name, path in paths.items() if path.is_file() and ".." not in path.parts}
+        return dict(filter(None, [try_companion(self.path, name, "its texture") for name in self._file.textures]))
 
     def parts(self) -> list[Part]:
         """One part."""
@@ -200,8 +205,8 @@ def read_triangles(path: Path, n_vertices: int, n_faces: int) -> tuple[FloatArra
     """Vertices ``(V, 3)`` as they stand in the file, faces ``(F, 3)``; numbers are those of its header."""
     import trimesh
 
-    # Without process=False vertices are merged; with fix_texture a PLY is split at texture seams.
-    options = {"fix_texture": False} if path.suffix.lower() == ".ply" else {}
+    # Without process=False vertices are merged; with fix_texture a PLY is split at seams. It needs no textures here.
+    options = {"fix_texture": False, "skip_materials": True} if path.suffix.lower() == ".ply" else {}
     mesh = trimesh.load_mesh(path, process=False, maintain_order=True, **options)
     vertices = np.array(mesh.vertices, dtype=np.float64).reshape(-1, 3)
     faces = np.array(mesh.faces, dtype=np.int64).reshape(-1, 3)

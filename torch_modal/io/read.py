@@ -22,12 +22,6 @@ READERS: dict[str, type[Asset]] = {
 SUFFIXES = tuple(READERS)
 
 
-def read_mesh(path: str | os.PathLike[str]) -> tuple[FloatArray, IntArray]:
-    """Positions ``(V, 3)``, in the file's units, and triangles ``(F, 3)`` of a file, as :func:`open_asset` reads it."""
-    asset = open_asset(path)
-    return asset.positions, asset.faces
-
-
 def open_asset(path: str | os.PathLike[str]) -> Asset:
     """Read a mesh file with all its content.
 
@@ -51,10 +45,10 @@ def open_asset(path: str | os.PathLike[str]) -> Asset:
         )
     if suffix not in READERS:
         raise MeshError(f"{path}: unknown extension {suffix!r}; supported are {', '.join(SUFFIXES)}")
-    if not path.exists():
-        raise FileNotFoundError(f"{path}: no such file")
-    if not path.is_file():
-        raise MeshError(f"{path}: not a file")
+    if not os.path.lexists(path):
+        raise FileNotFoundError(f"{str(path)[:300]}: no such file")
+    if not os.path.isfile(path):
+        raise MeshError(f"{path}: not a file, or a link to none")
     try:
         if not path.stat().st_size:
             raise MeshError(f"{path}: the file is empty")
