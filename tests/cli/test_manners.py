@@ -3,7 +3,9 @@
 import errno
 import logging
 import os
+import signal
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +14,7 @@ import pytest
 import torch_modal as tm
 from torch_modal.cli import main as cli
 from torch_modal.io.files import temporary_beside, write_file
+from torch_modal.io.formats import ANIMATION_FORMATS, Animation, OutputFormat
 from torch_modal.progress import ProgressReport
 
 
@@ -82,3 +85,54 @@ def test_the_command_names_the_path_in_one_line(
     assert cli.main([*argv, "--quiet"]) == 1
     assert capsys.readouterr().err == f"torch-modal: error: {out}: Permission denied\n"
     assert not out.exists()
+
+
+@pytest.fixture
+def unready() -> Iterator[None]:
+    """A handler of SIGTERM that fails, instead of the default that ends the tests."""
+
+    def fail(number: int, frame: object) -> None:
+        raise AssertionError("the command does not listen to SIGTERM")
+
+    before = signal.signal(signal.SIGTERM, fail)
+    yield
+    signal.signal(signal.SIGTERM, before)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="other systems send no SIGTERM")
+@pytest.mark.usefixtures("unready")
+def test_sigterm_leaves_no_temporary_files(
+    tmp_path: Path,
+    capsule: tuple[np.ndarray, np.ndarray],
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    files = tm.save_frames(np.stack([capsule[0], 1.1 * capsule[0]]), capsule[1], tmp_path / "in", "obj")
+    monkeypatch.setattr(tm, "subdivide", lambda keyframes, *_, **__: keyframes)
+    there = []
+
+    def write(animation: Animation, path: Path) -> None:
+        path.write_bytes(b"a part")
+        there.extend(path.parent.iterdir())
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    monkeypatch.setitem(ANIMATION_FORMATS, ".npz", OutputFormat(write))
+    out = tmp_path / "out" / "a.npz"
+    assert cli.main(["subdivide", *map(str, files), "--levels", "0", "--out", str(out), "--quiet"]) == 130
+    assert capsys.readouterr().err == "torch-modal: interrupted\n"
+    assert len(there) == 1 and list(out.parent.iterdir()) == []
+
+
+@pytest.mark.parametrize("where", ["in", "out"])
+def test_loops_of_links_and_long_names_are_one_line(
+    where: str, tmp_path: Path, capsule: tuple[np.ndarray, np.ndarray], capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "loop.obj").symlink_to("loop.obj")
+    (mesh,) = tm.save_frames(capsule[0][None], capsule[1], tmp_path / "in", "obj")
+    for path in (tmp_path / "loop.obj", tmp_path / f"{'n' * 5000}.obj"):
+        inputs, out = (
+            ([mesh, path], tmp_path / "a.glb") if where == "in" else ([mesh, mesh], path.with_suffix(".obj") / "a")
+        )
+        assert cli.main(["subdivide", *map(str, inputs), "--out", str(out), "--quiet"]) == 1
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.startswith(f"torch-modal: error: {str(path)[:200]}") and len(line) < 600

@@ -201,6 +201,9 @@ def test_labels_from_the_folder(bars: Shapes, tmp_path: Path) -> None:
     save_file({"vertex_labels": torch.zeros(163)}, tmp_path / "set" / "labels.safetensors")
     with pytest.raises(ValueError, match=r"set: vertex_labels begin with the shape \(3, 164\).*got \(163,\)"):
         tm.ShapeDataset(tmp_path)[0]
+    (tmp_path / "set" / "labels.safetensors").write_bytes(b"no tensors")
+    with pytest.raises(ValueError, match=r"set/labels\.safetensors is no safetensors file, or a damaged one: "):
+        tm.ShapeDataset(tmp_path)[0]
 
 
 def test_tables_are_kept_in_the_folders(bars: Shapes, tmp_path: Path) -> None:
@@ -352,3 +355,5 @@ def test_refuses(root: Path, tmp_path: Path) -> None:
         tm.ShapeDataset(tmp_path / "nowhere")
     with pytest.raises(ValueError, match="samples_per_set"):
         tm.ShapeDataset(root, samples_per_set=0)
+    with pytest.raises(ValueError, match="seed is 0 or more, got -1"):
+        tm.ShapeDataset(root, seed=-1)

@@ -51,6 +51,8 @@ def test_links_are_followed_but_not_in_circles(tmp_path: Path) -> None:
     (tmp_path / "root" / "linked").symlink_to(tmp_path / "elsewhere", target_is_directory=True)
     (tmp_path / "root" / "a" / "up").symlink_to(tmp_path / "root", target_is_directory=True)
     (tmp_path / "root" / "a" / "gone.obj").symlink_to(tmp_path / "nowhere.obj")
+    (tmp_path / "root" / "a" / "loop.obj").symlink_to("loop.obj")
+    (tmp_path / "root" / "loop").symlink_to("loop", target_is_directory=True)
     assert find_keyframe_sets(tmp_path / "root")[0] == ["a", "linked"]
     assert len(mesh_files(tmp_path / "root" / "a")) == 2
 

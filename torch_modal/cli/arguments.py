@@ -119,16 +119,16 @@ def is_file(args: argparse.Namespace, suffixes: Collection[str]) -> bool:
 
 def check_output(files: Sequence[Path], inputs: Iterable[Path], overwrite: bool) -> None:
     """Raise ValueError if files could not or must not be written, those that are read among them."""
-    read = {path.resolve() for path in inputs}
+    read = {os.path.realpath(path) for path in inputs}
     for file in files:
-        if file.resolve() in read:
+        if os.path.realpath(file) in read:
             raise ValueError(f"{file} is one of the meshes that are read; choose another name")
         if file.is_dir():
             raise ValueError(f"{file} is a folder; a file is to be written there")
         if file.exists() and not overwrite:
             raise ValueError(f"{file} exists; --overwrite replaces it")
     for above in dict.fromkeys(file.parent for file in files):
-        there = next(parent for parent in (above, *above.absolute().parents) if parent.exists())
+        there = next(parent for parent in (above, *above.absolute().parents) if parent.is_symlink() or parent.exists())
         if not there.is_dir():
             raise ValueError(f"{there} is a file, so nothing can be written below it; choose another name")
         if not os.access(there, os.W_OK):

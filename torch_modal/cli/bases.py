@@ -5,9 +5,7 @@ Each checks its output paths before any heavy import and any work.
 
 import argparse
 import os
-import signal
 import sys
-import threading
 from pathlib import Path
 
 from torch_modal.cli.arguments import (
@@ -120,8 +118,6 @@ def precompute(args: argparse.Namespace) -> int:
         args.fail(f"--out is a folder here, got the file name {args.out.name!r}")
     if args.scheduler and args.workers:
         args.fail("--scheduler shares the sets among the workers of its cluster; leave out --workers")
-    if threading.current_thread() is threading.main_thread():  # SIGTERM of a batch system acts like Ctrl-C
-        signal.signal(signal.SIGTERM, signal.default_int_handler)
 
     from torch_modal.data.precompute_set import DONE, Options
     from torch_modal.data.precompute_tree import precompute_tree

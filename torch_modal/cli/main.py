@@ -6,6 +6,7 @@ import functools
 import inspect
 import logging
 import os
+import signal
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -78,9 +79,11 @@ def build_parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line with these arguments, or with those of the process; the exit code.
 
-    It is 0, 1 after an error, 130 after Ctrl-C; 3 of `precompute` when some sets have no result, and of `check` when
-    parts pass through each other. Wrong usage leaves with ``SystemExit(2)``.
+    It is 0, 1 after an error, 130 after Ctrl-C or SIGTERM; 3 of `precompute` when some sets have no result, and of
+    `check` when parts pass through each other. Wrong usage leaves with ``SystemExit(2)``.
     """
+    with contextlib.suppress(ValueError):  # in the main thread, SIGTERM of a batch system acts like Ctrl-C
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         args = build_parser().parse_args(argv)
         with _messages_as_lines(args):
@@ -99,7 +102,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if args.debug or not (isinstance(error, EXPECTED) or type(error).__name__ in EXPECTED_NAMES):
             raise
         if isinstance(error, OSError) and error.strerror:
-            reason = f"{error.filename}: {error.strerror}" if error.filename else error.strerror
+            reason = f"{str(error.filename)[:300]}: {error.strerror}" if error.filename else error.strerror
         elif isinstance(error, MemoryError):
             reason = "out of memory; take fewer levels or a smaller mesh"
         else:

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor
 from torch.utils.data import BatchSampler, Dataset, Sampler
@@ -52,7 +53,7 @@ class ShapeDataset(Dataset[Sample]):
 
     Raises:
         FileNotFoundError: There is no such folder, or no set in it.
-        ValueError: ``samples_per_set`` is below 1.
+        ValueError: ``samples_per_set`` is below 1, or ``seed`` below 0.
     """
 
     def __init__(
@@ -70,6 +71,8 @@ class ShapeDataset(Dataset[Sample]):
     ) -> None:
         if samples_per_set < 1:
             raise ValueError(f"samples_per_set is 1 or more, got {samples_per_set}")
+        if seed < 0:
+            raise ValueError(f"seed is 0 or more, got {seed}")
         self.sets = [str(path) for path in find_sets(root)]
         if not self.sets:
             raise FileNotFoundError(f"no stored key-frame set in {root}; torch-modal precompute makes them")
@@ -159,7 +162,10 @@ class ShapeDataset(Dataset[Sample]):
         if self.labels is not None:
             labels = dict(self.labels(stored))
         else:
-            labels = load_file(path) if path.is_file() else {}
+            try:
+                labels = load_file(path) if path.is_file() else {}
+            except SafetensorError as error:
+                raise ValueError(f"{path} is no safetensors file, or a damaged one: {error}") from error
         k, v = len(space), space.n_vertices
         of_vertices = labels.get("vertex_labels")
         if of_vertices is not None and of_vertices.shape[:2] != (k, v) and of_vertices.shape[:1] == (v,):

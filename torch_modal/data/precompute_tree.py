@@ -55,8 +55,8 @@ def precompute_tree(
     """
     if not root.is_dir():
         raise ValueError(f"{root} is no folder" if root.exists() else f"there is no folder {root}")
-    if out.exists() and not out.is_dir():
-        raise ValueError(f"{out} is a file; the output is a folder")
+    if (out.is_symlink() or out.exists()) and not out.is_dir():
+        raise ValueError(f"{out} is a file, or a link to none; the output is a folder")
     if out.resolve() in (root.resolve(), *root.resolve().parents):
         raise ValueError(f"the output folder {out} is or contains the input {root}; choose another one")
     out.mkdir(parents=True, exist_ok=True)

@@ -49,8 +49,7 @@ def find_keyframe_sets(root: Path, skip: Path | None = None) -> tuple[list[str],
 
 def mesh_files(folder: Path) -> list[Path]:
     """The mesh files that lie directly in a folder, in natural order of their names."""
-    with os.scandir(folder) as entries:
-        names = [entry.name for entry in entries if not entry.name.startswith(".") and entry.is_file()]
+    names = [name for name in os.listdir(folder) if not name.startswith(".") and os.path.isfile(folder / name)]
     return [folder / name for name in sorted(names, key=natural) if Path(name).suffix.lower() in MESH_SUFFIXES]
 
 
