@@ -191,6 +191,7 @@ CASES: dict[str, Craft] = {
     "gltf: attribute": gltf((*PRIMITIVE, "attributes", "TEXCOORD_0", 99)),
     "gltf: attributes": gltf(("accessors", 2, "count", 2)),
     "gltf: indices": gltf((*PRIMITIVE, "indices", 99)),
+    "gltf: stride": gltf(("bufferViews", 0, "byteStride", 4)),
     "gltf: view of no buffer": gltf(("bufferViews", 0, "buffer", 99)),
     "gltf: mesh": gltf(("nodes", 0, "mesh", 99)),
     "gltf: image, without data": gltf(("images", 0, {})),
