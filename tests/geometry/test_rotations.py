@@ -1,7 +1,9 @@
 """Where the minimisation starts: edges of triangles that turn part of the way."""
 
 import math
+import warnings
 
+import numpy as np
 import pytest
 import torch
 from conftest import Shapes
@@ -9,6 +11,7 @@ from sheets import cylinder as cylinder_of
 from sheets import rectangle, rolled
 from torch import Tensor
 
+import torch_modal as tm
 from torch_modal.backends.choice import choose
 from torch_modal.backends.torch.backend import TorchBackend
 from torch_modal.backends.warp.rotations import WarpRotations
@@ -261,6 +264,27 @@ def strip_mesh() -> Connectivity:
 def test_below_a_turn_there_are_none(strip_mesh: Connectivity) -> None:
     assert LocalRotations(strip_mesh, torch.stack([strip(0), strip(1)])).clusters is None
     assert LocalRotations(strip_mesh, torch.stack([strip(0), strip(TURNS)])).clusters is not None
+
+
+@pytest.mark.parametrize("turns, torn", [(0, False), (1, True)])
+def test_a_ring_twisted_by_a_full_turn_is_told(turns: int, torn: bool) -> None:
+    """The rotations of its triangles have no signs that agree all around it."""
+
+    def ring(turns: int, n: int = 40, m: int = 12) -> tuple[Tensor, np.ndarray]:
+        i, j = (x.flatten() for x in np.meshgrid(np.arange(n), np.arange(m), indexing="ij"))
+        u, v = 2 * np.pi * i / n, 2 * np.pi * j / m
+        r = 1 + 0.3 * np.cos(2 * v)
+        out, up = 5 + r * np.cos(v + turns * u), r * np.sin(v + turns * u)
+        a, b, c, d = (x % n * m + y % m for x, y in ((i, j), (i + 1, j), (i + 1, j + 1), (i, j + 1)))
+        x = np.stack([out * np.cos(u), out * np.sin(u), up], -1)
+        return torch.from_numpy(x), np.concatenate([np.stack([a, b, c], -1), np.stack([a, c, d], -1)])
+
+    start, faces = ring(0)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        LocalRotations(Connectivity(faces), torch.stack([start, start + 1, ring(turns)[0]]))
+    assert [w.category for w in caught] == [tm.MeshWarning] * torn
+    assert not torn or "turn by a full turn" in str(caught[0].message)
 
 
 def test_the_pose_of_a_key_frame_does_not_matter(strip_mesh: Connectivity) -> None:

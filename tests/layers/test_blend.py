@@ -2,6 +2,7 @@
 
 import warnings
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -56,6 +57,21 @@ def assert_no_order(layer: Blend, keyframes: Tensor, n: int = 6) -> None:
         assert apart(found[1], found[2]) < 1e-6
 
 
+def assert_no_order_of_bases(layer: Blend, bases: list[tm.ModalBasis], keyframes: Tensor) -> None:
+    w = torch.stack([pulls(0.4, 0.3, 0.3), pulls(0.2, 0.0, 0.8)])
+    x, slope = (keyframes.clone().requires_grad_(), w.clone().requires_grad_())
+    found = layer(x, slope)
+    grads = torch.autograd.grad(found.square().sum(), (x, slope))
+    for order in ([0, 2, 1], [1, 0, 2], [2, 1, 0]):
+        other = Blend([bases[i] for i in order], layer.faces, objective=layer.objective, solver=layer.solver)
+        y, weights = x[order].detach().requires_grad_(), w[:, order].requires_grad_()
+        again = other(y, weights)
+        assert apart(again.detach(), found.detach()) < 1e-9
+        for own, wanted in zip(torch.autograd.grad(again.square().sum(), (y, weights)), grads, strict=True):
+            wanted = wanted[order] if own.dim() == 3 else wanted[:, order]
+            torch.testing.assert_close(own, wanted, rtol=1e-6, atol=1e-6 * float(wanted.abs().max()))
+
+
 class TestTwo:
     @pytest.mark.parametrize("preset", PRESETS)
     def test_two_key_frames_are_an_in_between(self, bars: Shapes, preset: str) -> None:
@@ -95,7 +111,27 @@ class TestInvariances:
         bases = tm.extract_bases(keyframes, faces, 10, progress=False)
         warnings.simplefilter("ignore", tm.ConvergenceWarning)  # of the base alone
         for solver in (None, tm.Solver(max_steps=0, local_steps=0)):
-            assert_no_order(Blend(bases, faces, solver=solver), keyframes, 2)
+            layer = Blend(bases, faces, solver=solver)
+            assert_no_order(layer, keyframes, 2)
+            assert_no_order_of_bases(layer, bases, keyframes)
+
+    @pytest.mark.parametrize("backend", ["torch", "warp"])
+    def test_neither_does_the_order_of_bases(
+        self, bars: Shapes, poses: Tensor, backend: Literal["torch", "warp"]
+    ) -> None:
+        layer = Blend(bars.bases, bars.faces, **modal(coarse_faces=200, local=True, backend=backend))
+        assert_no_order_of_bases(layer, bars.bases, poses)
+
+    def test_a_weight_of_zero_leaves_the_in_between_of_the_others(self, bars: Shapes, poses: Tensor) -> None:
+        """Exactly in one layer, and of the bases of these two alone; those of the third make the space another one."""
+        three = Blend(bars.bases, bars.faces)
+        for pair in ([0, 1], [2, 0]):
+            bases, t, w = [bars.bases[i] for i in pair], pulls(0.6, 0.4), torch.zeros(3, dtype=DOUBLE)
+            w[pair] = t
+            assert apart(three(poses, w), three(poses[pair], t)) < 1e-9
+            between = InBetween(bases, bars.faces)(*poses[pair], t[1])
+            assert apart(Blend(bases, bars.faces)(poses, w), between) < 1e-9
+            assert apart(three(poses, w), between) < 0.005
 
     def test_one_twice_has_both_weights(self, layer: Blend, poses: Tensor) -> None:
         x = layer(poses, pulls(0.5, 0.2, 0.3))
@@ -182,10 +218,12 @@ class TestResults:
             return torch.stack([torch.sin(k * u) / k, v, (1 - torch.cos(k * u)) / k], -1)
 
         x = torch.stack([rolled(first), rolled(-1.2), rolled(0.7)])
-        blend = Blend(tm.extract_bases(x, faces, 10, progress=False), faces)
-        found, truth = blend(x, pulls(0.5, 0.4, 0.1)), rolled(0.5 * first - 0.48 + 0.07)
-        found = best_fit(found, truth, torch.ones(300, dtype=DOUBLE)).apply(found)
-        assert apart(found, truth) < 1e-3
+        bases = tm.extract_bases(x, faces, 10, progress=False)
+        truth = rolled(0.5 * first - 0.48 + 0.07)
+        for order in ([0, 1, 2], [0, 2, 1], [2, 1, 0]):
+            found = Blend([bases[i] for i in order], faces)(x, pulls(0.5, 0.4, 0.1))
+            found = best_fit(found, truth, torch.ones(300, dtype=DOUBLE)).apply(found)
+            assert apart(found, truth) < 1e-3
 
     @pytest.mark.parametrize("name", ["hand", pytest.param("creature", marks=pytest.mark.slow)])
     def test_no_triangle_folds_over(self, name: str) -> None:

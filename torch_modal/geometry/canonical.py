@@ -3,6 +3,8 @@
 NumPy only.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from torch_modal.arrays import FloatArray, IntArray
@@ -30,6 +32,11 @@ def size(points: FloatArray, faces: IntArray) -> float:
         The size in the units of the points; for a surface without area, the bounding-box diagonal.
     """
     return _moments(points, faces)[2]
+
+
+def own_order(shapes: Sequence[FloatArray], faces: IntArray) -> list[int]:
+    """Indices of shapes in an order that follows from the shapes, by descending size. *Shape of each:* ``(V, 3)``."""
+    return sorted(range(len(shapes)), key=lambda i: (-size(shapes[i], faces), shapes[i].tobytes()))
 
 
 def placed(points: FloatArray, faces: IntArray) -> tuple[FloatArray, FloatArray, FloatArray, float]:

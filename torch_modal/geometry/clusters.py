@@ -27,7 +27,7 @@ class Clusters(nn.Module):
     rotation of half a turn or more.
 
     Args:
-        turns: Quaternions of the triangles, of any signs. *Shape:* ``(4, F)``.
+        turns: Quaternions of the triangles, of any signs, from the first of K shapes to each. *Shape:* ``(4, K, F)``.
         areas: Of the triangles. *Shape:* ``(F,)``.
         ancestors: Those of the triangles in a spanning forest, by 1, 2, 4, ... generations; a root is its own parent.
             *Shape:* ``(J, F)``.
@@ -43,7 +43,7 @@ class Clusters(nn.Module):
         # From the middle of each piece, so that as much turns one way as the other.
         order = np.lexsort((_from_mean(turns, areas, ancestors, piece), piece))
         middles = order[np.unique(piece[order], return_index=True)[1]]
-        cluster, roots, parent = _clusters(turns.T.numpy(), middles, ancestors[0].numpy())
+        cluster, roots, parent = _clusters(turns.movedim(-1, 0).numpy(), middles, ancestors[0].numpy())
         # One more cluster, which does not turn, is the parent of those without.
         generations = [np.append(parent, len(parent))]
         while (generations[-1] != len(parent)).any():
@@ -80,28 +80,38 @@ def beyond_a_turn(turns: Tensor, areas: Tensor, ancestors: Tensor, piece: Tensor
 
 
 def _from_mean(turns: Tensor, areas: Tensor, ancestors: Tensor, piece: Tensor) -> Tensor:
-    """Angles between triangles and the mean of their piece, added up along the tree. *Shape:* ``(F,)``."""
+    """Largest angles, of any two shapes, from the mean of the piece, added up along the tree. *Shape:* ``(F,)``."""
     step = product(conjugate(pick(turns, ancestors[0])), turns)
     winding = 2 * arc(torch.where(step[0] < 0, -step, step))
     for generation in ancestors:
         winding = winding + pick(winding, generation)
-    means = torch.stack([torch.bincount(piece, areas * row) for row in winding]) / torch.bincount(piece, areas)
-    return (winding - pick(means, piece)).norm(dim=0)
+    total = torch.bincount(piece, areas)
+    means = winding.new_zeros(*winding.shape[:2], len(total)).index_add(-1, piece, areas * winding) / total
+    off = winding - pick(means, piece)
+    return torch.stack([(off - x[:, None]).norm(dim=0).amax(0) for x in off.unbind(1)]).amax(0)
 
 
 def _clusters(turns: FloatArray, middles: IntArray, parents: IntArray) -> tuple[IntArray, IntArray, IntArray]:
-    """The cluster of each triangle, ``(F,)``; the root of each cluster, and its parent, C where none, ``(C,)`` each."""
+    """The cluster of each triangle, ``(F,)``; the root of each cluster, and its parent, C where none, ``(C,)`` each.
+
+    *Shape of the turns:* ``(F, 4, K)``.
+    """
     n = len(parents)
     # An extra node above the middles: one traversal visits all pieces.
     ends = np.append(np.arange(n), np.full(len(middles), n)), np.append(parents, middles)
     tree = coo_matrix((np.ones(len(ends[0])), ends), shape=(n + 1, n + 1)).tocsr()
     order, before = breadth_first_order(tree, n, directed=False)
+
+    def half_angles(f: int, root: int) -> FloatArray:
+        return np.arccos(np.abs((turns[f] * turns[root]).sum(0)).clip(max=1))
+
     cluster = np.empty(n, dtype=np.int64)
     roots: list[int] = []
     above: list[int] = []
     for f in order[1:]:
         own = -1 if before[f] == n else cluster[before[f]]
-        if own < 0 or abs(turns[f] @ turns[roots[own]]) < np.cos(WIDEST / 2):
+        # Two shapes are at most as far apart as both are from the first.
+        if own < 0 or np.sort(half_angles(f, roots[own]))[-2:].sum() > WIDEST / 2:
             above.append(own)
             own = len(roots)
             roots.append(f)

@@ -1,15 +1,19 @@
 """Means of shapes by local rotations: between two of them, every triangle turns at constant speed."""
 
+import warnings
+from collections.abc import Sequence
 from functools import reduce
+from math import cos
 from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
+from torch_modal.errors import MeshWarning
 from torch_modal.geometry.clusters import Clusters, beyond_a_turn
 from torch_modal.geometry.connectivity import Connectivity, spanning_forest
 from torch_modal.geometry.poisson import Poisson
-from torch_modal.geometry.rotations import agreeing, arc, mean, quaternion, rotate, turned
+from torch_modal.geometry.rotations import agreeing, arc, conjugate, mean, product, quaternion, rotate, turned
 from torch_modal.geometry.triangle_frames import (
     Frames,
     Sides,
@@ -24,6 +28,11 @@ from torch_modal.geometry.vectors import pick
 # The tree along which turns are compared avoids slivers, whose normals mean little: one with an altitude of this part
 # of its longest side counts like a turn of one radian against its neighbour.
 SLIVER = 0.02
+
+# Neighbours whose rotations are alike to so many radians, but a full turn apart, are torn; in folds of bodies none are.
+# Above this part of the area there is a warning.
+ALIKE = 0.5
+PART_TORN = 1e-3
 
 # Edges without a length count like one of this part of the mean.
 SHORTEST = 1e-9
@@ -58,7 +67,7 @@ class LocalRotations(nn.Module):
 
     Args:
         mesh: The connectivity.
-        references: Shapes near the key-frames, two or more: the tree is that of the turns between the first two, and
+        references: Shapes near the key-frames, two or more: the tree is that of the turns between all of them, and
             avoids what is a sliver in any. *Shape:* ``(K, V, 3)``.
     """
 
@@ -74,9 +83,8 @@ class LocalRotations(nn.Module):
         super().__init__()
         self.register_buffer("faces", torch.tensor(mesh.faces), persistent=False)
         every = [frames_of(x[None], self.faces) for x in references]
-        a, b = every[:2]
         slenderness = reduce(torch.minimum, [x.slenderness for x in every]).squeeze(0)
-        parents, piece = self._tree(_turn_between(a, b).squeeze(1), slenderness, mesh)
+        parents, piece = self._tree(_turns_from_first(every), slenderness, mesh)
         ancestors = [parents]
         while 2 ** len(ancestors) < len(parents):
             ancestors.append(ancestors[-1][ancestors[-1]])
@@ -90,15 +98,32 @@ class LocalRotations(nn.Module):
         self.register_buffer("ancestors", torch.stack(ancestors), persistent=False)
         self.register_buffer("piece", piece, persistent=False)
         self.n_edges, self.n_pieces = len(mesh.edges), int(piece.max()) + 1
-        wound = self.wound(a, b)
+        wound = self.wound(every)
         #: For rotations beyond a full turn; None where there are none.
         self.clusters = Clusters(*wound) if beyond_a_turn(*wound) else None
+        self._warn_of_tears(wound[0], mesh)
+
+    def _warn_of_tears(self, turns: Tensor, mesh: Connectivity) -> None:
+        """Say where neighbours are a full turn apart whatever the tree. *Shape:* ``(4, K, F)``."""
+        one, other = torch.tensor(mesh.face_neighbours).unbind(1)
+        turns = turns * LocalRotations.sign(self, turns.movedim(0, -1), self.areas.expand(turns.shape[1], -1))
+        torn = ((pick(turns, one) * pick(turns, other)).sum(0) < -cos(ALIKE / 2)).any(0)
+        if float((pick(self.areas, one) + pick(self.areas, other))[torn].sum()) > PART_TORN * float(self.areas.sum()):
+            warnings.warn(
+                "on a closed way around the mesh, key-frames turn by a full turn from each other, as a ring does that "
+                "is twisted by one: no choice of rotations is continuous, and in-betweens are distorted along a line",
+                MeshWarning,
+                stacklevel=2,
+            )
 
     @staticmethod
     def _tree(turns: Tensor, slenderness: Tensor, mesh: Connectivity) -> tuple[Tensor, Tensor]:
-        """The parent of each triangle, and its piece. *Shape:* ``(4, F), (F,) -> (F,)`` each."""
+        """The parent of each triangle, and its piece. *Shape:* ``(4, K, F), (F,) -> (F,)`` each."""
         one, other = torch.tensor(mesh.face_neighbours).unbind(1)
-        alike = (pick(turns, one) * pick(turns, other)).sum(0).abs().clamp_max(1)
+        # Between two shapes, neighbours turn by as much from each other as these rotations of the shapes do.
+        across = product(conjugate(pick(turns, one)), pick(turns, other))
+        pairs = ((x[:, None] * across[:, i:]).sum(0).abs() for i, x in enumerate(across.unbind(1)[:-1], 1))
+        alike = reduce(torch.minimum, (cosines.amin(0) for cosines in pairs)).clamp_max(1)
         slenderness = torch.minimum(pick(slenderness, one), pick(slenderness, other))
         costs = 2 * torch.arccos(alike) + SLIVER / slenderness.clamp_min(SLIVER / 1e3)
         parents, piece = spanning_forest(len(mesh.faces), mesh.face_neighbours, costs.numpy())
@@ -149,10 +174,10 @@ class LocalRotations(nn.Module):
         products = torch.stack([zero.index_add(-1, self.piece, row) for row in rows], -1).movedim(2, 1)
         return pick(agreeing(products, weights[:, None]).mT, self.piece)
 
-    def wound(self, a: Frames, b: Frames) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Arguments of :class:`Clusters`, from one shape to another."""
-        areas = (a.doubled_areas + b.doubled_areas).squeeze(0)
-        return _turn_between(a, b).squeeze(1), areas, self.ancestors, self.piece
+    def wound(self, every: Sequence[Frames]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Arguments of :class:`Clusters`, between shapes."""
+        areas = torch.cat([x.doubled_areas for x in every]).sum(0)
+        return _turns_from_first(every), areas, self.ancestors, self.piece
 
     def step(self, a: Frames, b: Frames) -> Tensor:
         """The step of each triangle from one shape to another.
@@ -234,6 +259,11 @@ def weights_per_length(mesh: Connectivity, references: Tensor) -> Tensor:
     first, second = torch.tensor(mesh.edges).unbind(1)
     lengths = reduce(torch.add, ((x[second] - x[first]).norm(dim=-1) for x in references)) / len(references)
     return 1 / lengths.clamp_min(SHORTEST * lengths.mean())
+
+
+def _turns_from_first(every: Sequence[Frames]) -> Tensor:
+    """Quaternions of the rotations from the first shape to each. *Shape:* ``(4, K, F)``."""
+    return torch.cat([_turn_between(every[0], x) for x in every], 1)
 
 
 def _turn_between(a: Frames, b: Frames) -> Tensor:

@@ -10,6 +10,7 @@ from torch_modal.autograd import full_precision, lasting, outlasting, require_nu
 from torch_modal.contact.in_between import ContactSolver
 from torch_modal.energy.term import Mesh
 from torch_modal.energy.volume import Volume, encloses
+from torch_modal.geometry.canonical import own_order
 from torch_modal.inbetween.results import InBetweenResult, Samples
 from torch_modal.inbetween.settings import Settings
 from torch_modal.inbetween.solver import InBetweenSolver
@@ -112,6 +113,9 @@ class InBetweenLayer(PreciseModule):
             [getattr(basis, name).double().cpu() for basis in self.bases] for name in ("reference", "modes")
         )
         connectivity = checked_surface(references, self.faces.cpu())[1]
+        if self.objective.space == "joint":  # nothing depends on the caller's order
+            order = own_order([x.numpy() for x in references], connectivity.faces)
+            references, modes = ([own[i] for i in order] for own in (references, modes))
         mesh = Mesh(connectivity)
         self.faces = mesh.faces
         #: True where there is a volume to be kept: not in sheets, whose energy has two terms.

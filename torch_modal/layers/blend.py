@@ -29,8 +29,8 @@ class Blend(InBetweenLayer):
     an error. The modes are constants. Precision, warnings and statuses are those of :class:`InBetween`.
 
     Args:
-        bases: The bases, one or more (:func:`torch_modal.extract_bases`); the first gives the orientation. In their
-            place key-frames, *shape* ``(K, V, 3)``, as for :class:`InBetween`.
+        bases: The bases, one or more, in any order (:func:`torch_modal.extract_bases`). In their place key-frames,
+            *shape* ``(K, V, 3)``, as for :class:`InBetween`.
         faces: Vertex indices. *Shape:* ``(F, 3)``.
         preset: ``"accurate"`` or ``"fast"``, as for :class:`InBetween`.
         objective: What is minimised, in the place of the preset's.

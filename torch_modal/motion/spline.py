@@ -7,6 +7,7 @@ from torch import Tensor, nn
 
 from torch_modal.autograd import full_precision
 from torch_modal.backends.torch.backend import TorchBackend
+from torch_modal.geometry.canonical import own_order
 from torch_modal.geometry.clusters import beyond_a_turn
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.local_rotations import Trajectory, weights_per_length
@@ -65,10 +66,11 @@ class Spline(nn.Module):
         super().__init__()
         n = len(references)
         self.scheme, self.cyclic = scheme, len(times) > n
-        self.alignment = KeyframeAlignment(references, mesh, backend)
+        order = own_order([x.numpy() for x in references], mesh.faces)  # as of in-betweens, whose frame contact shares
+        self.alignment = KeyframeAlignment(references[order], mesh, backend)
         self.register_buffer("times", times.clone(), persistent=False)
         self.poisson = backend.poisson(mesh, weights_per_length(mesh, references))
-        first = backend.rotations(mesh, references)
+        first = backend.rotations(mesh, references[:2])
         #: Local rotations of each interval. The tree of the first serves all in which neighbours have the same
         #: quaternion sign by it, and so by every tree, and in which nothing goes beyond a full turn.
         self.rotations: Any = nn.ModuleList([first])
@@ -77,7 +79,7 @@ class Spline(nn.Module):
             ends = references[[i, (i + 1) % n]]
             plain = first.clusters is None
             if plain:
-                plain = not beyond_a_turn(*first.wound(*(frames_of(x[None], first.faces) for x in ends)))
+                plain = not beyond_a_turn(*first.wound([frames_of(x[None], first.faces) for x in ends]))
             if plain:
                 turns = first.turns(ends[:1], ends[1:])[:, 0]
                 plain = bool(((pick(turns, one) * pick(turns, other)).sum(0) >= 0).all())
