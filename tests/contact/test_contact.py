@@ -166,6 +166,15 @@ def test_however_many_rounds_one_report(hand: Shapes) -> None:
     assert len(said) == 1
 
 
+def test_key_frames_exchanged(data_dir: Path) -> None:
+    """The same shape, as without contact: no length is measured in the first key-frame."""
+    (a, b), faces = tm.load_keyframes([data_dir / "mh-hand" / f"{name}.obj" for name in ("00-open", "02-fist")])
+    one, other = (tm.InBetween(x, faces, contact=True) for x in ([a, b], [b, a]))
+    found = one(a, b, 0.75)
+    assert float((found - tm.InBetween([a, b], faces)(a, b, 0.75)).abs().max()) > 0.01, "contacts"
+    torch.testing.assert_close(other(b, a, 0.25), found, rtol=0, atol=1e-9)
+
+
 @pytest.fixture(scope="module")
 def frogs(data_dir: Path) -> Shapes:
     """Poses of a frog whose limbs lie deep in each other on the way."""

@@ -67,6 +67,7 @@ class ContactSearch:
         areas: Areas of the vertices, constants of the gradient. *Shape:* ``(V,)``.
         n_shapes: T.
         pairs: The ``search`` of :class:`~torch_modal.geometry.crossings.Crossings`.
+        like: Its ``like``.
     """
 
     def __init__(
@@ -76,9 +77,10 @@ class ContactSearch:
         areas: Tensor,
         n_shapes: int,
         pairs: Callable[[FloatArray], IntArray] | None = None,
+        like: FloatArray | None = None,
     ) -> None:
         shapes = known.detach().double().cpu().numpy()
-        self.search = Search(Crossings(mesh.connectivity, shapes, search=pairs))
+        self.search = Search(Crossings(mesh.connectivity, shapes, like, pairs))
         self.faces = torch.tensor(mesh.connectivity.faces)
         self.areas = areas
         self.watched = np.zeros((n_shapes, known.shape[1]), dtype=bool)

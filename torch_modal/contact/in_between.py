@@ -124,7 +124,7 @@ def contact_search(core: InBetweenSolver, ends: Tensor, n_shapes: int) -> Contac
     reference = core.alignment.reference.detach().cpu().double().numpy()
     areas = vertex_areas(reference, connectivity.faces)
     pairs = core.backend.crossings(connectivity, reference)
-    return ContactSearch(core.mesh, ends, torch.from_numpy(areas).to(ends), n_shapes, pairs)
+    return ContactSearch(core.mesh, ends, torch.from_numpy(areas).to(ends), n_shapes, pairs, reference)
 
 
 def _steps(core: InBetweenSolver, rests: RestShapes) -> Callable[[Tensor, Tensor, Beside], Tensor]:

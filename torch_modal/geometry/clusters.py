@@ -92,29 +92,26 @@ def _from_mean(turns: Tensor, areas: Tensor, ancestors: Tensor, piece: Tensor) -
 
 
 def _clusters(turns: FloatArray, middles: IntArray, parents: IntArray) -> tuple[IntArray, IntArray, IntArray]:
-    """The cluster of each triangle, ``(F,)``; the root of each cluster, and its parent, C where none, ``(C,)`` each.
-
-    *Shape of the turns:* ``(F, 4, K)``.
-    """
+    """The cluster of each triangle, ``(F,)``; the root of each cluster, and its parent, C where none, ``(C,)`` each."""
     n = len(parents)
     # An extra node above the middles: one traversal visits all pieces.
     ends = np.append(np.arange(n), np.full(len(middles), n)), np.append(parents, middles)
     tree = coo_matrix((np.ones(len(ends[0])), ends), shape=(n + 1, n + 1)).tocsr()
     order, before = breadth_first_order(tree, n, directed=False)
-
-    def half_angles(f: int, root: int) -> FloatArray:
-        return np.arccos(np.abs((turns[f] * turns[root]).sum(0)).clip(max=1))
-
     cluster = np.empty(n, dtype=np.int64)
     roots: list[int] = []
     above: list[int] = []
     for f in order[1:]:
         own = -1 if before[f] == n else cluster[before[f]]
-        # Two shapes are at most as far apart as both are from the first.
-        if own < 0 or np.sort(half_angles(f, roots[own]))[-2:].sum() > WIDEST / 2:
+        if own < 0 or _half_spread(turns[f], turns[roots[own]]) > WIDEST / 2:
             above.append(own)
             own = len(roots)
             roots.append(f)
         cluster[f] = own
     parent = np.array(above)
     return cluster, np.array(roots, dtype=np.int64), np.where(parent < 0, len(roots), parent)
+
+
+def _half_spread(one: FloatArray, other: FloatArray) -> float:
+    """Bound on half the angle between triangles, from any shape to any: the largest two from the first shape, added."""
+    return float(np.sort(np.arccos(np.abs((one * other).sum(0)).clip(max=1)))[-2:].sum())

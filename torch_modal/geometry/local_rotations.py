@@ -109,12 +109,11 @@ class LocalRotations(nn.Module):
         turns = turns * LocalRotations.sign(self, turns.movedim(0, -1), self.areas.expand(turns.shape[1], -1))
         torn = ((pick(turns, one) * pick(turns, other)).sum(0) < -cos(ALIKE / 2)).any(0)
         if float((pick(self.areas, one) + pick(self.areas, other))[torn].sum()) > PART_TORN * float(self.areas.sum()):
-            warnings.warn(
-                "on a closed way around the mesh, key-frames turn by a full turn from each other, as a ring does that "
-                "is twisted by one: no choice of rotations is continuous, and in-betweens are distorted along a line",
-                MeshWarning,
-                stacklevel=2,
+            message = (
+                "around the mesh, key-frames turn by a full turn from each other, as a ring does that is twisted: no "
+                "choice of rotations is continuous, and in-betweens are distorted along a line"
             )
+            warnings.warn(message, MeshWarning, stacklevel=2)
 
     @staticmethod
     def _tree(turns: Tensor, slenderness: Tensor, mesh: Connectivity) -> tuple[Tensor, Tensor]:
