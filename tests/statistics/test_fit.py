@@ -58,6 +58,16 @@ def test_a_pose_that_is_not_among_the_keyframes(creature: tuple[tm.ShapeSpace, T
     torch.testing.assert_close(found.weights.sum(0), torch.ones(len(truth), dtype=DOUBLE))
 
 
+def test_inference_mode_and_arrays(space: tm.ShapeSpace, bars: Shapes) -> None:
+    points, picked = bars.keyframes[0][::9] + 0.02, torch.arange(0, 164, 9)
+    near = torch.tensor([0.4, 0.3, 0.3], dtype=DOUBLE)
+    wanted = space.fit(points, picked, near=near)
+    with torch.inference_mode():
+        found = space.fit(points + 0, picked + 0, near=near + 0)
+        torch.testing.assert_close(found.shape, wanted.shape)
+    assert torch.equal(space.fit(points.numpy(), picked.numpy(), near=near.numpy()).shape, wanted.shape)
+
+
 def _linear(shapes: Tensor, moved: Tensor, picked: Tensor) -> Tensor:
     """The nearest shape of the linear span, seen at the picked vertices."""
     pose = best_fit(shapes, moved.expand_as(shapes), torch.ones(len(moved), dtype=DOUBLE))

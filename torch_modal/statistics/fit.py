@@ -67,6 +67,11 @@ def fit(
         ValueError: Points, vertices or weights do not fit, or the points are in other units.
         RuntimeError: The points are within a transform of ``torch.func``, or have a tangent.
     """
+    if torch.is_inference_mode_enabled():  # weights are found by gradients
+        with torch.inference_mode(False), torch.no_grad():
+            near = near.clone() if isinstance(near, Tensor) else near
+            return fit(variation, torch.as_tensor(points).clone(), torch.as_tensor(vertices).clone(), near, robust)
+    points = torch.as_tensor(points)
     if transformed(points):
         raise RuntimeError("fits have no forward mode, and no transforms of torch.func: take torch.autograd.grad")
     k, v = variation.shapes.shape[:2]
