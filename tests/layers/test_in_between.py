@@ -12,7 +12,7 @@ import torch
 import trimesh
 from bodies import bend, twisted_plate
 from conftest import Shapes, modal
-from shapes import diagonal
+from shapes import apart, diagonal
 from torch import Tensor
 from torch.func import grad
 
@@ -359,11 +359,69 @@ def test_bases_that_do_not_fit(bars: Shapes, small_bars: Shapes) -> None:
         ([bars.bases[0], small_bars.bases[0]], r"meshes of \[30, 164\] vertices"),
         (small_bars.bases[:2], "vertices that do not exist"),
         (bars.bases, "between two bases, got 3; Path and Blend take more"),
-        (bars.keyframes[0], r"key-frames are floating-point of shape \(K, V, 3\); got \(164, 3\)"),
-        (bars.keyframes[:2].long(), "got .* of torch.int64"),
+        (bars.keyframes[0], r"key-frames have the shape \(K, V, 3\); got \(164, 3\)"),
+        (bars.keyframes[:2].long(), "dtype torch.int64.* convert"),
+        ([bars.bases[0], bars.keyframes[1].numpy()], "those of extract_bases; got ndarray"),
+        (["open.obj", "fist.obj"], "is a str that is no array of numbers"),
+        (None, "is a NoneType that is no array of numbers"),
     ):
         with pytest.raises(ValueError, match=message):
             InBetween(bases, bars.faces)
+
+
+@pytest.mark.parametrize("kind", [InBetween, tm.Blend, tm.MidShape, tm.Path])
+def test_key_frames_in_the_place_of_bases_are_arrays_or_lists(kind: Any, bars: Shapes) -> None:
+    x = bars.keyframes[:2]
+    wanted = kind(x, bars.faces).state_dict()
+    for given in (x.numpy(), list(x), list(x.numpy()), x.tolist()):
+        for own, value in zip(kind(given, bars.faces).state_dict().values(), wanted.values(), strict=True):
+            assert torch.equal(own, value)
+
+
+@pytest.mark.parametrize("wrong", ["not finite", "shape", "missing", "unknown"])
+@pytest.mark.parametrize("kind", [InBetween, tm.Path])
+def test_a_state_that_is_refused_changes_nothing(kind: Any, wrong: str, bars: Shapes) -> None:
+    layer = kind(bars.bases[:2], bars.faces)
+    before = {name: value.clone() for name, value in layer.state_dict().items()}
+    state = {name: 2 * value for name, value in before.items()}
+    if wrong == "not finite":
+        state["bases.1.reference"][3] = torch.nan
+    elif wrong == "shape":
+        state["bases.1.modes"] = state["bases.1.modes"][1:]
+    elif wrong == "missing":
+        del state["bases.1.modes"]
+    else:
+        state["bases.2.modes"] = state["bases.1.modes"]
+    with pytest.raises(ValueError if wrong == "not finite" else RuntimeError, match=r"NaN|which stays as it is: bases"):
+        layer.load_state_dict(state)
+    if wrong in ("not finite", "shape"):
+        with pytest.raises((ValueError, RuntimeError)):
+            torch.nn.Sequential(layer).load_state_dict({f"0.{name}": value for name, value in state.items()})
+    for name, value in layer.state_dict().items():
+        assert torch.equal(value, before[name])
+    if wrong in ("missing", "unknown"):
+        layer.load_state_dict(state, strict=False)
+
+
+def test_other_bases_in_functional_call_are_refused(bars: Shapes) -> None:
+    """What a layer computes from its bases is not computed again."""
+    layer, x = InBetween(bars.bases[:2], bars.faces), bars.keyframes
+    own = torch.func.functional_call(layer, layer.state_dict(), (x[0], x[1], 0.4))
+    torch.testing.assert_close(own, layer(x[0], x[1], 0.4))
+    modes = [bars.bases[0], replace(bars.bases[1], modes=2 * bars.bases[1].modes)]
+    for bases in (bars.bases[1:], modes):
+        state = InBetween(bases, bars.faces).state_dict()
+        for one in (layer, InBetween(bars.bases[:2], bars.faces).float()):
+            with pytest.raises(RuntimeError, match="bases of this InBetween were replaced"):
+                torch.func.functional_call(one, state, (x[0], x[1], 0.4))
+
+
+@pytest.mark.parametrize("preset", ["accurate", "fast"])
+def test_key_frames_exchanged(preset: Any, bars: Shapes) -> None:
+    """The same shapes, backwards in time."""
+    x, t = bars.keyframes, times(0.0, 0.3, 0.5)
+    one, other = (InBetween(bases, bars.faces, preset) for bases in (bars.bases[:2], bars.bases[1::-1]))
+    assert apart(one(x[0], x[1], t), other(x[1], x[0], 1 - t)) < 1e-9
 
 
 def test_modes_that_span_all_shapes() -> None:

@@ -21,7 +21,7 @@ from torch_modal.inbetween.settings import Objective, Preset, Solver, settings
 from torch_modal.io.cache import content_digest
 from torch_modal.keyframes.check import check_keyframes
 from torch_modal.layers.blend import Blend
-from torch_modal.modes.basis import ModalBasis
+from torch_modal.modes.basis import ModalBasis, checked_bases
 from torch_modal.statistics.components import Components
 from torch_modal.statistics.fit import Fitted, fit
 from torch_modal.statistics.variation import Variation
@@ -77,12 +77,7 @@ class ShapeSpace:
         cyclic: bool = False,
         contact: bool | None = None,
     ) -> None:
-        self.bases = [basis.to("cpu") for basis in ([bases] if isinstance(bases, ModalBasis) else bases)]
-        if not self.bases:
-            raise ValueError("a shape space needs one basis or more")
-        sizes = {basis.n_vertices for basis in self.bases}
-        if len(sizes) > 1:
-            raise ValueError(f"the bases belong to meshes of {sorted(sizes)} vertices; a space has one connectivity")
+        self.bases = [basis.to("cpu") for basis in checked_bases(bases)]
         # Checks and repairs the faces, as everywhere.
         self.faces = check_keyframes([self.bases[0].reference.double()], faces, warn=False).faces.cpu()
         self.settings = settings(preset, objective, solver, contact)

@@ -1,12 +1,13 @@
 """The common part of all layers of in-betweens: bases, settings, the solver, and the border."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from torch_modal.autograd import full_precision, lasting, outlasting, require_numbers
+from torch_modal.arrays import FloatArray
+from torch_modal.autograd import full_precision, lasting, outlasting, plain, require_numbers
 from torch_modal.contact.in_between import ContactSolver
 from torch_modal.energy.term import Mesh
 from torch_modal.energy.volume import Volume, encloses
@@ -14,9 +15,9 @@ from torch_modal.geometry.canonical import own_order
 from torch_modal.inbetween.results import InBetweenResult, Samples
 from torch_modal.inbetween.settings import Settings
 from torch_modal.inbetween.solver import InBetweenSolver
-from torch_modal.keyframes.arrays import as_faces
+from torch_modal.keyframes.arrays import as_faces, as_positions
 from torch_modal.keyframes.check import checked_surface
-from torch_modal.modes.basis import ModalBasis
+from torch_modal.modes.basis import ModalBasis, checked_bases
 
 
 class BasisBuffers(nn.Module):
@@ -37,7 +38,7 @@ class BasisBuffers(nn.Module):
         self.register_buffer("modes", modes.detach().to(torch.float64, copy=True))
 
 
-Bases = ModalBasis | Sequence[ModalBasis | BasisBuffers] | Tensor
+Bases = ModalBasis | Sequence[ModalBasis | BasisBuffers] | Tensor | FloatArray | Sequence[Tensor | FloatArray]
 """Bases of one connectivity, or key-frames without modes, *shape* ``(K, V, 3)``."""
 
 
@@ -45,26 +46,23 @@ def basis_buffers(bases: Bases) -> list[BasisBuffers]:
     """The buffers of each basis, or of key-frames, whose modes are none.
 
     Raises:
-        ValueError: There is nothing, or the bases belong to different meshes.
+        ValueError: There is nothing, or neither bases of one mesh nor key-frames.
     """
-    if isinstance(bases, Tensor):
-        if bases.dim() != 3 or bases.shape[-1] != 3 or not bases.is_floating_point():
-            raise ValueError(
-                "in the place of bases, key-frames are floating-point of shape (K, V, 3); got "
-                f"{tuple(bases.shape)} of {bases.dtype}"
-            )
-        return [BasisBuffers(x, x.new_zeros(0, *x.shape)) for x in bases]
-    several = [bases] if isinstance(bases, ModalBasis) else list(bases)
-    sizes = sorted({len(basis.reference) for basis in several})
-    if len(sizes) > 1:
-        raise ValueError(f"the bases belong to meshes of {sizes} vertices; an in-between needs one connectivity")
-    return [
-        basis if isinstance(basis, BasisBuffers) else BasisBuffers(basis.reference, basis.modes) for basis in several
-    ]
+    several: list[Any] = list(bases) if isinstance(bases, Iterable) else [bases]
+    if several and not any(hasattr(basis, "modes") for basis in several):
+        x = as_positions(several)
+        if x.dim() != 3 or x.shape[-1] != 3:
+            raise ValueError(f"in the place of bases, key-frames have the shape (K, V, 3); got {tuple(x.shape)}")
+        return [BasisBuffers(shape, shape.new_zeros(0, *shape.shape)) for shape in x]
+    return [b if isinstance(b, BasisBuffers) else BasisBuffers(b.reference, b.modes) for b in checked_bases(several)]
 
 
 class PreciseModule(nn.Module):
-    """A module that stays in float32 or float64, whatever it is cast to, and outlives inference mode."""
+    """A module of bases that stays in float32 or float64, whatever it is cast to, and outlives inference mode."""
+
+    bases: Any
+    faces: Tensor
+    built_from: Tensor
 
     @lasting
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "PreciseModule":
@@ -77,6 +75,36 @@ class PreciseModule(nn.Module):
 
         return super()._apply(kept, recurse)
 
+    def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
+        """As in torch, but a state that does not fit is refused as a whole, before anything of it is loaded."""
+        self._check_state(state_dict, "", strict)
+        return super().load_state_dict(state_dict, strict, assign)
+
+    def _load_from_state_dict(self, state_dict: Mapping[str, Any], prefix: str, *others: Any) -> None:
+        self._check_state(state_dict, prefix, strict=False)
+        super()._load_from_state_dict(state_dict, prefix, *others)
+
+    def _check_state(self, state_dict: Mapping[str, Any], prefix: str, strict: bool) -> None:
+        own, given = self.state_dict(prefix=prefix), {k: x for k, x in state_dict.items() if k.startswith(prefix)}
+        wrong = [name for name in own.keys() & given.keys() if own[name].shape != given[name].shape]
+        if wrong := sorted([*wrong, *(own.keys() ^ given.keys() if strict else [])]):
+            what = ", ".join(f"{name} {tuple(given[name].shape) if name in given else 'missing'}" for name in wrong[:4])
+            raise RuntimeError(f"the state does not fit this {type(self).__name__}, which stays as it is: {what}")
+        names = [f"{prefix}bases.{i}.reference" for i in range(len(self.bases))]
+        checked_surface([given.get(name, own[name]).double().cpu() for name in names], self.faces.cpu())
+
+    def _marks(self) -> Tensor:
+        """Numbers that tell the bases from others. *Shape:* ``(K, 3)``."""
+        return torch.stack([torch.cat([b.reference, *b.modes[-1:]]).square().mean(0) for b in self.bases])
+
+    def _require_own_bases(self) -> None:
+        """Raise where ``functional_call`` has replaced the bases, and not what follows from them."""
+        if plain(marks := self._marks()) and not torch.allclose(marks.to(self.built_from), self.built_from, 1e-4, 0.0):
+            raise RuntimeError(
+                f"the bases of this {type(self).__name__} were replaced, and not what it computed from its own: load "
+                "them by load_state_dict, or make a layer of them"
+            )
+
 
 class InBetweenLayer(PreciseModule):
     """A layer that solves in-betweens of the modal spaces of all its bases.
@@ -88,7 +116,6 @@ class InBetweenLayer(PreciseModule):
     """
 
     terms: Any
-    bases: Any
     core: InBetweenSolver
 
     def __init__(self, bases: Sequence[BasisBuffers], faces: Tensor, chosen: Settings) -> None:
@@ -123,6 +150,7 @@ class InBetweenLayer(PreciseModule):
         given = torch.stack(references), modes, mesh, list(self.terms), self.objective, self.solver
         kind = ContactSolver if self.objective.contact else InBetweenSolver
         self.core = kind(*given).to(like)
+        self.register_buffer("built_from", self._marks(), persistent=False)
 
     @property
     def dtype(self) -> torch.dtype:
@@ -140,6 +168,7 @@ class InBetweenLayer(PreciseModule):
         """
         if self.solver.gradient == "implicit" or self.solver.local_steps or self.solver.regions:
             require_numbers(type(self).__name__, keyframes)
+        self._require_own_bases()
         n, item = weights.shape[-1], keyframes.shape[-2:]
         flat = keyframes.to(self.dtype).expand(*lead, n, *item).reshape(-1, n, *item)
         pulls = weights.to(self.dtype).expand(*lead, n).reshape(-1, n)

@@ -54,8 +54,6 @@ class Blend(InBetweenLayer):
         if chosen.objective.space == "paired" or chosen.objective.contact:
             raise ValueError("contact and space='paired' are of two key-frames; a blend has space='joint' alone")
         several = basis_buffers(bases)
-        if not several:
-            raise ValueError("a blend needs one basis or more, got none")
         super().__init__(several * 2 if len(several) == 1 else several, faces, chosen)
 
     def forward(self, keyframes: Tensor, weights: Tensor) -> Tensor:

@@ -69,7 +69,7 @@ class InBetween(InBetweenLayer):
 
         All leading dimensions broadcast against each other, as in ``torch.lerp``: a number gives one shape for each
         pair of key-frames, ``t`` of ``(B,)`` with ``(B, V, 3)`` each its own time, ``t`` of ``(T,)`` with ``(V, 3)`` T
-        times, and with ``x_a[:, None]`` all pairs.
+        times, and with ``x_a[:, None]`` all pairs. So does ``t`` of ``(B, 1)`` with ``(B, V, 3)``: squeeze it first.
 
         Args:
             x_a: Key-frames at 0. *Shape:* ``(..., V, 3)``.

@@ -8,7 +8,6 @@ from torch_modal.inbetween.results import InBetweenResult
 from torch_modal.inbetween.settings import Objective, Preset, Solver, settings
 from torch_modal.layers.base import Bases
 from torch_modal.layers.in_between import InBetween
-from torch_modal.modes.basis import ModalBasis
 
 
 class MidShape(nn.Module):
@@ -42,8 +41,6 @@ class MidShape(nn.Module):
         regions: int | None = None,
     ) -> None:
         super().__init__()
-        if not isinstance(bases, ModalBasis) and len(bases) != 2:
-            raise ValueError(f"a mid-shape lies between two bases, got {len(bases)}; pass [basis_a, basis_b]")
         objective, solver = settings(preset, objective, solver, None, space, mu, regions)
         self.in_between = InBetween(bases, faces, objective=objective, solver=solver)
 

@@ -1,6 +1,7 @@
 """Vibration modes of one key-frame, as tensors."""
 
 import os
+from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,22 @@ from torch_modal.io.tensors import TensorFile, write_tensors
 
 FORMAT = "torch_modal.basis"
 VERSION = "2"
+
+
+def checked_bases(bases: Any) -> "list[ModalBasis]":
+    """One basis or several of one mesh, as a list.
+
+    Raises:
+        ValueError: There are none, they are something else, or belong to meshes of different sizes.
+    """
+    several = list(bases) if isinstance(bases, Iterable) else [bases]
+    others = sorted({type(basis).__name__ for basis in several if not hasattr(basis, "modes")})
+    if others or not several:
+        raise ValueError(f"bases, one or more, are those of extract_bases; got {', '.join(others) or 'none'}")
+    sizes = sorted({len(basis.reference) for basis in several})
+    if len(sizes) > 1:
+        raise ValueError(f"the bases belong to meshes of {sizes} vertices; they need one connectivity")
+    return several
 
 
 @dataclass(frozen=True, eq=False)

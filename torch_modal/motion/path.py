@@ -68,7 +68,6 @@ class Path(PreciseModule):
     """
 
     times: Tensor
-    bases: Any
 
     @lasting
     def __init__(
@@ -127,6 +126,7 @@ class Path(PreciseModule):
         backend = choose(self.solver.backend)
         self.spline = Spline(connectivity, references, self.times.cpu(), self.scheme, backend).to(like)
         self.distortion = backend.distortion(Mesh(connectivity), None).to(like)
+        self.register_buffer("built_from", self._marks(), persistent=False)
 
     @property
     def dtype(self) -> torch.dtype:
@@ -272,7 +272,6 @@ class Path(PreciseModule):
 
     def _located(self, keyframes: Tensor, t: Tensor | float) -> tuple[Tensor, Tensor, Tensor, Tensor, torch.Size]:
         """Motions, *shape* ``(L, K, V, 3)``; of each shape the motion, the interval, and the time there; dimensions."""
-        require_numbers("Path", keyframes)
         reference = self.spline.alignment.reference
         wanted = (self.n_keyframes, *reference.shape)
         if not isinstance(keyframes, Tensor) or not keyframes.is_floating_point() or keyframes.shape[-3:] != wanted:
@@ -283,6 +282,8 @@ class Path(PreciseModule):
             )
         if keyframes.device != reference.device:
             raise ValueError(f"keyframes are on {keyframes.device}, the path on {reference.device}; move one")
+        require_numbers("Path", keyframes)
+        self._require_own_bases()
         rounding = torch.finfo(t.dtype).eps if isinstance(t, Tensor) and t.is_floating_point() else 0.0
         t = torch.as_tensor(t, dtype=self.times.dtype, device=keyframes.device)
         own = keyframes.shape[:-3]
