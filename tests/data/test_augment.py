@@ -133,6 +133,8 @@ def test_without_a_generator_the_global_one_is_used(bars: Shapes, space: tm.Shap
         (lambda: tm.RandomRigidMotion(axis=(0, 0, 0)), "an axis has a length"),
         (lambda: tm.RandomRigidMotion(translation=-1), "translation"),
         (lambda: tm.AugmentationSequential(data_keys=["normals"]), "'shapes' among them"),
+        (lambda: tm.AugmentationSequential([tm.RandomBlend()]), r"one by one, .*\(\*transforms\); got \['list'\]"),  # type: ignore[arg-type]
+        (lambda: tm.AugmentationSequential(torch.nn.ReLU()), r"got \['ReLU'\]"),  # type: ignore[arg-type]
         (lambda: tm.AugmentationSequential(data_keys=["shapes", "colours"]), "colours"),
     ],
 )
@@ -155,6 +157,8 @@ def test_wrong_calls(bars: Shapes, space: tm.ShapeSpace) -> None:
         deformation(x[:2], params=deformation.params, space=space)
     with pytest.raises(ValueError, match="a pool holds the 3 key-frames"):
         tm.RandomInBetween(p=1.0)(x, space=space, pool=tm.ShapeBatch(x[:2]))
+    with pytest.raises(ValueError, match=r"ShapeBatch.of_keyframes\(space\); got a ShapeSpace"):
+        tm.RandomInBetween(p=1.0)(x, space=space, pool=space)
     with pytest.raises(ValueError, match="no in-between"):
         mirrored = x * torch.tensor([1.0, 1, -1], dtype=F64)
         tm.RandomInBetween(p=1.0, t=(0.5, 0.5))(torch.stack([x[0], mirrored[0]]), space=space)
@@ -214,9 +218,19 @@ def test_interpolation_is_cubic() -> None:
     assert torch.autograd.gradcheck(lambda t: interpolate(curve, t), [times])
 
 
-def test_a_single_shape_has_no_partner(bars: Shapes, space: tm.ShapeSpace) -> None:
-    x = bars.keyframes[:1]
-    assert torch.equal(tm.RandomInBetween(p=1.0, space=space)(x), x)
+def test_a_shape_alone_has_key_frames_as_partners(bars: Shapes, space: tm.ShapeSpace) -> None:
+    """As with a pool, of a call or of the transform; without other key-frames, or with labels, there are none."""
+    x, pool = bars.keyframes[0], tm.ShapeBatch.of_keyframes(space)
+    given: dict[str, Any] = {"t": (0.4, 0.6), "p": 1.0, "keepdim": True}
+    found = tm.RandomInBetween(**given, space=space, generator=seeded())(x)
+    assert float((found - x).abs().max()) > 0.1
+    assert torch.equal(tm.RandomInBetween(**given, space=space, generator=seeded())(x, pool=pool), found)
+    assert torch.equal(tm.RandomInBetween(**given, space=space, generator=seeded(), pool=pool)(x), found)
+    one = tm.AugmentationSequential(tm.RandomInBetween(**given), generator=seeded(), space=space, pool=pool)
+    assert not torch.equal(one(x[None]), x[None])
+    assert torch.equal(tm.RandomInBetween(**given, space=tm.ShapeSpace(bars.bases[:1], bars.faces))(x), x)
+    labelled = tm.RandomInBetween(**given, space=space, data_keys=["shapes", "shape_labels"])
+    assert torch.equal(labelled(x, torch.tensor(3))[0], x)
 
 
 def test_nearest_key_frame_is_found_through_rigid_motions(bars: Shapes, space: tm.ShapeSpace) -> None:
@@ -519,6 +533,14 @@ def test_composition_says_what_does_not_fit(bars: Shapes, space: tm.ShapeSpace) 
     with pytest.raises(ValueError, match="one connectivity"):
         smaller = replace(bars.bases[1], reference=bars.bases[1].reference[1:], modes=bars.bases[1].modes[:, 1:])
         tm.ShapeSpace([bars.bases[0], smaller], bars.faces)
+    for wrong, got in (
+        (bars.keyframes, "Tensor"),
+        ([bars.keyframes.numpy()], "ndarray"),
+        (None, "NoneType"),
+        ([], "none"),
+    ):
+        with pytest.raises(ValueError, match=f"bases, one or more, are those of extract_bases; got {got}"):
+            tm.ShapeSpace(wrong, bars.faces)  # type: ignore[arg-type]
 
 
 # ---------------------------------------------------------------------------------------------------- many draws

@@ -41,6 +41,7 @@ class ShapeAugmentation(nn.Module):
         data_keys: Arguments and results of a call; ``"shapes"`` must be among them.
         generator: Source of random numbers; by default PyTorch's own generator.
         space: Default key-frames and modes of the calls.
+        pool: Default pool of the calls, as for :meth:`transform`.
 
     Raises:
         ValueError: ``p`` is no probability, a data key is unknown or doubled, or there are no shapes.
@@ -60,6 +61,7 @@ class ShapeAugmentation(nn.Module):
         data_keys: Sequence[str] = ("shapes",),
         generator: torch.Generator | None = None,
         space: ShapeSpace | None = None,
+        pool: ShapeBatch | None = None,
     ) -> None:
         super().__init__()
         if not 0 <= p <= 1:
@@ -74,6 +76,7 @@ class ShapeAugmentation(nn.Module):
         self.keepdim = keepdim
         self.generator = generator
         self.space = space
+        self.pool = pool
         self.params: Any = {}
 
     def extra_repr(self) -> str:
@@ -141,7 +144,7 @@ class ShapeAugmentation(nn.Module):
         Raises:
             ValueError: There is no space, or the rows of ``params`` or ``pool`` do not fit.
         """
-        space = self._space(space)
+        space, pool = self._space(space), self.pool if pool is None else pool
         if self.uses_keyframes or torch.compiler.is_exporting():
             require_numbers(type(self).__name__, batch.shapes)
         n, dtype, device = len(batch.shapes), batch.shapes.dtype, batch.shapes.device
@@ -235,9 +238,10 @@ class AugmentationSequential(ShapeAugmentation):
         keepdim: Likewise.
         generator: Source of random numbers of all transforms; by default each has its own.
         space: Key-frames and modes, for all transforms; by default each has its own.
+        pool: Likewise.
 
     Raises:
-        ValueError: An unknown or doubled data key, or no shapes.
+        ValueError: An unknown or doubled data key, no shapes, or what is no transform.
     """
 
     uses_keyframes = False
@@ -249,8 +253,12 @@ class AugmentationSequential(ShapeAugmentation):
         keepdim: bool = False,
         generator: torch.Generator | None = None,
         space: ShapeSpace | None = None,
+        pool: ShapeBatch | None = None,
     ) -> None:
-        super().__init__(1.0, keepdim=keepdim, data_keys=data_keys, generator=generator, space=space)
+        super().__init__(1.0, keepdim=keepdim, data_keys=data_keys, generator=generator, space=space, pool=pool)
+        others = [type(one).__name__ for one in transforms if not isinstance(one, ShapeAugmentation)]
+        if others:
+            raise ValueError(f"pass the transforms one by one, AugmentationSequential(*transforms); got {others}")
         self.transforms: Any = nn.ModuleList(transforms)
 
     def forward_parameters(
@@ -271,7 +279,7 @@ class AugmentationSequential(ShapeAugmentation):
         if len(params) != len(self.transforms):
             raise ValueError(f"{len(self.transforms)} transforms need as many sets of parameters; got {len(params)}")
         for one, own in zip(self.transforms, params, strict=True):
-            batch = one.transform(batch, own, self._space(space), pool)
+            batch = one.transform(batch, own, self._space(space), self.pool if pool is None else pool)
         return batch
 
 

@@ -71,8 +71,8 @@ class ShapeDataset(Dataset[Sample]):
     ) -> None:
         if samples_per_set < 1:
             raise ValueError(f"samples_per_set is 1 or more, got {samples_per_set}")
-        if seed < 0:
-            raise ValueError(f"seed is 0 or more, got {seed}")
+        if not isinstance(seed, int | np.integer) or seed < 0:
+            raise ValueError(f"seed is an integer, 0 or more; got {seed!r}")
         self.sets = [str(path) for path in find_sets(root)]
         if not self.sets:
             raise FileNotFoundError(f"no stored key-frame set in {root}; torch-modal precompute makes them")

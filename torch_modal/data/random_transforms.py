@@ -21,7 +21,8 @@ from torch_modal.statistics.variation import check_density
 class RandomInBetween(ShapeAugmentation):
     """Replaces a shape by one between it and a partner, of least elastic energy (:class:`torch_modal.InBetween`).
 
-    Partners are other shapes of the batch, as in kornia's ``RandomMixUpV2``, or key-frames of a call's ``pool``.
+    Partners are other shapes of the batch, as in kornia's ``RandomMixUpV2``, or key-frames of a ``pool``. One shape
+    alone, without labels, has the key-frames of the space as partners.
 
     Where the key-frames are a motion (``keyframe_times`` of the :class:`ShapeSpace`), the partner from a pool is the
     key-frame before or after in time, with equal probability, and the in-between is that of :class:`torch_modal.Path`.

@@ -54,6 +54,8 @@ class ShapeBatch(NamedTuple):
     ) -> "ShapeBatch | None":
         """A second shape for each of some shapes; None if there is no other.
 
+        A shape that is alone, without labels, has partners among the key-frames.
+
         Args:
             chosen: The shapes. *Shape:* ``(n,)``.
             draw: Place of the partner among the other shapes, in [0, 1); of key-frames in a motion, that before (below
@@ -64,11 +66,14 @@ class ShapeBatch(NamedTuple):
         Raises:
             ValueError: The pool has another number of shapes.
         """
+        if pool is None and len(self.shapes) == 1 and self.vertex_labels is None and self.shape_labels is None:
+            pool = ShapeBatch.of_keyframes(space, self.shapes)
         others, own = self, chosen
         if pool is not None:
-            if len(pool.shapes) != len(space):
+            if not isinstance(pool, ShapeBatch) or len(pool.shapes) != len(space):
+                got = f"{len(pool.shapes)} shapes" if isinstance(pool, ShapeBatch) else f"a {type(pool).__name__}"
                 raise ValueError(
-                    f"a pool holds the {len(space)} key-frames of the space; got {len(pool.shapes)} shapes"
+                    f"a pool holds the {len(space)} key-frames of the space, ShapeBatch.of_keyframes(space); got {got}"
                 )
             assert self.nearest is not None
             others, own = pool.located(space, self.shapes.dtype), self.nearest[chosen]
