@@ -100,6 +100,24 @@ def passengers(shapes: Shapes) -> tm.Passengers:
     return tm.Passengers(x, shapes.faces, x[::3] + 0.01 * (x[::3] - x.mean(0)))
 
 
+def two_bodies(x: Tensor) -> Tensor:
+    """The shapes, and beside them, far away, the same in another order. *Shape:* ``(..., 3, V, 3)``."""
+    length = x[..., :1, -1:, :] - x[..., :1, :1, :]
+    return torch.cat([x, x.flip(-3) + 5 * length], -2)
+
+
+def of_two_bodies(shapes: Shapes) -> tm.InBetween:
+    """Of the first two key-frames, with the modes of each body."""
+    x, bases = two_bodies(shapes.keyframes)[:2], []
+    for shape, one, other in zip(x, shapes.bases[:2], shapes.bases[:0:-1], strict=True):
+        parts = torch.cat([one.modes, 0 * one.modes], 1), torch.cat([0 * other.modes, other.modes], 1)
+        values = torch.cat([one.eigenvalues, other.eigenvalues])
+        bases.append(tm.ModalBasis(shape, values, torch.cat(parts), one.rigid_eigenvalues))
+    layer = tm.InBetween(bases, torch.cat([shapes.faces, shapes.faces + shapes.keyframes.shape[1]]))
+    assert len(layer.cores) == 2
+    return layer
+
+
 def latent(layer: Any, x: Tensor) -> Tensor:
     """Of a straight path of codes."""
     return layer(Linear(x), torch.tensor([[0.0, 0.0], [0.5, 0.1], [1.0, 0.0]]).to(x))
@@ -134,6 +152,7 @@ LAYERS: dict[str, Case] = {
     "InBetween, no modes": Case(lambda s: tm.InBetween(s.keyframes[:2], s.faces), pair_in_time),
     "InBetween, own term": Case(with_own_term, pair_in_time),
     "InBetween, contact": Case(partial(in_between, contact=True), pair_in_time),
+    "InBetween, bodies": Case(of_two_bodies, lambda layer, x: pair_in_time(layer, two_bodies(x))),
     "MidShape, paper": Case(lambda s: tm.MidShape(s.bases[:2], s.faces, preset="paper"), pair),
     "Blend": Case(lambda s: tm.Blend(s.bases, s.faces), blended),
     "Path": Case(lambda s: tm.Path(s.bases, s.faces), set_in_time),

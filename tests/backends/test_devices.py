@@ -162,7 +162,7 @@ def test_layers(small_bars: Shapes, kind: str, preset: Any, backend: Any) -> Non
 @pytest.mark.parametrize("backend", ["torch", "warp"])
 def test_splines(small_bars: Shapes, backend: str) -> None:
     """Triangles and poses between key-frames."""
-    spline = tm.Path(small_bars.keyframes, small_bars.faces, solver=tm.Solver(backend=backend)).spline
+    spline = tm.Path(small_bars.keyframes, small_bars.faces, solver=tm.Solver(backend=backend)).splines[0]
     knots = spline.knots(small_bars.keyframes[None])
     with gpu() as mode, torch.no_grad():
         on_gpu(spline, mode)

@@ -1,9 +1,9 @@
 """Flat batches of in-betweens, their results, and warnings about those that did not converge."""
 
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -67,6 +67,20 @@ def unminimised(x: Tensor, usable: Tensor) -> Solution:
     number = x.detach().new_zeros(len(x))
     status = torch.where(usable, Status.CONVERGED, Status.INVALID)
     return Solution(number.new_zeros(len(x), 0), number, number.clone(), torch.zeros_like(status), status)
+
+
+def of_bodies(results: Sequence[InBetweenResult], vertices: Sequence[Any]) -> InBetweenResult:
+    """Results of bodies as one, from the vertices of each: with the sum of the energies and the worst status."""
+    if len(results) == 1:
+        return results[0]
+    a, *numbers = zip(*(result.solution[:5] for result in results), strict=True)
+    energy, norm, n_steps, status = (torch.stack(values) for values in numbers)
+    worst = (status % Status.FELL_BACK).amax(0)  # that a body fell back is the least of all
+    worst = torch.where(worst > 0, worst, status.amax(0))
+    shapes = torch.cat([result.shapes for result in results], 1)[:, torch.argsort(torch.cat(list(vertices)))]
+    ratio = torch.stack([result.solution.distortion_ratio for result in results]).amax(0)  # type: ignore[arg-type]
+    solution = Solution(torch.cat(a, 1), energy.sum(0), norm.amax(0), n_steps.amax(0), worst, distortion_ratio=ratio)
+    return InBetweenResult(shapes, solution)
 
 
 def report(solution: Solution, solver: Solver) -> None:

@@ -11,8 +11,9 @@ from torch_modal.autograd import full_precision, lasting, outlasting, plain, req
 from torch_modal.contact.in_between import ContactSolver
 from torch_modal.energy.term import Mesh
 from torch_modal.energy.volume import Volume, encloses
+from torch_modal.geometry.bodies import bodies
 from torch_modal.geometry.canonical import own_order
-from torch_modal.inbetween.results import InBetweenResult, Samples
+from torch_modal.inbetween.results import InBetweenResult, Samples, of_bodies
 from torch_modal.inbetween.settings import Settings
 from torch_modal.inbetween.solver import InBetweenSolver
 from torch_modal.keyframes.arrays import as_faces, as_positions
@@ -116,7 +117,7 @@ class InBetweenLayer(PreciseModule):
     """
 
     terms: Any
-    core: InBetweenSolver
+    cores: Any
 
     def __init__(self, bases: Sequence[BasisBuffers], faces: Tensor, chosen: Settings) -> None:
         super().__init__()
@@ -143,14 +144,28 @@ class InBetweenLayer(PreciseModule):
         if self.objective.space == "joint":  # nothing depends on the caller's order
             order = own_order([x.numpy() for x in references], connectivity.faces)
             references, modes = ([own[i] for i in order] for own in (references, modes))
-        mesh = Mesh(connectivity)
-        self.faces = mesh.faces
+        self.faces = torch.tensor(connectivity.faces)
+        chosen, found = self.objective, [(slice(None), connectivity)]
+        numbers = all(torch.as_tensor(term.stiffness).shape[-1:] in ((), (1,)) for term in self.terms)
+        if chosen.space == "joint" and numbers and not (chosen.contact or chosen.terms):  # these may be between bodies
+            found = bodies(torch.stack(references).numpy(), connectivity)
+        #: Vertices of each body, and its solver.
+        self.vertices, self.cores = [own for own, _ in found], nn.ModuleList()
         #: True where there is a volume to be kept: not in sheets, whose energy has two terms.
-        self.encloses = all(encloses(x, connectivity) for x in references)
-        given = torch.stack(references), modes, mesh, list(self.terms), self.objective, self.solver
-        kind = ContactSolver if self.objective.contact else InBetweenSolver
-        self.core = kind(*given).to(like)
+        self.encloses = []
+        kind = ContactSolver if chosen.contact else InBetweenSolver
+        for own, mesh in found:
+            shapes, moves = torch.stack(references)[:, own], [each[:, own] for each in modes]
+            if len(found) > 1:  # without the modes of other bodies
+                moves = [each[each.flatten(1).any(1)] for each in moves]
+            self.cores.append(kind(shapes, moves, Mesh(mesh), list(self.terms), chosen, self.solver).to(like))
+            self.encloses.append(all(encloses(x, mesh) for x in shapes))
         self.register_buffer("built_from", self._marks(), persistent=False)
+
+    @property
+    def core(self) -> InBetweenSolver:
+        """The solver of the first body, as a rule the only one."""
+        return self.cores[0]  # type: ignore[no-any-return]
 
     @property
     def dtype(self) -> torch.dtype:
@@ -172,8 +187,10 @@ class InBetweenLayer(PreciseModule):
         n, item = weights.shape[-1], keyframes.shape[-2:]
         flat = keyframes.to(self.dtype).expand(*lead, n, *item).reshape(-1, n, *item)
         pulls = weights.to(self.dtype).expand(*lead, n).reshape(-1, n)
-        samples = Samples(flat, pulls, self.mu_of(pulls, lead), self.stiffness_of(pulls, lead))
-        return self.core(samples).unflattened(lead)
+        mu, found = self.mu_of(pulls, lead), []
+        for i, (own, core) in enumerate(zip(self.vertices, self.cores, strict=True)):
+            found.append(core(Samples(flat[:, :, own], pulls, mu, self.stiffness_of(pulls, lead, i))))
+        return of_bodies(found, self.vertices).unflattened(lead)
 
     # ------------------------------------------------------------------------------------------------------ the border
     def check_shapes(self, **given: Tensor) -> None:
@@ -182,7 +199,7 @@ class InBetweenLayer(PreciseModule):
         Raises:
             ValueError: One is no tensor, no shape of the mesh, or on another device.
         """
-        reference = self.core.alignment.reference
+        reference = self.bases[0].reference
         for name, x in given.items():
             if not isinstance(x, Tensor):
                 raise ValueError(f"{name} is a {type(x).__name__}; pass a tensor, for instance torch.as_tensor({name})")
@@ -204,13 +221,13 @@ class InBetweenLayer(PreciseModule):
                 f"mu of shape {tuple(mu.shape)} does not broadcast against samples of {tuple(lead)}"
             ) from None
 
-    def stiffness_of(self, like: Tensor, lead: torch.Size) -> list[Tensor]:
-        """Stiffnesses of a flat batch, of each term. *Shape of each:* ``(B, M)`` or ``(B, 1)``."""
+    def stiffness_of(self, like: Tensor, lead: torch.Size, body: int = 0) -> list[Tensor]:
+        """Stiffnesses of a body in a flat batch, of each term. *Shape of each:* ``(B, M)`` or ``(B, 1)``."""
         found = []
         for term, part in zip(self.terms, self.core.fine.energy.parts, strict=True):
             values = torch.as_tensor(term.stiffness, dtype=like.dtype, device=like.device)
             values = values[None] if values.dim() == 0 else values
-            values = values if self.encloses or not isinstance(term, Volume) else 0 * values
+            values = values if self.encloses[body] or not isinstance(term, Volume) else 0 * values
             n = 1 if term.total else part.corners.shape[1]
             try:
                 if values.shape[-1] not in (1, n):

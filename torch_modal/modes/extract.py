@@ -4,7 +4,7 @@ import contextlib
 import functools
 import threading
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -13,6 +13,7 @@ import torch
 
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.errors import MeshError, MeshWarning
+from torch_modal.geometry.bodies import bodies
 from torch_modal.geometry.connectivity import Connectivity, connected_pieces
 from torch_modal.geometry.inspect import OPEN, open_part
 from torch_modal.io.cache import Arrays, Cache
@@ -83,7 +84,7 @@ def extract_bases(
     Args:
         keyframes: Positions, tensor or array, any units. *Shape:* ``(K, V, 3)``.
         faces: Vertex indices. *Shape:* ``(F, 3)``.
-        n_modes: Number of elastic modes of each, k.
+        n_modes: Number of elastic modes of each, k. Bodies far from each other (docs/input.md) have so many each.
         method: ``"solid"``; ``"shell"``, for the surface itself, which may be open, flat or not manifold; or
             ``"auto"``: the solid, but the shell where a key-frame is open or thin or the solid fails
             (:func:`why_shell`), which a line of the log says. All key-frames have the same.
@@ -143,6 +144,10 @@ def bases_of_checked(
             f"{n_modes} modes requested, but a surface of {n_used} vertices has at most {possible} ways to "
             f"deform; give 1 to {possible}"
         )
+    several = bodies(shapes, Connectivity(triangles, shapes.shape[1]))
+    if len(several) > 1:
+        with contextlib.suppress(MeshError, ModalAnalysisError):  # the whole may have modes, nevertheless
+            return _bases_of_bodies(several, torch.from_numpy(shapes), n_modes, method, form, mesher, cache, progress)
     with one_blas_thread(), ProgressReport(len(shapes), "vibration modes", progress) as bar:
         extraction = _Extraction(len(shapes), int(n_modes), form, mesher, cache or Cache.at(None), bar)
         for index, shape in enumerate(shapes):
@@ -167,6 +172,24 @@ def bases_of_checked(
         bases.append(
             ModalBasis(torch.from_numpy(shape.copy()), eigenvalues, torch.from_numpy(modes), rigid_eigenvalues)
         )
+    return bases
+
+
+def _bases_of_bodies(several: Sequence[Any], keyframes: torch.Tensor, n_modes: int, *options: Any) -> list[ModalBasis]:
+    """Bases with the modes of each body, which are zero on the others. *Shape:* ``(K, V, 3)``."""
+    found = []
+    for own, mesh in several:
+        most = min(n_modes, 3 * len(mesh.used) - N_RIGID)
+        found.append(bases_of_checked(keyframes[:, own], torch.tensor(mesh.faces), most, *options))
+    bases = []
+    for shape, *parts in zip(keyframes, *found, strict=True):
+        values, order = torch.cat([basis.eigenvalues for basis in parts]).sort(stable=True)
+        modes, rows = shape.new_zeros(len(values), *shape.shape), iter(order.argsort())
+        for (own, _), basis in zip(several, parts, strict=True):
+            for mode in basis.modes:
+                modes[next(rows), own] = mode
+        rigid_eigenvalues = torch.stack([basis.rigid_eigenvalues for basis in parts]).amax(0)
+        bases.append(ModalBasis(shape, values, modes, rigid_eigenvalues))
     return bases
 
 

@@ -102,14 +102,13 @@ class PathEditor:
         if not path.smooth:
             return [(own, own.new_zeros(0)) for own in ends]
         size = (self.keyframes.amax(1) - self.keyframes.amin(1)).norm(dim=-1).amax()
-        knots = path.spline.knots(self.keyframes[None].to(path.dtype))
-        unit = torch.ones(6, 1, 1).to(knots.shapes)
-        unit[3:] /= knots.shapes.abs().amax()  # of turns 1, of sizes those of the shapes
-        velocities = (
-            torch.cat([part.flatten(1) for part in (unit * triangles, turns, moves / size)], 1)
-            for triangles, turns, moves in zip(knots.triangles[1:], knots.turns[1:], knots.moves[1:], strict=True)
-        )
-        return list(zip(ends, torch.cat(list(velocities), 1), strict=True))
+        velocities = []
+        for knots in path.knots(self.keyframes[None].to(path.dtype)) or []:
+            unit = torch.ones(6, 1, 1).to(knots.shapes)
+            unit[3:] /= knots.shapes.abs().amax()  # of turns 1, of sizes those of the shapes
+            for triangles, turns, moves in zip(knots.triangles[1:], knots.turns[1:], knots.moves[1:], strict=True):
+                velocities += [part.flatten(1) for part in (unit * triangles, turns, moves / size)]
+        return list(zip(ends, torch.cat(velocities, 1), strict=True))
 
     def _checked(self, shape: Tensor) -> Tensor:
         if shape.shape != self.keyframes.shape[1:] or not bool(shape.isfinite().all()):

@@ -14,10 +14,11 @@ from torch_modal.contact.in_between import push_apart
 from torch_modal.energy.energy import RestShapes
 from torch_modal.energy.shell import ALPHA, BETA
 from torch_modal.energy.term import Mesh
+from torch_modal.geometry.bodies import bodies
 from torch_modal.geometry.crossings import require_contact
 from torch_modal.inbetween.alignment import Pose
 from torch_modal.inbetween.comparison import SLACK_OF_PATHS, no_worse
-from torch_modal.inbetween.results import InBetweenResult, report, unminimised, with_exact_keyframes
+from torch_modal.inbetween.results import InBetweenResult, of_bodies, report, unminimised, with_exact_keyframes
 from torch_modal.inbetween.settings import Objective, Preset, Solver, settings
 from torch_modal.keyframes.arrays import as_faces, checked_times
 from torch_modal.keyframes.check import checked_surface
@@ -68,6 +69,8 @@ class Path(PreciseModule):
     """
 
     times: Tensor
+    splines: Any
+    distortions: Any
 
     @lasting
     def __init__(
@@ -118,20 +121,24 @@ class Path(PreciseModule):
 
     @lasting
     def _build(self, _: Any = None) -> None:
-        """Build the spline of the bases' references, on their device and in their dtype."""
+        """Build the splines of the bases' references, on their device and in their dtype."""
         like = self.bases[0].reference
         references = torch.stack([basis.reference.double().cpu() for basis in self.bases])
         connectivity = checked_surface(list(references), self.faces)[1]
         self.faces = torch.tensor(connectivity.faces)
-        backend = choose(self.solver.backend)
-        self.spline = Spline(connectivity, references, self.times.cpu(), self.scheme, backend).to(like)
-        self.distortion = backend.distortion(Mesh(connectivity), None).to(like)
+        backend, alone = choose(self.solver.backend), self.contact or self.objective.terms
+        found = [(slice(None), connectivity)] if alone else bodies(references.numpy(), connectivity)
+        #: Vertices of each body, and its spline.
+        self.vertices, self.splines, self.distortions = [own for own, _ in found], nn.ModuleList(), nn.ModuleList()
+        for own, mesh in found:
+            self.splines.append(Spline(mesh, references[:, own], self.times.cpu(), self.scheme, backend).to(like))
+            self.distortions.append(backend.distortion(Mesh(mesh), None).to(like))
         self.register_buffer("built_from", self._marks(), persistent=False)
 
     @property
     def dtype(self) -> torch.dtype:
         """The dtype of the computation."""
-        return self.spline.alignment.scale.dtype
+        return self.splines[0].alignment.scale.dtype  # type: ignore[no-any-return]
 
     @lasting
     def insert(self, t: float) -> "Path":
@@ -184,7 +191,7 @@ class Path(PreciseModule):
     def solve(self, keyframes: Tensor, t: Tensor | float) -> InBetweenResult:
         """The shapes, and how each minimisation went, without a warning. Arguments as for :meth:`forward`."""
         flat, which, segment, u, lead = self._located(keyframes, t)
-        knots = self.spline.knots(flat) if self.smooth else None
+        knots = self.knots(flat)
         parts, order = by_interval(
             segment, len(self.pairs), lambda i, rows: self.within(knots, flat, i, which[rows], u[rows])
         )
@@ -194,10 +201,15 @@ class Path(PreciseModule):
         exact = with_exact_keyframes(result.shapes, ends, torch.stack([1 - u, u], -1))
         return result._replace(shapes=exact).unflattened(lead)
 
+    def knots(self, motions: Tensor) -> list[Knots] | None:
+        """The knots of each body; None if the path is not smooth. *Shape:* ``(L, K, V, 3)``."""
+        parts = zip(self.splines, self.vertices, strict=True)
+        return [spline.knots(motions[:, :, own]) for spline, own in parts] if self.smooth else None
+
     @full_precision
     def within(
         self,
-        knots: Knots | None,
+        knots: list[Knots] | None,
         flat: Tensor,
         i: int,
         which: Tensor,
@@ -207,7 +219,7 @@ class Path(PreciseModule):
         """Shapes of one interval.
 
         Args:
-            knots: Of the motions; None if they are not smooth.
+            knots: Of :meth:`knots`.
             flat: The motions, in the dtype of the computation. *Shape:* ``(L, K, V, 3)``.
             i: The interval.
             which: The motion of each shape. *Shape:* ``(B,)``.
@@ -222,22 +234,24 @@ class Path(PreciseModule):
             found = self.layers[0].solved(x, torch.ones_like(x[..., 0, 0]), u.shape)
         return found
 
-    def _alone(self, knots: Knots | None, flat: Tensor, i: int, which: Tensor, u: Tensor) -> InBetweenResult:
+    def _alone(self, knots: list[Knots] | None, flat: Tensor, i: int, which: Tensor, u: Tensor) -> InBetweenResult:
         """Shapes without contact and further terms. Arguments as for :meth:`within`."""
         weights = torch.stack([1 - u, u], -1)
         if knots is None:
             ends = flat[which][:, list(self.pairs[i])]
             return self.layers[i].solved(ends, weights, u.shape)  # type: ignore[no-any-return]
-        straight = self.spline.straight(knots, i, which, u)
-        x, usable = self.spline(knots, i, which, u, straight=straight), knots.usable[which]
-        stiffness = [u.new_full((len(u), 1), value) for value in (ALPHA, BETA)]
-        rests = RestShapes(knots.shapes[i : i + 2, which].movedim(0, 1), weights, stiffness, None)
-        x, solution = no_worse(x, [straight], unminimised(x, usable), self.distortion, rests, SLACK_OF_PATHS)
-        shapes = self.spline.alignment.restore(x, self.spline.pose(knots, i, which, u))
-        return InBetweenResult(torch.where(usable[:, None, None], shapes, torch.nan), solution)
+        found, stiffness = [], [u.new_full((len(u), 1), value) for value in (ALPHA, BETA)]
+        for spline, distortion, own in zip(self.splines, self.distortions, knots, strict=True):
+            straight = spline.straight(own, i, which, u)
+            x, usable = spline(own, i, which, u, straight=straight), own.usable[which]
+            rests = RestShapes(own.shapes[i : i + 2, which].movedim(0, 1), weights, stiffness, None)
+            x, solution = no_worse(x, [straight], unminimised(x, usable), distortion, rests, SLACK_OF_PATHS)
+            shapes = spline.alignment.restore(x, spline.pose(own, i, which, u))
+            found.append(InBetweenResult(torch.where(usable[:, None, None], shapes, torch.nan), solution))
+        return of_bodies(found, self.vertices)
 
     def _separated(
-        self, knots: Knots | None, flat: Tensor, i: int, which: Tensor, u: Tensor, result: InBetweenResult, n: int
+        self, knots: list[Knots] | None, flat: Tensor, i: int, which: Tensor, u: Tensor, result: InBetweenResult, n: int
     ) -> InBetweenResult:
         """Shapes pushed apart by a displacement found at ``n`` even times of each motion."""
         refuse_transforms(result.shapes)
@@ -248,7 +262,7 @@ class Path(PreciseModule):
         def placed(own: Tensor, at: Tensor) -> tuple[Pose, Tensor | None, Tensor]:
             """The poses, the rest shapes of a pair, and the key-frames in the frame."""
             if knots is not None:
-                return self.spline.pose(knots, i, own, at), None, knots.shapes[i : i + 2, own[0]]
+                return self.splines[0].pose(knots[0], i, own, at), None, knots[0].shapes[i : i + 2, own[0]]
             rests, pose, _ = core.alignment(flat[own][:, pair], torch.stack([1 - at, at], -1))
             return pose, rests, rests[0]
 
@@ -272,7 +286,7 @@ class Path(PreciseModule):
 
     def _located(self, keyframes: Tensor, t: Tensor | float) -> tuple[Tensor, Tensor, Tensor, Tensor, torch.Size]:
         """Motions, *shape* ``(L, K, V, 3)``; of each shape the motion, the interval, and the time there; dimensions."""
-        reference = self.spline.alignment.reference
+        reference = self.bases[0].reference
         wanted = (self.n_keyframes, *reference.shape)
         if not isinstance(keyframes, Tensor) or not keyframes.is_floating_point() or keyframes.shape[-3:] != wanted:
             is_tensor = isinstance(keyframes, Tensor)

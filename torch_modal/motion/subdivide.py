@@ -157,7 +157,7 @@ def _along_path(
     """Shapes between the key-frames of each interval."""
     path = Path(bases, faces.cpu(), times, cyclic, smooth, objective=chosen.objective, solver=chosen.solver)
     motion = keyframes[None].to(path.to(keyframes.device).dtype)
-    knots, left = path.spline.knots(motion) if path.smooth else None, 0
+    knots, left = path.knots(motion), 0
     for i, n in enumerate(b - a for a, b in pairwise(places)):
         u = torch.arange(1, n).to(motion) / n
         result = path.within(knots, motion, i, torch.zeros_like(u, dtype=torch.int64), u, n_searched=n - 1)
@@ -201,7 +201,10 @@ def _by_recursion(
                 mids = torch.stack([layers[a, b](x, y) for a, b, x, y in each])
             shapes = torch.cat([torch.stack([shapes[:-1], mids], 1).flatten(0, 1), shapes[-1:]])
             bar.update()
-        shapes = shapes if n_frames is None else _resample(shapes, n, weights)
+        if n_frames is not None:
+            known, shapes = shapes, shapes.new_empty(n + 1, *shapes.shape[1:])
+            for body in layers[0, 1].in_between.vertices:
+                shapes[:, body] = _resample(known[:, body], n, weights[body])
         yield shapes[1:-1]
 
 
