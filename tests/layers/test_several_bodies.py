@@ -139,3 +139,28 @@ def test_what_may_be_between_bodies_is_one_problem(kind: str, both: Shapes) -> N
     layer = tm.InBetween(both.bases[:2], both.faces, objective=tm.Objective(**changes))
     assert len(layer.cores) == 1
     assert layer(*both.keyframes[:2], 0.5).isfinite().all()
+
+
+@pytest.mark.parametrize("kind", ["pair", "path of pairs", "smooth path"])
+def test_contact_is_of_all_bodies(kind: str, both: Shapes) -> None:
+    """Two bodies that exchange their places, and would pass through each other on the way."""
+    pytest.importorskip("ipctk")
+    pytest.importorskip("igl")
+    first = both.keyframes[0, : both.keyframes.shape[1] // 2]
+    away = torch.tensor([0.0, 0.5, 9.0], dtype=DOUBLE)
+    x = torch.stack([torch.cat([first, first + away]), torch.cat([first + away, first])])
+    when = torch.linspace(0.34, 0.54, 6, dtype=DOUBLE)
+    if kind == "smooth path":
+        x = x[[0, 1, 0]]
+
+    def motion(contact: bool) -> tuple[Any, Tensor]:
+        if kind == "pair":
+            layer = tm.InBetween(x, both.faces, contact=contact)
+            return layer, layer(*x, when)
+        path = tm.Path(x, both.faces, contact=contact)
+        return (path.layers or [path])[0], path(x, when)
+
+    (one, pushed), (several, free) = motion(True), motion(False)
+    assert len(one.vertices) == 1 and len(several.vertices) == 2
+    before, after = (len(tm.self_contacts(shapes, both.faces).pairs) for shapes in (free, pushed))
+    assert before > 0 and after < before / 4

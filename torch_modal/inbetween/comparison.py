@@ -46,7 +46,7 @@ def no_worse(
         The shapes, and the solution with ratios of distortions, in which those that a start has replaced are marked.
     """
     if not len(x):
-        return x, solution
+        return x, solution._replace(distortion_ratio=solution.energy)
     shapes = [x, *starts]
     with torch.no_grad():
         found = distortion(shapes, rests)

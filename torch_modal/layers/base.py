@@ -118,6 +118,8 @@ class InBetweenLayer(PreciseModule):
 
     terms: Any
     cores: Any
+    separate = True
+    """False for bodies as one problem, as where something is between them."""
 
     def __init__(self, bases: Sequence[BasisBuffers], faces: Tensor, chosen: Settings) -> None:
         super().__init__()
@@ -147,7 +149,7 @@ class InBetweenLayer(PreciseModule):
         self.faces = torch.tensor(connectivity.faces)
         chosen, found = self.objective, [(slice(None), connectivity)]
         numbers = all(torch.as_tensor(term.stiffness).shape[-1:] in ((), (1,)) for term in self.terms)
-        if chosen.space == "joint" and numbers and not (chosen.contact or chosen.terms):  # these may be between bodies
+        if self.separate and chosen.space == "joint" and numbers and not (chosen.contact or chosen.terms):
             found = bodies(torch.stack(references).numpy(), connectivity)
         #: Vertices of each body, and its solver.
         self.vertices, self.cores = [own for own, _ in found], nn.ModuleList()

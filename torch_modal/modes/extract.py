@@ -184,12 +184,10 @@ def _bases_of_bodies(several: Sequence[Any], keyframes: torch.Tensor, n_modes: i
     bases = []
     for shape, *parts in zip(keyframes, *found, strict=True):
         values, order = torch.cat([basis.eigenvalues for basis in parts]).sort(stable=True)
-        modes, rows = shape.new_zeros(len(values), *shape.shape), iter(order.argsort())
-        for (own, _), basis in zip(several, parts, strict=True):
-            for mode in basis.modes:
-                modes[next(rows), own] = mode
+        each = ((own, basis.modes) for (own, _), basis in zip(several, parts, strict=True))
+        modes = [shape.new_zeros(len(moves), *shape.shape).index_copy(1, own, moves) for own, moves in each]
         rigid_eigenvalues = torch.stack([basis.rigid_eigenvalues for basis in parts]).amax(0)
-        bases.append(ModalBasis(shape, values, modes, rigid_eigenvalues))
+        bases.append(ModalBasis(shape, values, torch.cat(modes)[order], rigid_eigenvalues))
     return bases
 
 

@@ -116,6 +116,11 @@ class Path(PreciseModule):
             self.layers.extend(InBetween([own[i], own[j]], self.faces, **given) for i, j in self.pairs)
         elif self.objective.terms or self.contact:
             self.layers.append(Blend(own, self.faces, **given))
+        layer: Any
+        for layer in self.layers if self.contact else ():
+            layer.separate = False
+            if len(layer.cores) > 1:
+                layer._build()
         self._build()
         self.register_load_state_dict_post_hook(Path._build)
 
