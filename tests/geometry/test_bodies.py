@@ -65,18 +65,17 @@ def test_connectivity_of_each() -> None:
         assert abs(volume - 1) < 1e-12
 
 
-def test_what_is_no_body_goes_with_the_first() -> None:
+def test_what_is_no_body_goes_with_the_nearest() -> None:
     """Vertices of no face, faces without an area, and what has vanished in one of the shapes."""
-    x, mesh = boxes((0, 0, 0), (9, 0, 0), (0, 0, 50.0), (0, 99.0, 0))
-    faces = np.concatenate([mesh.faces[:24], [[16, 17, 16]]])
-    flat = x.copy()
-    flat[16:24] = flat[16]
-    assert parts(x, mesh=Connectivity(faces[:24], 32)) == [[0, 2, 3], [1]]
-    assert parts(flat, mesh=Connectivity(mesh.faces[:36], 32)) == [[0, 2, 3], [1]]
-    assert parts(x, flat, mesh=Connectivity(mesh.faces[:36], 32)) == [[0, 2, 3], [1]]
-    tiny = x.copy()
-    tiny[16:24] = tiny[16] + 1e-4 * (tiny[16:24] - tiny[16])
-    assert parts(x, tiny, mesh=Connectivity(mesh.faces[:36], 32)) == [[0, 2, 3], [1]]
+    x, mesh = boxes((0, 0, 0), (9, 0, 0), (8, 0, 50.0), (-1, 99.0, 0))
+    three, truth = Connectivity(mesh.faces[:36], 32), [[0, 3], [1, 2]]
+    assert parts(x, mesh=three) == [[0, 3], [1], [2]]
+    assert parts(x, mesh=Connectivity(mesh.faces[:24], 32)) == truth
+    for size in (0.0, 1e-4):
+        small = x.copy()
+        small[16:24] = small[16] + size * (small[16:24] - small[16])
+        assert parts(small, small, mesh=three) == ([[0, 3], [1], [2]] if size else truth)
+        assert parts(x, small, mesh=three) == truth
 
 
 def test_swarms_are_one_body() -> None:

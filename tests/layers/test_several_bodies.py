@@ -11,6 +11,7 @@ from torch import Tensor
 
 import torch_modal as tm
 from torch_modal.geometry.connectivity import Connectivity
+from torch_modal.inbetween.results import InBetweenResult, of_bodies, unminimised
 from torch_modal.modes.basis import ModalBasis
 from torch_modal.solve.minimise import Status
 
@@ -19,6 +20,8 @@ TIMES = torch.tensor([0.2, 0.5, 0.9], dtype=DOUBLE)
 WEIGHTS = torch.tensor([[0.2, 0.3, 0.5], [0.6, 0.4, 0.0]], dtype=DOUBLE)
 AWAY = 3.0
 """Diagonals from one body to the other."""
+
+pytestmark = pytest.mark.filterwarnings("ignore::torch_modal.MeshWarning")
 
 
 def turned(bars: Shapes) -> Shapes:
@@ -39,7 +42,8 @@ def beside(first: Shapes, keyframes: Tensor, modes: Tensor) -> Shapes:
         both = torch.cat([torch.cat([basis.modes, 0 * basis.modes], 1), torch.cat([0 * modes, modes], 1)])
         values = torch.cat([basis.eigenvalues, torch.ones(len(modes), dtype=DOUBLE)])
         bases.append(ModalBasis(shape, values, both, basis.rigid_eigenvalues))
-    return Shapes(x, torch.cat([first.faces, first.faces + n]), bases)
+    # It is open, so that it has no volume to be kept, and some of its vertices have no face.
+    return Shapes(x, torch.cat([first.faces, first.faces[40:] + n]), bases)
 
 
 @pytest.fixture(scope="module")
@@ -82,9 +86,24 @@ def test_a_body_that_stands_still_does_not_move_and_changes_nothing(name: str, a
     assert (found[:, :n] - truth).norm(dim=-1).max() < 1e-9 * diagonal
 
 
+def test_order_of_the_vertices_does_not_matter(alone: Shapes, both: Shapes) -> None:
+    n = alone.keyframes.shape[1]
+    place = torch.arange(2 * n).roll(n)  # the second body comes first
+    order = place.argsort()
+    bases = [
+        ModalBasis(b.reference[order], b.eigenvalues, b.modes[:, order], b.rigid_eigenvalues) for b in both.bases[:2]
+    ]
+    layer = tm.InBetween(bases, place[both.faces])
+    assert layer.vertices[0].tolist() == list(range(n))
+    found = layer(*both.keyframes[:2, order], TIMES)[:, place]
+    torch.testing.assert_close(found[:, :n], CALLS["InBetween"](alone), rtol=0, atol=1e-9)
+    torch.testing.assert_close(found[:, n:], both.keyframes[:1, n:].expand(3, -1, -1), rtol=0, atol=1e-9)
+
+
 def test_modes_of_each_body(alone: Shapes, both: Shapes) -> None:
     n, k = alone.keyframes.shape[1], 6
-    found = tm.extract_bases(both.keyframes[:2], both.faces, k, progress=False)
+    faces = torch.cat([alone.faces, alone.faces + n])
+    found = tm.extract_bases(both.keyframes[:2], faces, k, progress=False)
     first = tm.extract_bases(alone.keyframes[:2], alone.faces, k, progress=False)
     second = tm.extract_bases(both.keyframes[:2, n:], alone.faces, k, progress=False)
     for whole, one, other in zip(found, first, second, strict=True):
@@ -128,6 +147,23 @@ def test_results_of_bodies_are_put_together(alone: Shapes, both: Shapes) -> None
     assert len(together.cores) == 2
 
 
+def test_status_is_the_worst() -> None:
+    """That a body fell back is no failure, although it has the highest number."""
+    good, steps, stalled, invalid, fell = map(int, Status)
+    first = [good, good, steps, stalled, invalid, fell, fell]
+    second = [good, fell, fell, steps, fell, stalled, good]
+    results = []
+    for own in (first, second):
+        x = torch.zeros(len(own), 2, 3, dtype=DOUBLE)
+        known = unminimised(x, torch.tensor(own) == good)
+        ones = torch.ones(len(own), dtype=DOUBLE)
+        results.append(InBetweenResult(x, known._replace(status=torch.tensor(own), energy=ones, gradient_norm=ones)))
+    found = of_bodies(results, [torch.tensor([0, 3]), torch.tensor([1, 2])])
+    assert found.solution.status.tolist() == [good, fell, steps, stalled, invalid, stalled, fell]
+    assert bool((found.solution.energy == 2).all() and (found.solution.gradient_norm == 1).all())
+    assert found.shapes.shape == (7, 4, 3)
+
+
 @pytest.mark.parametrize("kind", ["terms", "stiffness", "paired"])
 def test_what_may_be_between_bodies_is_one_problem(kind: str, both: Shapes) -> None:
     n = len(Connectivity(both.faces.numpy()).edges)
@@ -142,11 +178,12 @@ def test_what_may_be_between_bodies_is_one_problem(kind: str, both: Shapes) -> N
 
 
 @pytest.mark.parametrize("kind", ["pair", "path of pairs", "smooth path"])
-def test_contact_is_of_all_bodies(kind: str, both: Shapes) -> None:
+def test_contact_is_of_all_bodies(kind: str, bars: Shapes) -> None:
     """Two bodies that exchange their places, and would pass through each other on the way."""
     pytest.importorskip("ipctk")
     pytest.importorskip("igl")
-    first = both.keyframes[0, : both.keyframes.shape[1] // 2]
+    first, n = bars.keyframes[0], bars.keyframes.shape[1]
+    faces = torch.cat([bars.faces, bars.faces + n])
     away = torch.tensor([0.0, 0.5, 9.0], dtype=DOUBLE)
     x = torch.stack([torch.cat([first, first + away]), torch.cat([first + away, first])])
     when = torch.linspace(0.34, 0.54, 6, dtype=DOUBLE)
@@ -155,12 +192,12 @@ def test_contact_is_of_all_bodies(kind: str, both: Shapes) -> None:
 
     def motion(contact: bool) -> tuple[Any, Tensor]:
         if kind == "pair":
-            layer = tm.InBetween(x, both.faces, contact=contact)
+            layer = tm.InBetween(x, faces, contact=contact)
             return layer, layer(*x, when)
-        path = tm.Path(x, both.faces, contact=contact)
+        path = tm.Path(x, faces, contact=contact)
         return (path.layers or [path])[0], path(x, when)
 
     (one, pushed), (several, free) = motion(True), motion(False)
     assert len(one.vertices) == 1 and len(several.vertices) == 2
-    before, after = (len(tm.self_contacts(shapes, both.faces).pairs) for shapes in (free, pushed))
+    before, after = (len(tm.self_contacts(shapes, faces).pairs) for shapes in (free, pushed))
     assert before > 0 and after < before / 4

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy.spatial import cKDTree
 
 from torch_modal.arrays import FloatArray
 from torch_modal.geometry.connectivity import Connectivity, double_areas
@@ -16,7 +17,7 @@ LEAST_AREA = 1e-6
 
 
 def bodies(shapes: FloatArray, mesh: Connectivity) -> list[tuple[Any, Connectivity]]:
-    """Vertices and connectivity of each body; what belongs to none goes with the first. *Shape:* ``(K, V, 3)``.
+    """Vertices and connectivity of each body; what belongs to none goes with the nearest. *Shape:* ``(K, V, 3)``.
 
     Groups of pieces are one body if, in any shape, the distance of their bounding boxes is at most the mean of the
     diagonals.
@@ -34,13 +35,15 @@ def bodies(shapes: FloatArray, mesh: Connectivity) -> list[tuple[Any, Connectivi
         if near.sum() > 1:  # they are one group from now on, the first
             group, i = np.where(near, 0, np.cumsum(~near))[group], 0
             box = np.concatenate([box[:, near].min(1, keepdims=True), box[:, ~near]], 1)
-    body = np.zeros(mesh.n_vertices, dtype=np.int64)
-    if 1 < i <= MOST_BODIES:
-        body[mesh.used] = group
-        areas = [np.bincount(body[mesh.faces[:, 0]], double_areas(x, mesh.faces), i) for x in shapes]
-        proper = np.min(areas, 0) > LEAST_AREA * diagonals.max(0) ** 2
-        body = np.where(proper, np.cumsum(proper) - 1, 0)[body]
-    if not body.any():
+    if not 1 < i <= MOST_BODIES:
         return [(slice(None), mesh)]
+    body = np.full(mesh.n_vertices, -1)
+    body[mesh.used] = group
+    areas = [np.bincount(body[mesh.faces[:, 0]], double_areas(x, mesh.faces), i) for x in shapes]
+    proper = np.min(areas, 0) > LEAST_AREA * diagonals.max(0) ** 2
+    body = np.append(np.where(proper, np.cumsum(proper) - 1, -1), -1)[body]
+    if proper.sum() < 2:
+        return [(slice(None), mesh)]
+    body[body < 0] = body[body >= 0][cKDTree(shapes[0, body >= 0]).query(shapes[0, body < 0])[1]]
     each = [(np.flatnonzero(body == k), mesh.faces[body[mesh.faces[:, 0]] == k]) for k in range(body.max() + 1)]
     return [(torch.from_numpy(own), Connectivity(np.searchsorted(own, faces), len(own))) for own, faces in each]
