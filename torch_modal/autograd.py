@@ -111,6 +111,23 @@ def full_precision(compute: Callable[Given, Made]) -> Callable[Given, Made]:
     return run
 
 
+def untraced(compute: Callable[Given, Made]) -> Callable[Given, Made]:
+    """Decorate a function that ``torch.compile`` calls as it is: tracing its data-dependent steps would take minutes.
+
+    ``torch.export`` traces it.
+    """
+
+    @wraps(compute)
+    def run(*args: "Given.args", **kwargs: "Given.kwargs") -> Made:
+        if torch.compiler.is_dynamo_compiling() and not torch.compiler.is_exporting():  # it imports Dynamo: only here
+            return torch.compiler.disable(compute)(*args, **kwargs)  # type: ignore[no-any-return]
+        return compute(*args, **kwargs)
+
+    # A code of its own: Dynamo limits how often one is compiled.
+    run.__code__ = run.__code__.replace(co_name=compute.__name__)  # type: ignore[attr-defined]
+    return run
+
+
 class Recent:
     """The most recently used objects, up to a limit.
 
@@ -157,8 +174,9 @@ def outlasting(x: Tensor) -> Tensor:
     return x.clone() if x.is_inference() else x
 
 
+@untraced
 def made_outside(make: Callable[..., Made], *seen: Tensor) -> Made:
-    """Create an object outside of all transforms of ``torch.compile`` and ``torch.func``, to cache it or of numbers.
+    """Create an object outside of all transforms of ``torch.func``, to cache it or of numbers.
 
     Args:
         make: The function.
@@ -167,12 +185,10 @@ def made_outside(make: Callable[..., Made], *seen: Tensor) -> Made:
     if torch.compiler.is_exporting():  # without the modes that would record it
         with _disable_current_modes(), torch._C.DisableTorchFunction():
             return lasting(make)(*seen)
-    plain = torch._C._functorch.peek_interpreter_stack() is None and forward_ad._current_level < 0
-    if plain and not torch.compiler.is_compiling():
+    if torch._C._functorch.peek_interpreter_stack() is None and forward_ad._current_level < 0:
         return lasting(make)(*seen)
     found: list[Made] = []
-    apply = torch.compiler.disable(_Outside.apply) if torch.compiler.is_compiling() else _Outside.apply
-    apply(lambda *given: found.append(make(*given)), torch.empty(0), *seen)
+    _Outside.apply(lambda *given: found.append(make(*given)), torch.empty(0), *seen)
     return found[0]
 
 

@@ -1,4 +1,4 @@
-"""Layers that are exported, mapped over times, and given nothing."""
+"""Layers that are compiled, exported, mapped over times, and given nothing."""
 
 from typing import Any
 
@@ -6,7 +6,8 @@ import pytest
 import torch
 from conftest import Shapes
 from every_layer import CASES, Step, in_between
-from torch import Tensor
+from torch import Tensor, nn
+from torch._dynamo.testing import CompileCounterWithBackend
 from torch.func import grad, vmap
 
 import torch_modal as tm
@@ -75,6 +76,47 @@ def test_no_points_and_nobody_in_a_pool(bars: Shapes, small_bars: Shapes) -> Non
     fitted = space.fit(bars.keyframes[:0, :40], torch.arange(40))
     one = space.fit(bars.keyframes[0, :40], torch.arange(40))
     assert [part.shape[1:] for part in fitted] == [part.shape for part in one]
+
+
+# ------------------------------------------------------------------------------------------------------------ compile
+
+
+class Net(nn.Module):
+    """A small network that predicts the second key-frame and the time of a layer, and a loss of the in-between."""
+
+    def __init__(self, layer: nn.Module, x: Tensor) -> None:
+        super().__init__()
+        torch.manual_seed(0)
+        self.layer, self.body = layer, nn.Linear(x[0].numel(), x[0].numel() + 1, dtype=DOUBLE)
+
+    def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        out = torch.tanh(self.body(x[0].flatten()))
+        shape = self.layer(x[0], x[1] + 0.05 * out[:-1].view_as(x[1]), out[-1].sigmoid())
+        return shape, torch.relu(shape).square().sum()
+
+
+@pytest.mark.parametrize("backend", ["eager", pytest.param("inductor", marks=pytest.mark.slow)])
+def test_compiled_network_around_a_layer(backend: str, small_bars: Shapes) -> None:
+    """What surrounds the solve is compiled, in two graphs; the solve is not traced, which would take minutes."""
+    if backend == "inductor":
+        from torch._inductor import cpp_builder, exc
+
+        try:
+            cpp_builder.get_cpp_compiler()
+        except exc.InvalidCxxCompiler:
+            pytest.skip("there is no C++ compiler, which Inductor needs")
+    torch.compiler.reset()
+    net, x = Net(in_between(small_bars), small_bars.keyframes), small_bars.keyframes[:2].clone()
+    counter = CompileCounterWithBackend(backend)
+    compiled = torch.compile(net, backend=counter)
+    found = []
+    for call in (net, compiled):
+        shape, loss = call(x)
+        found.append([shape, *torch.autograd.grad(loss, list(net.body.parameters()))])
+    torch.testing.assert_close(found[1], found[0], rtol=1e-10, atol=1e-12)
+    assert counter.frame_count == 2
+    compiled(x * 1.01)
+    assert counter.frame_count == 2, "other numbers are compiled again"
 
 
 # ------------------------------------------------------------------------------------------------------------- export

@@ -21,7 +21,7 @@ from scipy.sparse.linalg import SuperLU, splu
 from torch import Tensor
 
 from torch_modal.arrays import FloatArray, IntArray
-from torch_modal.autograd import Recent, applied
+from torch_modal.autograd import Recent, applied, untraced
 
 try:
     import cholespy
@@ -140,13 +140,12 @@ def _cholesky(matrix: sparse.csr_matrix, device: torch.device) -> Solve:
     return solve
 
 
+@untraced
 def solve_by(solver: Callable[[], Solve], right: Tensor) -> Tensor:
     """Solve with gradients, which are solves, too. *Shape:* ``(..., V, m) -> (..., V, m)``.
 
     The solver is made lazily: inside ``torch.func`` transforms, tensors cannot be read earlier.
     """
-    if torch.compiler.is_compiling():  # do not trace into SciPy
-        return torch.compiler.disable(_Solve.apply)(solver, right)
     return applied(_Solve, solver, right)
 
 

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from torch_modal.autograd import broadcast_shapes, lasting, made_outside, once, traced
+from torch_modal.autograd import broadcast_shapes, lasting, made_outside, once, traced, untraced
 from torch_modal.inbetween.results import InBetweenResult, report, with_exact_keyframes
 from torch_modal.inbetween.settings import Objective, Preset, Solver, settings
 from torch_modal.layers.base import Bases, InBetweenLayer, basis_buffers
@@ -56,6 +56,7 @@ class Blend(InBetweenLayer):
         several = basis_buffers(bases)
         super().__init__(several * 2 if len(several) == 1 else several, faces, chosen)
 
+    @untraced
     def forward(self, keyframes: Tensor, weights: Tensor) -> Tensor:
         """The weighted in-betweens.
 
@@ -77,6 +78,7 @@ class Blend(InBetweenLayer):
         report(found.solution, self.solver)
         return found.shapes
 
+    @untraced
     def solve(self, keyframes: Tensor, weights: Tensor) -> InBetweenResult:
         """The shapes, and how each minimisation went, without a warning. Arguments as for :meth:`forward`."""
         lead = self._check(keyframes, weights)

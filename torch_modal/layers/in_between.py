@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from torch_modal.autograd import broadcast_shapes, lasting, made_outside, traced
+from torch_modal.autograd import broadcast_shapes, lasting, made_outside, traced, untraced
 from torch_modal.geometry.crossings import require_contact
 from torch_modal.inbetween.results import InBetweenResult, report, with_exact_keyframes
 from torch_modal.inbetween.settings import Objective, Preset, Solver, settings
@@ -64,6 +64,7 @@ class InBetween(InBetweenLayer):
             raise ValueError("the paired space (Eq. 4) is one of modes; pass bases, not key-frames")
         super().__init__(ends * 2 if len(ends) == 1 else ends, faces, chosen)
 
+    @untraced
     def forward(self, x_a: Tensor, x_b: Tensor, t: Tensor | float) -> Tensor:
         """The in-betweens.
 
@@ -87,6 +88,7 @@ class InBetween(InBetweenLayer):
         report(found.solution, self.solver)
         return found.shapes
 
+    @untraced
     def solve(self, x_a: Tensor, x_b: Tensor, t: Tensor | float) -> InBetweenResult:
         """The in-betweens, and how each minimisation went, without a warning. Arguments as for :meth:`forward`."""
         self.check_shapes(x_a=x_a, x_b=x_b)

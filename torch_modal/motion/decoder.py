@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from torch_modal.autograd import broadcast_shapes, full_precision, lasting, require_numbers, traced
+from torch_modal.autograd import broadcast_shapes, full_precision, lasting, require_numbers, traced, untraced
 from torch_modal.backends.torch.backend import TorchBackend
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.local_rotations import Trajectory
@@ -129,6 +129,7 @@ class ModalDecoder(nn.Module):
         """Number of amplitudes, k."""
         return len(self.columns)
 
+    @untraced
     @full_precision
     def forward(
         self, amplitudes: Tensor, t: Tensor | float, motions: Tensor | None = None, keyframes: Tensor | None = None

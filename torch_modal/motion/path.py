@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from torch_modal.autograd import broadcast_shapes, full_precision, lasting, require_numbers
+from torch_modal.autograd import broadcast_shapes, full_precision, lasting, require_numbers, untraced
 from torch_modal.backends.choice import choose
 from torch_modal.contact.active import refuse_transforms
 from torch_modal.contact.in_between import push_apart
@@ -175,6 +175,7 @@ class Path(PreciseModule):
         other = Path(own, self.faces, times, self.cyclic, self.scheme or self.smooth, **given)
         return other.to(self.bases[0].reference)
 
+    @untraced
     def forward(self, keyframes: Tensor, t: Tensor | float) -> Tensor:
         """The shapes at given times.
 
@@ -193,6 +194,7 @@ class Path(PreciseModule):
         report(found.solution, self.solver)
         return found.shapes
 
+    @untraced
     def solve(self, keyframes: Tensor, t: Tensor | float) -> InBetweenResult:
         """The shapes, and how each minimisation went, without a warning. Arguments as for :meth:`forward`."""
         flat, which, segment, u, lead = self._located(keyframes, t)

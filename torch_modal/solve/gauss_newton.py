@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from torch_modal.autograd import full_precision
+from torch_modal.autograd import full_precision, untraced
 from torch_modal.energy.modal_energy import Derivatives
 from torch_modal.solve.minimise import AmplitudeEnergy, ridged
 
@@ -54,6 +54,7 @@ class GaussNewtonStep(nn.Module):
         self.energy = energy
         self.damping = damping
 
+    @untraced
     @full_precision
     def forward(self, a: Tensor, placement: Any) -> Step:
         """Take one step, without a branch that depends on data.
