@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import pytest
 import torch
 from torch import Tensor
 
@@ -104,6 +105,25 @@ def test_newtons_step_where_it_exists_and_gauss_newtons_elsewhere() -> None:
     found = GaussNewtonStep(Distance(), damping=0.0)(torch.zeros_like(gradient), None)
     torch.testing.assert_close(found.amplitudes, wanted)
     torch.testing.assert_close(found.gradient_norm, gradient.norm(dim=-1))
+
+
+@pytest.mark.parametrize(("rise", "moves"), [(5e-4, False), (1e-6, False), (1e-13, False), (2e-16, True)])
+def test_no_step_goes_uphill_beyond_rounding(rise: float, moves: bool) -> None:
+    class Slope(Circle):
+        """Every step rises by a part of the energy, which may be below zero."""
+
+        def value(self, a: Tensor, placement: Any) -> Tensor:
+            return level + 100 * rise * (a != origin).any(-1)
+
+        def derivatives(self, a: Tensor, placement: Any, second_order: bool = True) -> Derivatives:
+            square = torch.eye(2, dtype=a.dtype).expand(2, 2, 2)
+            return Derivatives(self.value(a, placement), torch.ones_like(a), square, 0 * square, a[:, 0])
+
+    origin, level = start([0.3, -1.0], [2.0, 0.5]), start([100.0, -100.0])[0]
+    found = GaussNewtonStep(Slope())(origin, None)
+    assert found.moved.tolist() == [moves] * 2
+    assert torch.equal(found.amplitudes, origin) != moves
+    torch.testing.assert_close(found.energy, level, rtol=4e-16, atol=0)
 
 
 def test_steps_that_are_unrolled_say_whether_they_converged() -> None:
