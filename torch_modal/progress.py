@@ -14,7 +14,7 @@ Progress = bool | None
 
 
 class ProgressReport:
-    """A progress bar that several threads may update.
+    """A progress bar that several threads may update, and whose clock goes on during a long step.
 
     Args:
         total: Number of steps.
@@ -26,7 +26,13 @@ class ProgressReport:
     def __init__(self, total: int, what: str, progress: Progress = None, unit: str = "step") -> None:
         shown = sys.stderr is not None and sys.stderr.isatty() if progress is None else progress
         self._bar = tqdm(total=total, desc=what, unit=unit, leave=False, disable=not shown)
-        self._lock = threading.Lock()
+        self._lock, self._closed = threading.Lock(), threading.Event()
+        if shown:
+            threading.Thread(target=self._tick, daemon=True).start()
+
+    def _tick(self) -> None:
+        while not self._closed.wait(1.0):
+            self.expect(0)
 
     def expect(self, steps: int) -> None:
         """Increase the total."""
@@ -50,4 +56,6 @@ class ProgressReport:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, where: TracebackType | None
     ) -> None:
-        self._bar.close()
+        self._closed.set()
+        with self._lock:
+            self._bar.close()

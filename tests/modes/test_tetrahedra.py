@@ -89,6 +89,7 @@ def worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
         ("os.kill(os.getpid(), signal.SIGKILL)", "signal SIGKILL", False),
         ("os.kill(os.getpid(), signal.SIGBUS)", "signal SIGBUS", False),
         ("os.abort()", "signal SIGABRT", False),
+        ("os.kill(os.getpid(), signal.SIGXCPU)", "its processor_time of inf s is over", True),
         ("os.kill(os.getpid(), signal.SIGSEGV)", "signal SIGSEGV", True),
         ("print('RuntimeError: no envelope'); sys.exit(3)", "exit code 3 \\(RuntimeError: no envelope\\)", True),
         ("sys.exit('ModuleNotFoundError: pytetwild')", "exit code 1 \\(ModuleNotFoundError: pytetwild\\)", False),
@@ -141,7 +142,8 @@ def test_too_little_memory_is_not_the_surfaces_fault(worker, capsule: Mesh) -> N
 
 def test_the_exit_code_of_the_real_worker(capsule: Mesh, tmp_path: Path) -> None:
     """It tells the mesher's refusal, here of a wrong edge length, from a job that cannot be read."""
-    numbers = {"edge_length_fac": 2.0, "epsilon": 1e-3, "stop_energy": 10.0, "max_surface_faces": 10**6, "timeout": 60}
+    numbers = {"edge_length_fac": 2.0, "epsilon": 1e-3, "stop_energy": 10.0, "max_surface_faces": 10**6}
+    numbers |= {"timeout": 60, "processor_time": np.inf}
     np.savez(tmp_path / "job.npz", vertices=capsule[0], faces=capsule[1], **numbers)
     for job, code, says in (("job.npz", tetwild.MESHER_RAISED, "ValueError: Edge"), ("none.npz", 1, "No such file")):
         command = [sys.executable, str(tetwild.WORKER), str(tmp_path / job), str(tmp_path / "result.npz")]
@@ -205,7 +207,14 @@ def test_debris_is_dropped_and_pieces_are_kept() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("epsilon", 0.0), ("edge_length_fac", -1.0), ("stop_energy", float("nan")), ("timeout", -1.0)]
+    ("name", "value"),
+    [
+        ("epsilon", 0.0),
+        ("edge_length_fac", -1.0),
+        ("stop_energy", float("nan")),
+        ("timeout", -1.0),
+        ("processor_time", -1.0),
+    ],
 )
 def test_settings_out_of_range(name: str, value: float) -> None:
     with pytest.raises(ValueError, match=name):
@@ -227,6 +236,20 @@ def test_auto_takes_the_lattice_unless_parts_touch(monkeypatch: pytest.MonkeyPat
         assert [one is surface for one in asked] == [True] * touching
         np.testing.assert_array_equal(filled.vertices, lattice.vertices)
         np.testing.assert_array_equal(filled.tets, lattice.tets)
+
+
+def test_auto_bounds_the_time_of_the_mesher(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+    """The lattice follows; with these edges fTetWild would take minutes."""
+    resource = pytest.importorskip("resource", reason="Windows has no limit of the processor time")
+    monkeypatch.setattr(tetwild, "PATIENCE", 1.0)
+    keyframes, faces, *_ = load_sample("hand")
+    surface = CanonicalSurface.of(keyframes[1].numpy(), faces.numpy())
+    before = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
+    with caplog.at_level("INFO"):
+        filled = Auto(TetWild(edge_length_fac=2e-3, timeout=60.0)).fill(surface, threading.Event())
+    assert resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime - before < 4
+    assert "its processor_time of 1 s is over" in caplog.text
+    np.testing.assert_array_equal(filled.tets, Lattice().fill(surface, threading.Event()).tets)
 
 
 def test_edges_follow_the_thinnest_part(monkeypatch: pytest.MonkeyPatch) -> None:

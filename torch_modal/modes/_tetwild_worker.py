@@ -24,19 +24,24 @@ def main(job_path: str, result_path: str) -> None:
     """Decimate the surface, fill it with tetrahedra, write ``vertices (N, 3)`` and ``tets (T, 4)``.
 
     The job holds ``vertices (V, 3)`` centred with a bounding-box diagonal of 100, ``faces (F, 3)`` and the
-    scalars ``edge_length_fac``, ``epsilon``, ``stop_energy``, ``max_surface_faces``, ``timeout``.
+    scalars ``edge_length_fac``, ``epsilon``, ``stop_energy``, ``max_surface_faces``, ``timeout``, ``processor_time``.
     """
     with np.load(job_path) as job:
         vertices, faces = job["vertices"].copy(), job["faces"].astype(np.int32)
-        edge_length_fac, epsilon, stop_energy, timeout = (
-            float(job[name]) for name in ("edge_length_fac", "epsilon", "stop_energy", "timeout")
-        )
+        names = ("edge_length_fac", "epsilon", "stop_energy", "timeout", "processor_time")
+        edge_length_fac, epsilon, stop_energy, timeout, processor_time = (float(job[name]) for name in names)
         max_surface_faces = int(job["max_surface_faces"])
 
     if hasattr(signal, "alarm"):
         # The parent enforces the timeout. If the parent is killed, the default action of SIGALRM ends this process
         # even while pytetwild holds the GIL.
         signal.alarm(min(int(timeout) + 10, 2**31 - 1))
+
+    if processor_time < sys.maxsize and sys.platform != "win32":
+        import resource
+
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        resource.setrlimit(resource.RLIMIT_CPU, (max(int(processor_time), 1), int(processor_time) + 2))  # SIGXCPU
 
     if sys.platform == "linux":
         pr_set_pdeathsig = 1  # ends this process together with its parent

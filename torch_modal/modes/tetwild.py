@@ -35,9 +35,12 @@ THIN_PART = 0.05
 TOUCHING = 0.03
 """Self-proximity above which a lattice fuses so much that modes are too stiff: closed fists have 0.037 and more."""
 
+PATIENCE = 10.0
+"""Processor time that ``"auto"`` gives fTetWild, in seconds: fists take 1 to 3, bodies of many parts minutes."""
 MESHER_RAISED = 3
 """Exit code of the worker if the mesher itself raised an exception."""
-_OWN_FAILURES = {MESHER_RAISED, *(-getattr(signal, name, 0) for name in ("SIGSEGV", "SIGFPE"))}
+_TIME_IS_OVER = -getattr(signal, "SIGXCPU", 0)
+_OWN_FAILURES = {MESHER_RAISED, _TIME_IS_OVER, *(-getattr(signal, name, 0) for name in ("SIGSEGV", "SIGFPE"))}
 """Exit codes that the surface causes. Others may not recur: SIGKILL comes from outside, and C++ raises SIGABRT when
 memory or threads run out."""
 
@@ -57,6 +60,7 @@ class TetWild:
         stop_energy: Quality at which fTetWild stops improving; lower is better and slower (its own default is 10).
         max_surface_faces: The surface is decimated to about this many faces first.
         timeout: Seconds for a key-frame, after which the child process is killed.
+        processor_time: The same, of the processor, whatever else the machine computes; without effect on Windows.
 
     Raises:
         ValueError: A number is out of range (fTetWild hangs on an ``epsilon`` of zero, for example).
@@ -67,6 +71,7 @@ class TetWild:
     stop_energy: float = 200.0
     max_surface_faces: int = 1500
     timeout: float = 600.0
+    processor_time: float = np.inf
 
     def __post_init__(self) -> None:
         for name, low, high in (
@@ -75,6 +80,7 @@ class TetWild:
             ("stop_energy", 4.0, 1e6),
             ("max_surface_faces", 100, 10**8),
             ("timeout", 0.0, np.inf),
+            ("processor_time", 0.0, np.inf),
         ):
             value = getattr(self, name)
             if value is not None and not low <= value <= high:
@@ -82,7 +88,7 @@ class TetWild:
 
     def key(self) -> dict[str, Any]:
         """Settings, and the versions of the packages."""
-        settings = {name: value for name, value in asdict(self).items() if name != "timeout"}
+        settings = {name: value for name, value in asdict(self).items() if name not in ("timeout", "processor_time")}
         versions = {name: version(name) for name in ("pytetwild", "fast-simplification")}
         return {"mesher": "tetwild", **settings, **versions}
 
@@ -119,10 +125,10 @@ class TetWild:
 
 @dataclass(frozen=True)
 class Auto:
-    """The mesher ``"auto"``: a lattice, but fTetWild where parts of the surface touch, unless it fails.
+    """The mesher ``"auto"``: a lattice, but fTetWild where parts of the surface touch, unless it fails or takes long.
 
     Attributes:
-        tetwild: Settings of fTetWild.
+        tetwild: Settings of fTetWild, which gets 10 seconds of processor time at most.
     """
 
     tetwild: TetWild = TetWild()
@@ -135,7 +141,7 @@ class Auto:
         """Fill a surface with tetrahedra."""
         if self_proximity(surface) > TOUCHING:
             try:
-                return self.tetwild.fill(surface, stop)
+                return replace(self.tetwild, processor_time=PATIENCE).fill(surface, stop)
             except TetrahedralizationError as error:
                 logger.info("a lattice, in which parts that touch are joined: %s", error)
         return Lattice().fill(surface, stop)
@@ -177,7 +183,8 @@ def _run_worker(points: FloatArray, faces: IntArray, settings: TetWild, stop: th
         finally:
             end_process(process)  # also on KeyboardInterrupt
         if (code := process.returncode) != 0:
-            tail = last_line(log.read_text(errors="replace"))
+            over = f"its processor_time of {settings.processor_time:g} s is over"
+            tail = over if code == _TIME_IS_OVER else last_line(log.read_text(errors="replace"))
             raise TetrahedralizationError(
                 f"the worker process ended with {describe_exit(code)}{f' ({tail})' if tail else ''}. "
                 "Check the surface for self-intersections and degenerate faces, or try other settings",
