@@ -112,10 +112,7 @@ def full_precision(compute: Callable[Given, Made]) -> Callable[Given, Made]:
 
 
 def untraced(compute: Callable[Given, Made]) -> Callable[Given, Made]:
-    """Decorate a function that ``torch.compile`` calls as it is: tracing its data-dependent steps would take minutes.
-
-    ``torch.export`` traces it.
-    """
+    """Decorate a function that ``torch.compile`` calls as it is: to trace its data-dependent steps takes minutes."""
 
     @wraps(compute)
     def run(*args: "Given.args", **kwargs: "Given.kwargs") -> Made:
@@ -123,8 +120,8 @@ def untraced(compute: Callable[Given, Made]) -> Callable[Given, Made]:
             return torch.compiler.disable(compute)(*args, **kwargs)  # type: ignore[no-any-return]
         return compute(*args, **kwargs)
 
-    # A code of its own: Dynamo limits how often one is compiled.
-    run.__code__ = run.__code__.replace(co_name=compute.__name__)  # type: ignore[attr-defined]
+    own = run.__code__.replace(co_name=compute.__name__)  # type: ignore[attr-defined]
+    run.__code__ = own  # type: ignore[attr-defined]  # Dynamo limits how often one code is compiled
     return run
 
 
