@@ -1,14 +1,20 @@
 """Coarse meshes get as many faces as thin limbs and small pieces need."""
 
+from typing import Any
+
+import fast_simplification
 import numpy as np
 import pytest
 import torch
 import trimesh
 from bodies import body
+from conftest import Shapes
 from shapes import edge_lengths
 
 import torch_modal as tm
-from torch_modal.geometry.connectivity import connected_pieces
+from torch_modal.energy.term import Mesh
+from torch_modal.geometry.connectivity import Connectivity, connected_pieces
+from torch_modal.inbetween import coarse as coarse_mesh
 from torch_modal.inbetween.coarse import ENOUGH_FACES
 from torch_modal.modes.coarsening import FACES_OF_PIECE, coarsen
 
@@ -30,6 +36,44 @@ def test_fast_resolves_thin_limbs(name: str, most: float) -> None:
     assert error(found) < most * error((first + last) / 2)
     n_faces = len(layer.core.space.coarse.mesh.faces)
     assert n_faces <= (ENOUGH_FACES if name.startswith("wire") else 300), "more than a body of one thickness needs"
+
+
+def test_each_pose_is_collapsed_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """However many numbers of faces are tried."""
+    calls, tried = [], []
+
+    def counted(*given: Any, **named: Any) -> Any:
+        calls.append(given)
+        return simplify(*given, **named)
+
+    def recorded(points: Any, faces: Any, n_faces: int, *others: Any) -> Any:
+        tried.append(n_faces)
+        return coarsen(points, faces, n_faces, *others)
+
+    simplify = fast_simplification.simplify
+    monkeypatch.setattr(fast_simplification, "simplify", counted)
+    monkeypatch.setattr(coarse_mesh, "coarsen", recorded)
+    monkeypatch.setattr(coarse_mesh, "spread", lambda fine, coarse: np.inf)
+    shape = body("limb bent 120")
+    shapes = torch.from_numpy(np.stack([shape.pose(0.0), shape.pose(1.0)]))
+    whole = Mesh(Connectivity(np.array(shape.faces), shapes.shape[1]))
+    coarse_mesh.resolving(shapes, whole, 300, [torch.ones_like(shapes[:1])] * 2)
+    assert tried == [300, 450, 675, 1000] and len(calls) == 2
+
+
+@pytest.mark.parametrize(("most", "bound"), [(10**6, 1e-3), (200, 3.0)])
+def test_stiffness_is_that_of_the_edges(most: int, bound: float, bars: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Energy of small amplitudes by ``a' H a``; from some of the edges, about that."""
+    monkeypatch.setattr(coarse_mesh, "MOST_EDGES", most)
+    x, modes = bars.keyframes[1], bars.bases[1].modes
+    mesh = Mesh(Connectivity(bars.faces.numpy(), len(x)))
+    found = coarse_mesh.stretching(mesh, x, modes)
+    a = 1e-5 * torch.randn(20, len(modes), dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    moved, rest = (edge_lengths(y, bars.faces) for y in (x + torch.tensordot(a, modes, 1), x))
+    energies = ((moved - rest).square() / rest).sum(-1)
+    ratios = torch.einsum("bi,ij,bj->b", a, found, a) / energies
+    assert ratios.max() / ratios.min() < 1 + bound
+    assert abs(ratios[0] - 1) < 1e-3 or most < len(mesh.edges)
 
 
 def test_pieces_keep_faces() -> None:

@@ -112,6 +112,16 @@ def test_meshes_of_few_more_faces_than_wanted(data_dir: Path, n_faces: int) -> N
         assert n_faces / 2 < len(coarsen(shapes, faces, n_faces).faces) < len(faces)
 
 
+def test_known_collapses_give_the_same_clusters(hand_path: Keyframes) -> None:
+    """Those down to 300 faces begin with those down to more."""
+    x, faces = hand_path.keyframes.numpy()[[0, 4]], hand_path.faces.numpy()
+    known: dict[int, np.ndarray] = {}
+    for n_faces in (300, 450, 675, 1000):
+        found, alone = coarsen(x, faces, n_faces, None, known), coarsen(x, faces, n_faces)
+        np.testing.assert_array_equal(found.clusters, alone.clusters)
+        np.testing.assert_array_equal(found.faces, alone.faces)
+
+
 def test_candidates_alone_are_tried(fine: tuple[np.ndarray, np.ndarray]) -> None:
     keyframes, faces = fine
     for index in range(len(keyframes)):

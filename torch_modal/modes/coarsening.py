@@ -1,5 +1,6 @@
 """Edge-collapse coarsening shared by all key-frames, with cluster averages (section 3.2 of the paper)."""
 
+from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -57,7 +58,11 @@ class Coarsening:
 
 
 def coarsen(
-    keyframes: FloatArray, faces: IntArray, n_faces: int = 1000, candidates: Sequence[int] | None = None
+    keyframes: FloatArray,
+    faces: IntArray,
+    n_faces: int = 1000,
+    candidates: Sequence[int] | None = None,
+    known: dict[int, IntArray] | None = None,
 ) -> Coarsening:
     """Partition the vertices of all key-frames by the edge collapses of one of them.
 
@@ -70,18 +75,22 @@ def coarsen(
         faces: Vertex indices. *Shape:* ``(F, 3)``.
         n_faces: Faces of the coarse mesh; smaller meshes are not coarsened.
         candidates: Indices of the key-frames whose collapses are tried; by default all.
+        known: Collapses of key-frames down to fewer faces, from earlier calls; those of this call are added.
 
     Raises:
         ValueError: If ``n_faces`` is below 4.
     """
     if n_faces < 4:
         raise ValueError(f"a coarse mesh needs at least 4 faces, got n_faces={n_faces}")
-    sources = range(len(keyframes)) if candidates is None else candidates
+    sources, known = range(len(keyframes)) if candidates is None else candidates, {} if known is None else known
     found: list[tuple[float, Coarsening]] = []
     for n in (int(factor * n_faces) for factor in MORE_FACES):
         if found and (n >= len(faces) or found[-1][0] >= NEEDLE):
             break
-        tried = [(*_fatness(keyframes, each), each) for each in (collapsed(keyframes[i], faces, n) for i in sources)]
+        for i in set(sources) - set(known) if n < len(faces) else ():
+            known[i] = decimate(keyframes[i], faces, n)[2]
+        each = [collapsed(keyframes[i], faces, n, known.get(i)) for i in sources]
+        tried = [(*_fatness(keyframes, one), one) for one in each]
         # Those without needles first, then by the 1st percentile.
         least, _, best = max(tried, key=lambda one: (min(one[0], NEEDLE), one[1]))
         found.append((least, best))
@@ -97,11 +106,22 @@ def _fatness(keyframes: FloatArray, coarsening: Coarsening) -> tuple[float, floa
     return float(fatness.min()), float(np.percentile(fatness, 1, axis=-1).min())
 
 
-def collapsed(points: FloatArray, faces: IntArray, n_faces: int) -> Coarsening:
-    """Partition by the edge collapses of one pose; pieces that would vanish are collapsed separately."""
+def collapsed(points: FloatArray, faces: IntArray, n_faces: int, known: IntArray | None = None) -> Coarsening:
+    """Partition by the edge collapses of one pose; pieces that would vanish are collapsed separately.
+
+    Collapses that are known go down to as many faces or fewer: they begin with the wanted ones.
+    """
     if len(faces) <= n_faces:
         return Coarsening.of_labels(np.arange(len(points)), faces)
-    root = _roots(points, faces, n_faces)
+    collapses = decimate(points, faces, n_faces)[2] if known is None else known
+    start = max(len(collapses) - 4 * n_faces, 0)  # each takes two faces, or one at a boundary
+    left = _coarse_faces(_roots(collapses[:start], len(points)), faces, repeated=True)
+
+    def is_enough(n: int) -> bool:
+        return len(_coarse_faces(_roots(collapses[start:n], len(points)), left, repeated=True)) <= n_faces
+
+    n = start + bisect_left(range(start, len(collapses)), True, key=is_enough)
+    root = _roots(collapses[:n], len(points))
     piece = connected_pieces(np.concatenate([faces[:, :2], faces[:, 1:]]), len(points))
     before = np.bincount(piece[faces[:, 0]])
     if np.count_nonzero(before) > 1:
@@ -111,8 +131,10 @@ def collapsed(points: FloatArray, faces: IntArray, n_faces: int) -> Coarsening:
         for i in np.argsort(-areas, kind="stable")[:MOST_PIECES]:
             if poor[i]:
                 members, own = np.unique(faces[piece[faces[:, 0]] == i], return_inverse=True)
-                few = before[i] <= FACES_OF_PIECE
-                root[members] = members if few else members[_roots(points[members], own.reshape(-1, 3), FACES_OF_PIECE)]
+                root[members] = members
+                if before[i] > FACES_OF_PIECE:
+                    collapses = decimate(points[members], own.reshape(-1, 3), FACES_OF_PIECE)[2]
+                    root[members] = members[_roots(collapses, len(members))]
     return Coarsening.of_labels(root, faces)
 
 
@@ -126,18 +148,17 @@ def joined(points: FloatArray, faces: IntArray, coarsening: Coarsening, shortest
     return Coarsening.of_labels(labels, faces) if short.any() else coarsening
 
 
-def _roots(points: FloatArray, faces: IntArray, n_faces: int) -> IntArray:
-    """Representative vertex of each cluster. *Shape:* ``(V,)``."""
-    collapses = decimate(points, faces, n_faces)[2]
-    root = np.arange(len(points))
+def _roots(collapses: IntArray, n: int) -> IntArray:
+    """Representative vertex of the cluster of each of n vertices. *Shape:* ``(m, 2) -> (n,)``."""
+    root = np.arange(n)
     root[collapses[:, 1]] = collapses[:, 0]
     while not np.array_equal(root[root], root):
         root = root[root]
     return root
 
 
-def _coarse_faces(labels: IntArray, faces: IntArray) -> IntArray:
-    """Faces in terms of labels, without degenerate and repeated ones. *Shape:* ``(F_coarse, 3)``."""
+def _coarse_faces(labels: IntArray, faces: IntArray, repeated: bool = False) -> IntArray:
+    """Faces in terms of labels, without degenerate ones, or repeated ones unless wanted. *Shape:* ``(n, 3)``."""
     left = labels[faces]
     left = left[~degenerate_faces(left)]
-    return left[~repeated_faces(left)]
+    return left if repeated else left[~repeated_faces(left)]
