@@ -25,8 +25,6 @@ MOST_SPREAD = 40.0
 5 to 37; where results were wrong, they had 60 to 5,000."""
 MOST_EDGES = 100_000
 """Of more, the stiffness is estimated from one in so many."""
-CHUNK = 4_000
-"""Edges at a time: more would not fit into caches."""
 NO_STIFFNESS = 1e-6
 """Relative stiffness below which directions are not compared: those in which loose pieces move rigidly."""
 
@@ -116,7 +114,7 @@ def stretching(mesh: Mesh, x: Tensor, modes: Tensor) -> Tensor:
     lengths = edges.norm(dim=1)
     directions = edges * inverse(lengths**1.5, lengths <= MIN_RELATIVE_LENGTH * lengths.mean())[:, None]
     hessian = modes.new_zeros(len(modes), len(modes))
-    for some in torch.arange(len(i)).split(CHUNK):
+    for some in torch.arange(len(i)).split(4000):  # more would not fit into caches
         fields = modes.index_select(1, j[some]) - modes.index_select(1, i[some])
         rows = torch.einsum("kec,ec->ke", fields, directions[some])
         hessian += rows @ rows.mT
@@ -129,9 +127,7 @@ def spread(fine: Tensor, coarse: Tensor) -> float:
     A uniform factor does no harm. But where the coarse mesh is soft, as where a limb has become flat, a minimisation
     goes far astray; where it is stiff, as where few long triangles follow a limb, it does not move at all.
 
-    Args:
-        fine: Of the fine mesh. *Shape:* ``(k, k)``.
-        coarse: Of the coarse mesh. *Shape:* ``(k, k)``.
+    *Shape:* ``(k, k), (k, k)``.
     """
     size = fine.diagonal().clamp_min(torch.finfo(fine.dtype).tiny).rsqrt()
     fine, coarse = (size[:, None] * x * size for x in (fine, coarse))

@@ -107,10 +107,7 @@ def _fatness(keyframes: FloatArray, coarsening: Coarsening) -> tuple[float, floa
 
 
 def collapsed(points: FloatArray, faces: IntArray, n_faces: int, known: IntArray | None = None) -> Coarsening:
-    """Partition by the edge collapses of one pose; pieces that would vanish are collapsed separately.
-
-    Collapses that are known go down to as many faces or fewer: they begin with the wanted ones.
-    """
+    """Partition by the edge collapses of one pose, the first of known ones; pieces that would vanish have their own."""
     if len(faces) <= n_faces:
         return Coarsening.of_labels(np.arange(len(points)), faces)
     collapses = decimate(points, faces, n_faces)[2] if known is None else known
