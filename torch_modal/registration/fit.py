@@ -35,6 +35,9 @@ _MAP_SHARE = 0.05  # weight of the map relative to closest points
 _LANDMARK_WEIGHT = 5.0
 _FIXING_WEIGHT = 1e-5  # fixes pieces without a counterpart
 _ALIKE = 0.4  # smallest cosine between the normals of closest points
+# Functions of fields along the surface, their least stiffness, that of landmarks and of the distance to the surface,
+# and the weight of curvature relative to strain, in square roots of the area.
+_SLIDING_FUNCTIONS, _SOFTEST, _FIXED, _CURVATURE_SHARE = 20, 1e-3, 1e3, 0.1
 
 
 Pull = tuple[sparse.csr_matrix, FloatArray, FloatArray]
@@ -206,3 +209,35 @@ class TemplateFit:
             used &= ~released[corners].any(1)
         kept = np.flatnonzero(used)
         return self._pull(shape.rows(closest)[kept], self.back.vertices[kept], weight * self._back_share[kept])
+
+
+def sliding_freedom(shape: SpectralShape, fixed: IntArray) -> float:
+    """Displacement along the surface by random errors of strain and curvature, in square roots of the area.
+
+    Median over the vertices of the standard deviation, for least squares over smooth fields. It is large where
+    displacements along the surface hardly change lengths (approximate Killing fields, Ben-Chen et al. 2010) and
+    curvature. *Shape:* ``(m,)``, the coarse vertices at landmarks.
+    """
+    surface, functions = shape.coarse, shape.functions[:, :_SLIDING_FUNCTIONS]
+    (i, j), faces, k = surface.edges.T, surface.faces, functions.shape[1]
+    sides = surface.vertices[i] - surface.vertices[j]
+    areas = np.bincount(surface.connectivity.sides, np.tile(surface.face_areas / 3, 3), minlength=len(i))
+    # Twice the mean curvature, of low frequencies, and its gradient.
+    spectrum = shape.eigenvalues[:, None] * (shape.functions.T @ (shape.mass[:, None] * surface.vertices))
+    curvature = dot(shape.functions @ spectrum, surface.vertex_normals)
+    opposite = surface.vertices[np.roll(faces, 1, axis=1)] - surface.vertices[np.roll(faces, -1, axis=1)]
+    slopes = np.cross(surface.face_normals, (opposite * curvature[faces][..., None]).sum(1))
+    slopes /= 2 * np.maximum(surface.face_areas, 1e-12)[:, None]
+
+    def rows(weights: FloatArray, values: FloatArray, directions: FloatArray) -> FloatArray:
+        return (np.sqrt(weights)[:, None, None] * values[:, :, None] * directions[:, None]).reshape(-1, 3 * k)
+
+    parts = [
+        rows(areas, functions[i] - functions[j], sides / np.maximum(dot(sides, sides), 1e-12)[:, None]),
+        rows(surface.face_areas, functions[faces].mean(1), _CURVATURE_SHARE * slopes),
+        rows(_FIXED * surface.vertex_areas, functions, surface.vertex_normals),
+        rows(np.full(3 * len(fixed), _FIXED), functions[fixed].repeat(3, axis=0), np.tile(np.eye(3), (len(fixed), 1))),
+    ]
+    matrix = np.concatenate([*parts, np.sqrt(_SOFTEST) * np.eye(3 * k)])
+    covariance = np.linalg.inv(matrix.T @ matrix).reshape(k, 3, k, 3).trace(axis1=1, axis2=3)
+    return float(np.sqrt(np.median(dot(functions @ covariance, functions))))

@@ -33,8 +33,10 @@ N_SIGNS, MORE_SIGNS = 4, 6
 """Number of eigenfunctions with both signs in the initial maps, and in those of a second attempt."""
 N_OTHER_STARTS = 6
 """Number of initial maps besides the sign patterns."""
-N_REFINED = 4
-"""Number of fully refined maps."""
+N_REFINED, N_DIFFERENT = 4, 2
+"""Number of fully refined maps: the best ones, and others that differ from them."""
+SAME = 0.1
+"""Largest difference of equal maps, for a surface of unit area."""
 N_SAMPLES = 40
 """Number of samples between which distances are compared."""
 _STEP = 3
@@ -196,7 +198,12 @@ class CoarsePair:
             coarse.append(self.refined(vertices, k, COARSE_FUNCTIONS))
             tick()
         coarse.sort(key=lambda found: -found.score)
-        best = [*coarse[:N_REFINED], max(coarse, key=lambda found: found.mirrored_score)]
+        best, places = coarse[:N_REFINED], self.second.coarse.vertices
+        for found in coarse[N_REFINED:]:  # the best ones are often the same map
+            apart = min(difference(places[found.vertices], places[one.vertices]) for one in best)
+            if len(best) < N_REFINED + N_DIFFERENT and apart > SAME:
+                best.append(found)
+        best.append(max(coarse, key=lambda found: found.mirrored_score))
         *fine, mirrored = [self.refined(found.vertices, COARSE_FUNCTIONS) for found in best]
         return [*sorted(fine, key=lambda found: -found.score), mirrored]
 
@@ -242,6 +249,11 @@ def nearest_rows(queries: FloatArray, rows: FloatArray) -> IntArray:
     return np.concatenate(
         [(part @ rows.T - half).argmax(1) for part in np.array_split(queries, len(queries) // 2048 + 1)]
     )
+
+
+def difference(points: FloatArray, others: FloatArray) -> float:
+    """98th percentile of the distances of corresponding points. *Shape:* ``(n, 3), (n, 3)``."""
+    return float(np.percentile(np.linalg.norm(points - others, axis=1), 98))
 
 
 def _oriented_area(first: SpectralShape, second: SpectralShape, vertices: IntArray) -> float:

@@ -15,22 +15,26 @@ from torch_modal.io.cache import Cache
 from torch_modal.keyframes.arrays import weld_seams
 from torch_modal.keyframes.check import check_keyframes
 from torch_modal.progress import Progress, ProgressReport
-from torch_modal.registration.fit import COARSE_STAGES, FINE_STAGES, MAP_WEIGHTS, TemplateFit
+from torch_modal.registration.fit import COARSE_STAGES, FINE_STAGES, MAP_WEIGHTS, TemplateFit, sliding_freedom
 from torch_modal.registration.landmarks import landmark_table
 from torch_modal.registration.maps import (
     FINE_FUNCTIONS,
     MORE_SIGNS,
     N_OTHER_STARTS,
     N_SIGNS,
+    SAME,
     CoarsePair,
     Map,
     SpectralShape,
+    difference,
 )
-from torch_modal.registration.report import TRUSTED, Quality, Registration, judge, measure, ramp
+from torch_modal.registration.report import LEADS, SLIDING, TRUSTED, Quality, Registration, judge, measure, ramp
 from torch_modal.registration.surface import MeshSurface, main_part, outward, referenced
 
-VERSION = 6
+VERSION = 7
 """Part of the cache key: raise it when the algorithm changes."""
+MIN_VERTICES = MORE_SIGNS + 3
+"""Minimum number of vertices of a surface: two more than eigenfunctions."""
 MIN_LANDMARKS = 5
 """Minimum number of landmarks between different subjects: fewer do not determine the map."""
 _SURE_SCORE = 0.62  # score of a spectral map below which more initial maps are tried
@@ -38,7 +42,7 @@ _SCORE_SHARE = 0.5  # weight of a map's score relative to the stretch of its fit
 _NEAR_LANDMARK = 0.1  # largest landmark error of a spectral map, for a surface of unit area
 _RIVALS = 3  # maximum number of maps that are fitted
 _RIVAL_SCORE = 0.15  # largest difference to the best map, in score minus distortion
-_SAME = 0.1  # 98th percentile of the distance of maps that count as equal, for a surface of unit area
+_CLOSE = 0.15  # cost above the best fit's up to which others count
 _SPECTRAL_REFINEMENTS = (True, True, False, False)  # of the map of each repeated fit
 _CONVERGED = 0.3  # mean displacement of the vertices at convergence, in percent of the diagonal
 _WORSE = 0.05  # accepted increase of a candidate's cost
@@ -148,11 +152,17 @@ class _RegistrationProblem:
         rest = template[0]
         goal, self.target_vertices = referenced(target[0], outward(*target))
         # Sizes are those of the main body, without stray pieces.
-        body = main_part(goal)
+        own, self.used = referenced(rest, outward(*template))
+        main, body = main_part(own), main_part(goal)
+        for name, part in (("template", main), ("target", body)):
+            if len(part.vertices) < MIN_VERTICES or part.area == 0:
+                raise MeshError(
+                    f"the {name}'s largest piece has {len(part.vertices)} vertices and an area of {part.area:.3g}; "
+                    f"registration needs {MIN_VERTICES} vertices or more, and an area: give a finer mesh"
+                )
         self.unit, self.origin = body.diagonal / 100, body.vertices.mean(0)
         self.target = goal.moved((goal.vertices - self.origin) / self.unit)
-        own, self.used = referenced(rest, outward(*template))
-        self.size = np.sqrt(body.area / main_part(own).area) / self.unit
+        self.size = np.sqrt(body.area / main.area) / self.unit
         self.rest = rest * self.size
         self.template = own.moved(own.vertices * self.size)
         self.first, self.second = SpectralShape(self.template), SpectralShape(self.target)
@@ -174,10 +184,12 @@ class _RegistrationProblem:
     def solve(self) -> Registration:
         rivals = self._rivals(self._maps())
         candidates = sorted((self._coarse(*rival) for rival in rivals), key=lambda one: one.cost)
-        # Advantage of the best fit over one along another map.
-        lead = candidates[1].cost - candidates[0].cost if len(candidates) > 1 else np.inf
-        best = self._rescaled(self._refined(candidates[0]))
-        return self._report(*self._fine(best), best, lead)
+        close = [self._refined(one) for one in candidates if one.cost < candidates[0].cost + _CLOSE]
+        best, *others = sorted(close, key=lambda one: one.cost)
+        # Advantage of the best fit over another one; most fits along other maps end at the best one.
+        leads = [one.cost - best.cost for one in others if difference(one.x, best.x) > SAME * self.second.scale]
+        best = self._rescaled(best)
+        return self._report(*self._fine(best), best, min(leads, default=np.inf))
 
     # ------------------------------------------------------------------------------------------------------------- maps
     def _maps(self) -> list[Map]:
@@ -208,10 +220,9 @@ class _RegistrationProblem:
         places = self.second.coarse.vertices
         kept = rated[:1]
         for found, distortion in rated[1:]:
-            apart = (np.linalg.norm(places[found.vertices] - places[one.vertices], axis=1) for one, _ in kept)
-            difference = min(np.percentile(distances, 98) for distances in apart)
+            apart = min(difference(places[found.vertices], places[one.vertices]) for one, _ in kept)
             lead = (found.score - distortion) - (rated[0][0].score - rated[0][1])
-            if len(kept) < _RIVALS and lead > -_RIVAL_SCORE and difference > _SAME:
+            if len(kept) < _RIVALS and lead > -_RIVAL_SCORE and apart > SAME:
                 kept.append((found, distortion))
         return kept
 
@@ -308,9 +319,11 @@ class _RegistrationProblem:
             supported = np.minimum(supported, ramp(misplaced, *_MISPLACED)[near])
         lost = float(self.template.vertex_areas[supported < TRUSTED].sum() / self.template.area)
         quality = quality._replace(unsupported_area=max(quality.unsupported_area, lost))
-        confidence, said = judge(quality, score, distortion, errors, mirrored, lead, self.same_subject)
+        freedom = sliding_freedom(self.first, self.mark_vertices[:, 0])
+        confidence, said = judge(quality, score, distortion, errors, mirrored, lead, freedom, self.same_subject)
+        unique = min(ramp(freedom, *SLIDING), ramp(lead, *LEADS[self.same_subject]))
         of_vertices = np.full(len(everything), confidence)
-        of_vertices[self.used] = supported
+        of_vertices[self.used] = np.minimum(supported, unique)
         closest = self.target.closest(everything)
         corners = self.target_vertices[self.target.faces[closest.faces]]
         return Registration(

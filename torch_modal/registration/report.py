@@ -16,6 +16,10 @@ from torch_modal.registration.surface import MeshSurface, referenced
 TRUSTED = 0.5
 """Confidence below which a result is doubtful."""
 
+SLIDING = 0.9, 0.65
+"""Freedom to slide along the target: no confidence, full confidence."""
+LEADS = {True: (0.0, 0.15), False: (0.0, 0.1)}
+"""Advantage over the best fit along another map: no confidence, full confidence; for one subject, and for two."""
 _FAR = 0.01  # distance from the target above which a face is unsupported, in diagonals
 _SHRUNK = 0.2  # area change relative to the median below which a face is unsupported: missing parts collapse
 _STRAY = 0.03  # distance from the template above which a piece of the target is ignored, in diagonals
@@ -215,6 +219,7 @@ def judge(
     landmark_errors: FloatArray,
     mirrored_lead: float,
     lead: float,
+    freedom: float,
     same_subject: bool,
 ) -> tuple[float, tuple[str, ...]]:
     """Confidence, the minimum of several criteria, and a message for each criterion that fails."""
@@ -229,6 +234,8 @@ def judge(
             ramp(quality.unsupported_area, 0.05, 0.02),
             f"{100 * quality.unsupported_area:.1f} % of the area have no target beside them",
         ),
+        (ramp(freedom, *SLIDING), "the template is so smooth that it can slide along the target"),
+        (ramp(lead, *LEADS[same_subject]), "another map fits nearly as well"),
     ]
     if same_subject or not len(landmark_errors):
         of_map = f"the map scores {map_score:.2f} with distances {distortion:.2f} off, right ones 0.7 and 0.1"
@@ -237,7 +244,6 @@ def judge(
             (ramp(map_score - distortion, *((0.32, 0.70) if same_subject else (0.25, 0.50))), of_map),
             (ramp(mirrored_lead, 0.15, 0.05), "the target looks like a mirror image of the template"),
             (ramp(quality.stretch, 0.35, 0.2) if same_subject else 1.0, of_edges),
-            (1.0 if same_subject else ramp(lead, 0.0, 0.1), "another map fits nearly as well"),
         ]
     if len(landmark_errors):
         worst = int(landmark_errors.argmax())
