@@ -51,7 +51,7 @@ ONE_SUBJECT = {
     "score": (lambda v: {"map_score": v}, 0.32, 0.70, "the map scores"),
     "distortion": (lambda v: {"map_score": 1.0, "distortion": v}, 0.68, 0.30, "the map scores"),
     "mirrored": (lambda v: {"mirrored_lead": v}, 0.15, 0.05, "mirror image"),
-    "another": (lambda v: {"lead": v}, 0.0, 0.15, "another map"),
+    "another": (lambda v: {"lead": v}, 0.0, 0.1, "another map"),
     "sliding": (lambda v: {"freedom": v}, 0.9, 0.65, "slide"),
     "landmarks": (lambda v: {"landmark_errors": (0.5, v, 1.0)}, 8.0, 2.0, "landmark 1"),
 }
@@ -125,7 +125,7 @@ def tilted(points: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 @pytest.mark.parametrize(
     "name",
-    ["box", *(pytest.param(name, marks=pytest.mark.slow) for name in ("cylinder", "sphere", "star", "torus"))],
+    ["star", *(pytest.param(name, marks=pytest.mark.slow) for name in ("box", "cylinder", "sphere", "torus"))],
 )
 def test_symmetric_bodies_are_doubtful(name: str) -> None:
     points, faces = symmetric(name)

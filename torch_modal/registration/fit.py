@@ -221,7 +221,7 @@ def sliding_freedom(shape: SpectralShape, fixed: IntArray) -> float:
     surface, functions = shape.coarse, shape.functions[:, :_SLIDING_FUNCTIONS]
     (i, j), faces, k = surface.edges.T, surface.faces, functions.shape[1]
     sides = surface.vertices[i] - surface.vertices[j]
-    areas = np.bincount(surface.connectivity.sides, np.tile(surface.face_areas / 3, 3), minlength=len(i))
+    areas: FloatArray = np.bincount(surface.connectivity.sides, np.tile(surface.face_areas, 3), minlength=len(i)) / 3
     # Twice the mean curvature, of low frequencies, and its gradient.
     spectrum = shape.eigenvalues[:, None] * (shape.functions.T @ (shape.mass[:, None] * surface.vertices))
     curvature = dot(shape.functions @ spectrum, surface.vertex_normals)

@@ -28,7 +28,7 @@ from torch_modal.registration.maps import (
     SpectralShape,
     difference,
 )
-from torch_modal.registration.report import LEADS, SLIDING, TRUSTED, Quality, Registration, judge, measure, ramp
+from torch_modal.registration.report import LEAD, SLIDING, TRUSTED, Quality, Registration, judge, measure, ramp
 from torch_modal.registration.surface import MeshSurface, main_part, outward, referenced
 
 VERSION = 7
@@ -42,7 +42,7 @@ _SCORE_SHARE = 0.5  # weight of a map's score relative to the stretch of its fit
 _NEAR_LANDMARK = 0.1  # largest landmark error of a spectral map, for a surface of unit area
 _RIVALS = 3  # maximum number of maps that are fitted
 _RIVAL_SCORE = 0.15  # largest difference to the best map, in score minus distortion
-_CLOSE = 0.15  # cost above the best fit's up to which others count
+_CLOSE = 0.1  # cost above the best fit's up to which others count
 _SPECTRAL_REFINEMENTS = (True, True, False, False)  # of the map of each repeated fit
 _CONVERGED = 0.3  # mean displacement of the vertices at convergence, in percent of the diagonal
 _WORSE = 0.05  # accepted increase of a candidate's cost
@@ -321,7 +321,7 @@ class _RegistrationProblem:
         quality = quality._replace(unsupported_area=max(quality.unsupported_area, lost))
         freedom = sliding_freedom(self.first, self.mark_vertices[:, 0])
         confidence, said = judge(quality, score, distortion, errors, mirrored, lead, freedom, self.same_subject)
-        unique = min(ramp(freedom, *SLIDING), ramp(lead, *LEADS[self.same_subject]))
+        unique = min(ramp(freedom, *SLIDING), ramp(lead, *LEAD))
         of_vertices = np.full(len(everything), confidence)
         of_vertices[self.used] = np.minimum(supported, unique)
         closest = self.target.closest(everything)

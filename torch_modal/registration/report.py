@@ -18,8 +18,8 @@ TRUSTED = 0.5
 
 SLIDING = 0.9, 0.65
 """Freedom to slide along the target: no confidence, full confidence."""
-LEADS = {True: (0.0, 0.15), False: (0.0, 0.1)}
-"""Advantage over the best fit along another map: no confidence, full confidence; for one subject, and for two."""
+LEAD = 0.0, 0.1
+"""Advantage over the best fit along another map: no confidence, full confidence."""
 _FAR = 0.01  # distance from the target above which a face is unsupported, in diagonals
 _SHRUNK = 0.2  # area change relative to the median below which a face is unsupported: missing parts collapse
 _STRAY = 0.03  # distance from the template above which a piece of the target is ignored, in diagonals
@@ -235,7 +235,7 @@ def judge(
             f"{100 * quality.unsupported_area:.1f} % of the area have no target beside them",
         ),
         (ramp(freedom, *SLIDING), "the template is so smooth that it can slide along the target"),
-        (ramp(lead, *LEADS[same_subject]), "another map fits nearly as well"),
+        (ramp(lead, *LEAD), "another map fits nearly as well"),
     ]
     if same_subject or not len(landmark_errors):
         of_map = f"the map scores {map_score:.2f} with distances {distortion:.2f} off, right ones 0.7 and 0.1"
