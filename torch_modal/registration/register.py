@@ -187,7 +187,12 @@ class _RegistrationProblem:
         close = [self._refined(one) for one in candidates if one.cost < candidates[0].cost + _CLOSE]
         best, *others = sorted(close, key=lambda one: one.cost)
         # Advantage of the best fit over another one; most fits along other maps end at the best one.
-        leads = [one.cost - best.cost for one in others if difference(one.x, best.x) > SAME * self.second.scale]
+        apart = [(one.cost - best.cost, np.linalg.norm(one.x - best.x, axis=1) / self.second.scale) for one in others]
+        leads = [lead for lead, distances in apart if np.percentile(distances, 98) > SAME]
+        #: Confidence in the place of each coarse vertex beside other fits. *Shape:* ``(n,)``.
+        self.unique = np.ones(len(self.first))
+        for lead, distances in apart:
+            self.unique[distances > SAME] = np.minimum(self.unique[distances > SAME], ramp(lead, *LEAD))
         best = self._rescaled(best)
         return self._report(*self._fine(best), best, min(leads, default=np.inf))
 
@@ -321,7 +326,8 @@ class _RegistrationProblem:
         quality = quality._replace(unsupported_area=max(quality.unsupported_area, lost))
         freedom = sliding_freedom(self.first, self.mark_vertices[:, 0])
         confidence, said = judge(quality, score, distortion, errors, mirrored, lead, freedom, self.same_subject)
-        unique = min(ramp(freedom, *SLIDING), ramp(lead, *LEAD))
+        near = self.first.placed.nearest_alike(self.template.vertices, self.template.vertex_normals)
+        unique = np.minimum(self.unique[near], ramp(freedom, *SLIDING))
         of_vertices = np.full(len(everything), confidence)
         of_vertices[self.used] = np.minimum(supported, unique)
         closest = self.target.closest(everything)
