@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 import subprocess
+import tracemalloc
 from importlib import resources
 from pathlib import Path
 
@@ -157,7 +158,10 @@ def test_principal_shapes(tmp_path):
     gltf = pygltflib.GLTF2().load(str(path))
     primitive = gltf.meshes[0].primitives[0]
     assert len(primitive.targets) == 3 and gltf.meshes[0].extras["targetNames"][0] == "principal-1"
-    np.testing.assert_allclose(accessor(gltf, primitive.attributes.POSITION), FRAMES.mean(0), atol=1e-5)
+    # Blender clamps weights to this range.
+    weights = accessor(gltf, gltf.animations[0].samplers[0].output).reshape(9, 3)
+    np.testing.assert_allclose([weights.min(0), weights.max(0)], [[0] * 3, [1] * 3], atol=1e-6)
+    np.testing.assert_allclose(gltf.meshes[0].weights, weights[0], atol=1e-6)
     # The error is the rest of the singular values.
     values = np.linalg.svd((FRAMES - FRAMES.mean(0)).reshape(9, -1), compute_uv=False)
     off = read_shapes([path])[0] - FRAMES
@@ -166,6 +170,19 @@ def test_principal_shapes(tmp_path):
     np.testing.assert_allclose(read_shapes([exact])[0], FRAMES[:4], atol=1e-5)
     still = tm.save_animation(FRAMES[[0, 0]], FACES, tmp_path / "c.glb", targets=1)
     np.testing.assert_allclose(read_shapes([still])[0], FRAMES[[0, 0]], atol=1e-5)
+    few = FRAMES[:, ::40]  # more frames than coordinates
+    path = tm.save_animation(few[:, :2], [[0, 1, 1]], tmp_path / "d.glb", targets=6)
+    np.testing.assert_allclose(read_shapes([path])[0], few[:, :2], atol=1e-5)
+
+
+@pytest.mark.parametrize("form", [{"bones": 2}, {"targets": 2}])
+def test_memory_does_not_grow_with_the_square_of_the_frames(tmp_path, form):
+    frames = np.stack([turn.apply(X[::20]) for turn in Rotation.from_rotvec(np.linspace(0, 9, 4000)[:, None] * [0, 0, 1])])
+    tracemalloc.start()
+    tm.save_animation(frames, [[0, 1, 2], [2, 3, 4]], tmp_path / "a.glb", **form)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 8 * 4000**2 / 4  # a quarter of such a matrix
 
 
 @pytest.mark.parametrize(
@@ -269,15 +286,16 @@ def test_three_plays_the_frames(tmp_path):
     assert np.abs(found - tm.bake(FRAMES, FACES, 6).shapes().numpy()).max() < TOLERANCE * DIAGONAL
 
 
-def test_blender_plays_the_frames(tmp_path):
+@pytest.mark.parametrize("form", [{"bones": 6}, {"targets": 8}])
+def test_blender_plays_the_frames(tmp_path, form):
     bpy = pytest.importorskip("bpy", reason="bpy is not installed")
-    path = tm.save_animation(FRAMES, FACES, tmp_path / "a.glb", bones=6, fps=24)
+    path = tm.save_animation(FRAMES, FACES, tmp_path / "a.glb", fps=24, **form)
     bpy.ops.wm.read_factory_settings(use_empty=True)
     bpy.ops.import_scene.gltf(filepath=str(path))
     scene = bpy.context.scene
     (own,) = [each for each in scene.objects if each.type == "MESH" and len(each.data.vertices) == len(X)]
     start = round(min(action.frame_range[0] for action in bpy.data.actions))
-    for n, shape in enumerate(tm.bake(FRAMES, FACES, 6).shapes().numpy()):
+    for n, shape in enumerate(read_shapes([path])[0]):
         scene.frame_set(start + n)
         posed = own.evaluated_get(bpy.context.evaluated_depsgraph_get())
         points = np.array([posed.matrix_world @ vertex.co for vertex in posed.data.vertices])

@@ -22,6 +22,7 @@ from torch_modal.io.normals import carry_together
 
 # Normals double the file. Beyond this size (POSITION alone) they are left out.
 LARGEST_FILE_WITH_NORMALS = 48 * 2**20
+TINY = 1e-30  # in the place of zero, where shapes do not move
 
 
 def glb_bytes(vertices: FloatArray, faces: IntArray, asset: Asset | None) -> bytes:
@@ -49,7 +50,7 @@ def write_glb(animation: Animation, path: Path) -> None:
             "players interpolate linearly between them.",
             stacklevel=3,
         )
-    drawn, weights = shapes[kept], np.eye(len(kept))[:, 1:]
+    drawn, weights = shapes[kept], None
     if skin is not None:
         drawn = skin.rest[None].double().cpu().numpy()
     elif n_targets:
@@ -73,11 +74,13 @@ def write_glb(animation: Animation, path: Path) -> None:
         if skin is not None:
             samplers, channels = _add_skin(document, skin, asset, inputs, shown)
         else:
-            outputs = document.add(weights[shown].astype(np.float32).reshape(-1), "SCALAR")
+            # Frame n is the target n - 1 alone: rows of the unit matrix, without its first column.
+            rows = np.arange(1, len(drawn)) == shown[:, None] if weights is None else weights[shown]
+            outputs = document.add(rows.astype(np.float32).reshape(-1), "SCALAR")
             samplers = [{"input": inputs, "output": outputs, "interpolation": "LINEAR"}]
             names = [f"principal-{n}" if n_targets else f"frame-{kept[n]:03d}" for n in range(1, len(drawn))]
             for mesh in document.get("meshes"):
-                mesh["weights"] = weights[0].tolist()
+                mesh["weights"] = rows[0].astype(float).tolist()
                 mesh["extras"] = {**mesh.get("extras", {}), "targetNames": names}
             channels = [
                 {"sampler": 0, "target": {"node": number, "path": "weights"}}
@@ -104,16 +107,23 @@ def thinned(n_frames: int, most: int, wanted: list[int]) -> IntArray:
 
 
 def _principal(shapes: FloatArray, n: int) -> tuple[FloatArray, FloatArray]:
-    """The mean, with each of the first n principal shapes added, and their weights in the frames, within -1 and 1.
+    """A base, with each of the first n principal shapes added, and their weights in the frames, from 0 to 1.
 
-    *Shape:* ``(N, V, 3) -> (1 + n, V, 3), (N, n)``; n is smaller where fewer give the frames exactly.
+    Blender clamps weights to this range, so the base is the mean plus the least part of each shape. *Shape:*
+    ``(N, V, 3) -> (1 + n, V, 3), (N, n)``; n is smaller where fewer give the frames exactly.
     """
     mean = shapes.mean(0)
     moved = (shapes - mean).reshape(len(shapes), -1)
-    values, vectors = np.linalg.eigh(moved @ moved.T)
-    used = np.flatnonzero(values >= 1e-14 * values[-1])[::-1][:n]
-    weights = vectors[:, used] / np.abs(vectors[:, used]).max(0)
-    return np.concatenate([mean[None], mean + np.tensordot(np.linalg.pinv(weights), shapes - mean, 1)]), weights
+    few = len(moved) <= moved.shape[1]
+    values, vectors = np.linalg.eigh(moved @ moved.T if few else moved.T @ moved)
+    vectors = vectors[:, np.flatnonzero(values >= 1e-14 * values[-1])[::-1][:n]]
+    if not few:
+        vectors = moved @ vectors
+        vectors /= np.maximum(np.linalg.norm(vectors, axis=0), TINY)
+    low, extent = vectors.min(0), np.maximum(np.ptp(vectors, axis=0), TINY)
+    parts = (vectors.T @ moved).reshape(-1, *mean.shape)
+    base = mean + np.tensordot(low, parts, 1)
+    return np.concatenate([base[None], base + extent[:, None, None] * parts]), (vectors - low) / extent
 
 
 def _add_skin(

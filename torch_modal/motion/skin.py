@@ -166,8 +166,7 @@ class _Decomposition:
         Bones are added one by one: that towards which a straight step lowers the distance most.
         """
         n_frames, n = bones.shape[:2]
-        columns = bones.transpose(1, 2).reshape(3 * n_frames, 4 * n)
-        grams = (columns.mT @ columns).reshape(n, 4, n, 4).transpose(1, 2).reshape(n * n, 16)
+        columns, grams = bones.transpose(1, 2).reshape(3 * n_frames, 4 * n), _grams(bones).reshape(n * n, 16)
         weights, errors = self.rest.new_zeros(len(self.rest), n), []
         for part in torch.arange(len(self.rest), device=bones.device).split(max(1, CHUNK // n**2)):
             p, x = self.rest[part], self.rows[:, part]
@@ -212,13 +211,21 @@ class _Decomposition:
             weights, bones = weights[:, kept], bones[:, kept]
             weighted = weights[:, :, None] * self.rest[:, None]
             sums = torch.einsum("vja,vjb->jab", weighted, weighted)
-            apart = bones[:, :, None] - bones[:, None]
-            off = torch.einsum("tjkia,jab,tjkib->jk", apart, sums, apart) / (len(bones) * sums[:, 3, 3, None])
+            grams = _grams(bones)
+            own = grams.diagonal().movedim(-1, 0)
+            apart = own[:, None] + own - grams - grams.transpose(0, 1)
+            off = (apart * sums[:, None]).sum((2, 3)) / (len(bones) * sums[:, 3, 3, None])
             j, k = divmod(int(off.fill_diagonal_(torch.inf).argmin()), len(off))
             if off[j, k] > EQUAL**2:
                 return weights, bones
             weights[:, k] += weights[:, j]
             kept = torch.arange(len(off), device=off.device) != j
+
+
+def _grams(bones: Tensor) -> Tensor:
+    """Sums over the frames of ``T_j^T T_k``. *Shape:* ``(T, J, 3, 4) -> (J, J, 4, 4)``."""
+    columns = bones.transpose(1, 2).flatten(0, 1).flatten(1)
+    return (columns.mT @ columns).unflatten(1, (-1, 4)).unflatten(0, (-1, 4)).transpose(1, 2)
 
 
 def _convex(squares: Tensor, products: Tensor, chosen: Tensor) -> tuple[Tensor, Tensor]:
