@@ -177,7 +177,9 @@ def test_principal_shapes(tmp_path):
 
 @pytest.mark.parametrize("form", [{"bones": 2}, {"targets": 2}])
 def test_memory_does_not_grow_with_the_square_of_the_frames(tmp_path, form):
-    frames = np.stack([turn.apply(X[::20]) for turn in Rotation.from_rotvec(np.linspace(0, 9, 4000)[:, None] * [0, 0, 1])])
+    frames = np.stack(
+        [turn.apply(X[::20]) for turn in Rotation.from_rotvec(np.linspace(0, 9, 4000)[:, None] * [0, 0, 1])]
+    )
     tracemalloc.start()
     tm.save_animation(frames, [[0, 1, 2], [2, 3, 4]], tmp_path / "a.glb", **form)
     peak = tracemalloc.get_traced_memory()[1]

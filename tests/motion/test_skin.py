@@ -1,16 +1,19 @@
 """Motions as bones: by motions that are known, and against the definition."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
+import trimesh
 from textured import bend, triangles_of_tube
 from torch import Tensor
 
 import torch_modal as tm
 from torch_modal.data.samples import load_sample
 from torch_modal.errors import MeshWarning
-from torch_modal.geometry.rotations import exp
-from torch_modal.motion.skin import _convex
+from torch_modal.geometry.rotations import exp, log
+from torch_modal.motion.skin import _between, _convex, _Decomposition
 
 X, FACES = triangles_of_tube()
 BENT = torch.tensor(np.stack([bend(X, turn) for turn in np.linspace(0.01, 0.9, 7)]))
@@ -29,11 +32,17 @@ def arm(generator: torch.Generator, units: float = 1.0) -> tuple[Tensor, Tensor,
     return units * frames, torch.tensor(FACES), weights
 
 
+def off_at_frames(skin: tm.Skin, frames: Tensor) -> float:
+    """Root mean square distance over the diagonal."""
+    diagonal = (frames[0].amax(0) - frames[0].amin(0)).norm()
+    return float((skin.shapes() - frames).square().sum(-1).mean().sqrt() / diagonal)
+
+
 @pytest.mark.parametrize("units", [1.0, 1e-3, 1e3])
 def test_bones_that_are_known_are_found(generator: torch.Generator, units: float) -> None:
     frames, faces, weights = arm(generator, units)
     skin = tm.bake(frames, faces, 2)
-    assert skin.error < 1e-4 and skin.weights.shape[1] == 2
+    assert off_at_frames(skin, frames) < 1e-4 and skin.error < 1e-3 and skin.weights.shape[1] == 2
     second = skin.weights[:, int(skin.weights[-1].argmax())]
     torch.testing.assert_close(second, weights, atol=0.01, rtol=0)
     assert (torch.linalg.det(skin.transforms[..., :3, :3]) - 1).abs().max() < 1e-9
@@ -48,7 +57,8 @@ def test_shapes_are_those_of_the_definition(generator: torch.Generator) -> None:
         expected += skin.weights[:, j, None] * (skin.rest @ turn.mT + shift[:, None])
     torch.testing.assert_close(skin.shapes(), expected)
     diagonal = float((frames[0].amax(0) - frames[0].amin(0)).norm())
-    assert skin.error == pytest.approx(float((expected - frames).square().sum(-1).mean().sqrt()) / diagonal)
+    off = torch.cat([expected - frames, _between(skin, frames)]).square().sum(-1).mean().sqrt()
+    assert skin.error == pytest.approx(float(off) / diagonal)
     assert torch.equal(skin.rest, frames[0])
     assert (skin.weights >= 0).all() and ((skin.weights > 0).sum(1) <= 3).all()
     torch.testing.assert_close(skin.weights * 65_535, (skin.weights * 65_535).round(), atol=1e-6, rtol=0)
@@ -81,6 +91,41 @@ def test_convex_weights_beat_all_on_a_grid(generator: torch.Generator) -> None:
     grid = torch.cartesian_prod(*[torch.arange(11)] * 4)
     grid = grid[grid.sum(1) == 10].double() / 10
     assert (off[:, None] <= (torch.einsum("nij,gj->ngi", a, grid) - x[:, None]).square().sum(2) + 1e-9).all()
+
+
+def test_bones_turn_no_more_than_the_body() -> None:
+    ball = trimesh.creation.icosphere(3)
+    angles = np.linspace(0, np.pi, 17)[:, None] * ball.vertices[:, 2] / 2
+    across, along = np.exp(1j * angles) * (ball.vertices @ [1, 1j, 0]), np.tile(ball.vertices[:, 2], (17, 1))
+    frames = torch.tensor(np.stack([across.real, across.imag, along], -1))
+    skin = tm.bake(frames, ball.faces)
+    turns = skin.transforms[1:, :, :3, :3] @ skin.transforms[:-1, :, :3, :3].mT
+    assert log(turns).norm(dim=-1).max() < np.radians(20) + np.pi / 32  # that is the largest turn of a triangle
+    assert off_at_frames(skin, frames) < 1.1e-4 and skin.error < 1.1e-4
+
+
+def test_half_way_between_frames_by_hand() -> None:
+    """One bone: the body turns by 80 degrees and moves; then the bone alone has a wrong place in the last frame."""
+    turns = exp(torch.tensor([[0.0, 0, 0], [0, 1.4, 0], [0, 2.8, 0]], dtype=torch.float64))
+    frames = BENT[0] @ turns.mT + torch.tensor([[[0.0, 0, 0]], [[5, 0, 0]], [[5, 5, 0]]])
+    maps = torch.eye(4, dtype=torch.float64).repeat(3, 1, 1, 1)
+    maps[:, 0, :3, :3], maps[1:, 0, 0, 3], maps[2, 0, 1, 3] = turns, 5, 5
+    skin = tm.Skin(BENT[0], torch.ones(len(X), 1, dtype=torch.float64), maps, 0.0)
+    assert _between(skin, frames).abs().max() < 1e-9
+    wrong = skin.transforms.clone()
+    wrong[2, 0, 2, 3] += 0.5
+    off = _between(replace(skin, transforms=wrong), frames).norm(dim=-1)
+    torch.testing.assert_close(off, torch.tensor([[0.0], [0.25]], dtype=torch.float64).expand_as(off))
+
+
+def test_weights_are_the_best_of_all_pairs(generator: torch.Generator) -> None:
+    frames, _, _ = arm(generator)
+    fit = _Decomposition(frames, 1)
+    bones = tm.bake(frames, FACES, 3).transforms[:, :, :3]
+    weights, error = fit._weights(bones, 1)
+    off = (torch.einsum("tjab,vb->tjva", bones, fit.rest) - frames[:, None]).square().sum(-1).mean(0)
+    torch.testing.assert_close(error, off.min(0).values, atol=1e-9, rtol=1e-6)
+    assert torch.equal(weights.argmax(1), off.argmin(0))
 
 
 def test_samples_are_followed() -> None:

@@ -10,8 +10,6 @@ import torch
 
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.geometry.connectivity import merge_seams
-from torch_modal.geometry.rigid import best_fit
-from torch_modal.geometry.rotations import quaternion
 from torch_modal.geometry.skin import Skin
 from torch_modal.geometry.vectors import vertex_normals
 from torch_modal.io.asset import Asset, Material, Part
@@ -133,23 +131,15 @@ def _add_skin(
 
     Skinned meshes ignore the transforms of their nodes, which therefore go into the inverse bind matrices.
     """
-    given = skin.weights, skin.rest, skin.transforms, skin.shapes()
-    weights, rest, transforms, shapes = (array.double().cpu() for array in given)
+    weights, (bind, turns, shifts) = skin.weights.double().cpu().numpy(), skin.tracks()
     primitives = [primitive for mesh in document.get("meshes") for primitive in mesh["primitives"]]
-    vertices = [np.arange(len(rest))] if asset is None else [part.vertices for part in asset.parts()]
+    vertices = [np.arange(len(weights))] if asset is None else [part.vertices for part in asset.parts()]
     for primitive, own in zip(primitives, vertices, strict=True):
-        primitive["attributes"] |= document.add_influences(weights.numpy()[own])
-    fit = best_fit(rest, shapes, torch.ones_like(rest[:, 0]))
-    # The root, then the joints, each at the mean of its vertices.
-    bind = torch.eye(4, dtype=torch.float64).repeat(1 + weights.shape[1], 1, 1)
-    bind[0, :3, 3], bind[1:, :3, 3] = fit.source, weights.mT @ rest / weights.sum(0)[:, None]
-    root = bind[:1].repeat(len(shapes), 1, 1)
-    root[:, :3, :3], root[:, :3, 3] = fit.rotation, fit.target
-    local = torch.cat([root[:, None], torch.linalg.solve(root[:, None], transforms @ bind[1:])], 1)[shown]
-    turns = quaternion(local[..., :3, :3].movedim((2, 3), (0, 1)))
+        primitive["attributes"] |= document.add_influences(weights[own])
+    turns, shifts = turns[:, shown], shifts[shown]
     turns[:, 1:] *= torch.where((turns[:, 1:] * turns[:, :-1]).sum(0) < 0, -1, 1).cumprod(0)  # never the long way round
     rotations = (turns[[1, 2, 3, 0]] * 32_767).round().permute(2, 1, 0).numpy().astype("<i2", order="C")
-    translations = local[..., :3, 3].transpose(0, 1).numpy().astype("<f4", order="C")
+    translations = shifts.transpose(0, 1).numpy().astype("<f4", order="C")
     first = len(document.get("nodes"))
     joints = list(range(first + 1, first + len(bind)))
     document.append("nodes", {"name": "root", "translation": bind[0, :3, 3].tolist(), "children": joints})

@@ -18,7 +18,8 @@ from torch_modal.errors import MeshWarning
 from torch_modal.geometry.connectivity import merge_seams
 from torch_modal.geometry.inspect import diagonals
 from torch_modal.geometry.rigid import best_rotation
-from torch_modal.geometry.skin import STEPS, Skin
+from torch_modal.geometry.rotations import exp, log, matrix
+from torch_modal.geometry.skin import STEPS, Skin, blended
 from torch_modal.io.write import check_frames
 
 ROUNDS = 20  # at most; fewer where one lowers the error by less than a hundredth
@@ -27,6 +28,10 @@ LEAST = 4  # vertices of a new bone; fewer leave its rotation undetermined
 EQUAL = 1e-5  # distance of motions that count as one, over the diagonal
 CHUNK = 2**22  # products of bones at vertices, in memory at a time
 TINY, RIDGE = 1e-30, 1e-10
+TIED = 8  # further rounds, in which the rotations of a bone are tied to those in the frames beside
+TIES = 0.01, 1.0  # first and largest weight of it, over the squared error of all vertices; fourfold where bones turn on
+TURN = np.cos(np.radians(15))  # turn between frames beyond that of the bone's vertices
+THIN = 1e-4  # part of the identity in the rotation of a bone's vertices, which may lie on a line
 
 
 @torch.no_grad()
@@ -41,8 +46,9 @@ def bake(
     """A motion as linear blend skinning: bones that move rigidly, and their weights at each vertex.
 
     Bones start from clusters of vertices that move alike, split where the error is largest; then weights and bones are
-    fitted in turns (Le and Deng 2012, Smooth Skinning Decomposition with Rigid Bones). Bones that move as one are
-    merged. Copies of a vertex along seams have equal weights.
+    fitted in turns (Le and Deng 2012, Smooth Skinning Decomposition with Rigid Bones). Rotations are tied to those in
+    the frames beside, as players interpolate them. Bones that move as one are merged. Copies of a vertex along seams
+    have equal weights.
 
     Args:
         frames: Vertex positions, two frames or more. Frame 0 is the rest shape. *Shape:* ``(T, V, 3)``.
@@ -95,7 +101,8 @@ def bake(
         transforms[..., :3, :3] = made[..., :3]
         transforms[..., :3, 3] = made[..., 3] * diagonal + after - made[..., :3] @ after[0, 0]
         found = Skin(like[0], weights[copies].to(like), transforms.to(like), 0.0, when)
-        off = (found.shapes().double().cpu() - torch.from_numpy(shapes)).square().sum(-1).mean().sqrt()
+        off = found.shapes().double().cpu() - torch.from_numpy(shapes)
+        off = torch.cat([off, _between(found, torch.from_numpy(shapes))]).square().sum(-1).mean().sqrt()
         return replace(found, error=float(off) / diagonal)
 
     best = skin(bones)
@@ -120,7 +127,7 @@ class _Decomposition:
     def __init__(self, x: Tensor, influences: int) -> None:
         self.influences = influences
         self.rest = torch.nn.functional.pad(x[0], (0, 1), value=1)
-        self.rows = x.mT.flatten(0, 1)
+        self.shapes, self.rows = x, x.mT.flatten(0, 1)
         self.still = torch.eye(3, 4).to(x).repeat(len(x), 1, 1, 1)
 
     def solve(self, most: int) -> tuple[Tensor, Tensor]:
@@ -132,11 +139,18 @@ class _Decomposition:
             weights, error = self._weights(bones, self.influences)
             if error.mean() > 0.98 * last:
                 break
-        weights, bones = self._merged(weights, bones)
+        ties, total = torch.full_like(bones[0, :, 0, 0], TIES[0]), error.sum() + EQUAL**2 * len(error)
+        for _ in range(TIED):
+            bones = self._moved(bones, weights, total * ties)
+            steps = bones[1:, ..., :3] @ bones[:-1, ..., :3].mT
+            beyond = (steps * _steps(self.shapes, weights)[0]).sum((-2, -1)) < 1 + 2 * TURN
+            ties = torch.where(beyond.any(0), (4 * ties).clamp_max(TIES[1]), ties)
+            weights, error = self._weights(bones, self.influences)
+        weights, bones, ties = self._merged(weights, bones, ties)
         whole = (weights * STEPS).floor()
         rank = (weights * STEPS - whole).argsort(1, descending=True).argsort(1)
         weights = (whole + (rank < STEPS - whole.sum(1, keepdim=True))) / STEPS
-        return weights, self._moved(bones, weights)
+        return weights, self._moved(bones, weights, total * ties)
 
     def _clusters(self, most: int) -> Tensor:
         """Bones of clusters of vertices that move alike; those with the largest errors are halved."""
@@ -188,27 +202,40 @@ class _Decomposition:
             errors.append((error + x.square().sum(0)).clamp_min(0) / n_frames)
         return weights, torch.cat(errors)
 
-    def _moved(self, bones: Tensor, weights: Tensor) -> Tensor:
-        """Bones one after the other, each by the best rigid motion for its part of the vertices."""
+    def _moved(self, bones: Tensor, weights: Tensor, ties: Tensor | None = None) -> Tensor:
+        """Bones one after the other, each by the best rigid motion for its part of the vertices.
+
+        Ties ``(J,)`` add the squared change of a rotation between frames, without the turn of the bone's vertices.
+        """
         n_frames, n = bones.shape[:2]
         weighted = (weights[:, :, None] * self.rest[:, None]).flatten(1)
         sums, moments = weighted.mT @ weighted, self.rows @ weighted
         columns = bones.transpose(1, 2).reshape(3 * n_frames, 4 * n).clone()
+        steps = None if ties is None else _steps(self.shapes, weights)[0]
         for own in [slice(4 * j, 4 * j + 4) for j in range(n)] * SWEEPS:
             *_, mass = middle = sums[own, own][3]
             if mass > TINY:
                 part = moments[:, own] - columns @ sums[:, own] + columns[:, own] @ sums[own, own]
                 part, middle = part.unflatten(0, (n_frames, 3)) / mass, middle[:3] / mass
-                rotation = best_rotation(part[..., :3] - part[..., 3:] * middle)
+                covariance = part[..., :3] - part[..., 3:] * middle
+                if ties is None or steps is None:
+                    rotation = best_rotation(covariance)
+                else:
+                    j, rotation = own.start // 4, columns[:, own].unflatten(0, (n_frames, 3))[..., :3].clone()
+                    for some in (slice(0, None, 2), slice(1, None, 2)):  # frames whose neighbours are the others
+                        beside = torch.zeros_like(rotation)
+                        beside[1:] += steps[:, j] @ rotation[:-1]
+                        beside[:-1] += steps[:, j].mT @ rotation[1:]
+                        rotation[some] = best_rotation((covariance + ties[j] / mass * beside)[some])
                 shift = part[..., 3] - rotation @ middle
                 columns[:, own] = torch.cat([rotation, shift[..., None]], 2).flatten(0, 1)
         return columns.reshape(n_frames, 3, n, 4).transpose(1, 2)
 
-    def _merged(self, weights: Tensor, bones: Tensor) -> tuple[Tensor, Tensor]:
+    def _merged(self, weights: Tensor, bones: Tensor, ties: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Without bones that move nothing, or as another one does."""
         kept = weights.sum(0) * STEPS >= 1
         while True:
-            weights, bones = weights[:, kept], bones[:, kept]
+            weights, bones, ties = weights[:, kept], bones[:, kept], ties[kept]
             weighted = weights[:, :, None] * self.rest[:, None]
             sums = torch.einsum("vja,vjb->jab", weighted, weighted)
             grams = _grams(bones)
@@ -217,9 +244,41 @@ class _Decomposition:
             off = (apart * sums[:, None]).sum((2, 3)) / (len(bones) * sums[:, 3, 3, None])
             j, k = divmod(int(off.fill_diagonal_(torch.inf).argmin()), len(off))
             if off[j, k] > EQUAL**2:
-                return weights, bones
+                return weights, bones, ties
             weights[:, k] += weights[:, j]
             kept = torch.arange(len(off), device=off.device) != j
+
+
+def _steps(x: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+    """Turns of the vertices of each bone from frame to frame, and their centres.
+
+    *Shape:* ``(T, V, 3), (V, J) -> (T - 1, J, 3, 3), (T, J, 3)``.
+    """
+    parts = weights / weights.sum(0).clamp_min(TINY)
+    centres = parts.mT @ x
+    moments = torch.einsum("vj,tva,vb->tjab", parts, x, x[0]) - centres[..., None] * centres[0, :, None]
+    width = moments[0].diagonal(dim1=1, dim2=2).sum(1)[:, None, None]
+    turns = best_rotation(moments + THIN * width * torch.eye(3).to(x))
+    return turns[1:] @ turns[:-1].mT, centres
+
+
+def _between(skin: Skin, shapes: Tensor) -> Tensor:
+    """Distances half-way between frames of what players show to the mean of both. *Shape:* ``(T - 1, V, 3)``.
+
+    The mean is taken after the turns of the body and, in its frame, of the bones' vertices, both put back by half.
+    """
+    bind, turns, shifts = skin.tracks()
+    weights, rest, middles = skin.weights.double().cpu(), skin.rest.double().cpu(), bind[1:, :3, 3:]
+    rotations = matrix(turns).movedim((0, 1), (2, 3))
+    own = (shapes - shifts[:, :1]) @ rotations[:, 0]
+    steps, centres = _steps(own, weights)
+    half = exp(0.5 * log(steps))
+    played = rotations[:-1, 1:] @ exp(0.5 * log(rotations[:-1, 1:].mT @ rotations[1:, 1:]))
+    shift = 0.5 * (shifts[:-1, 1:] + shifts[1:, 1:])[..., None] - played @ middles
+    off = blended(weights, torch.cat([played, shift], 3), rest.expand(len(half), -1, -1))
+    for turn, middle, x in ((half, centres[:-1, :, :, None], own[:-1]), (half.mT, centres[1:, :, :, None], own[1:])):
+        off -= 0.5 * blended(weights, torch.cat([turn, middle - turn @ middle], 3), x)
+    return off
 
 
 def _grams(bones: Tensor) -> Tensor:
