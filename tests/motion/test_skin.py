@@ -104,6 +104,19 @@ def test_bones_turn_no_more_than_the_body() -> None:
     assert off_at_frames(skin, frames) < 1.1e-4 and skin.error < 1.1e-4
 
 
+def test_ties_leave_a_rigid_motion_as_it_is(generator: torch.Generator) -> None:
+    turns = exp(torch.randn(5, 3, generator=generator, dtype=torch.float64))
+    turns[0] = torch.eye(3)
+    fit = _Decomposition(BENT[0] @ turns.mT, 1)
+    weights = torch.ones(len(X), 1, dtype=torch.float64)
+    free = fit._moved(fit.still, weights)
+    tied = fit._moved(free, weights, torch.tensor([1e6], dtype=torch.float64))
+    torch.testing.assert_close(
+        tied, free, atol=0.01, rtol=0
+    )  # the turns of the vertices have a small part of the identity
+    torch.testing.assert_close(free[:, 0, :, :3], turns)
+
+
 def test_half_way_between_frames_by_hand() -> None:
     """One bone: the body turns by 80 degrees and moves; then the bone alone has a wrong place in the last frame."""
     turns = exp(torch.tensor([[0.0, 0, 0], [0, 1.4, 0], [0, 2.8, 0]], dtype=torch.float64))
