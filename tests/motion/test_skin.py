@@ -117,6 +117,16 @@ def test_ties_leave_a_rigid_motion_as_it_is(generator: torch.Generator) -> None:
     torch.testing.assert_close(free[:, 0, :, :3], turns)
 
 
+def test_bones_that_move_as_one_are_merged(generator: torch.Generator) -> None:
+    frames, _, second = arm(generator)
+    fit = _Decomposition(frames, 4)
+    bones = tm.bake(frames, FACES, 2).transforms[:, [0, 1, 0], :3]
+    weights = torch.stack([0.5 * second, 1 - second, 0.5 * second], 1)
+    found, left, ties = fit._merged(weights, bones, torch.arange(3.0))
+    assert found.shape == (len(X), 2) and left.shape[1] == len(ties) == 2
+    torch.testing.assert_close(found.sum(1), torch.ones_like(second))
+
+
 def test_half_way_between_frames_by_hand() -> None:
     """One bone: the body turns by 80 degrees and moves; then the bone alone has a wrong place in the last frame."""
     turns = exp(torch.tensor([[0.0, 0, 0], [0, 1.4, 0], [0, 2.8, 0]], dtype=torch.float64))
