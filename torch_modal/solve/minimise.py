@@ -73,7 +73,7 @@ class Solution(NamedTuple):
     n_crossing: Tensor | None = None
     """With contact, the pairs of triangles of parts that still go through each other. *Shape:* ``(B,)``, int64."""
     distortion_ratio: Tensor | None = None
-    """Distortion of the minimiser over that of a start, the largest of all; starts count as strained by 1 % at least.
+    """Distortion of the minimiser over that of a start, the largest of all; starts count as strained by 2 % at least.
     From 1.1 on the shape is blended into its start, from 1.2 on (paths: 2 and 3) replaced by it. *Shape:* ``(B,)``."""
 
     @property
