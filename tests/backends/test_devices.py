@@ -113,7 +113,7 @@ def steps(energy: Energy, x: Tensor, reference: Any) -> None:
     at = energy.linearise(rows, reference)
     right = -energy.fold(energy.gradient(at))
     assert_there([energy.value(rows, reference), energy.value_at(at, reference)])
-    assert_there(_solved(energy, ConvexHessian(energy, at), right, 3, [], None))
+    assert_there(_solved(energy, ConvexHessian(energy, at), right, 3, []))
 
 
 def assert_core_runs(core: Any, x: Tensor, stiffness: list[Tensor]) -> None:
