@@ -27,6 +27,7 @@ ByteArray = NDArray[np.uint8]
 CHILD_SECONDS = 300.0
 SMOOTH_FACES = 30_000  # matplotlib draws at least so many
 LIGHTS = (((-2, 3, 4), 0.82), ((4, 1, 3), 0.30), ((0, -3, 2), 0.14))  # directions as the viewer sees them; brightness
+SURFACE = {"ambient": 0.25, "diffuse": 0.85, "specular": 0.08, "specular_power": 12}
 
 
 class Scene(NamedTuple):
@@ -61,17 +62,7 @@ def _draw_pyvista(scene: Scene) -> ByteArray:
         mesh = pv.PolyData(points * scale, corners.reshape(-1))
         mesh["rgb"] = colors
         mesh.point_data.active_normals = vertex_normals(points, scene.faces)
-        actor = plotter.add_mesh(
-            mesh,
-            scalars="rgb",
-            rgb=True,
-            smooth_shading=True,
-            ambient=0.25,
-            diffuse=0.85,
-            specular=0.08,
-            specular_power=12,
-            reset_camera=False,
-        )
+        actor = plotter.add_mesh(mesh, scalars="rgb", rgb=True, smooth_shading=True, reset_camera=False, **SURFACE)
         camera.clipping_range = (0.5 * depth, 3.5 * depth)
         images.append(plotter.screenshot(None, return_img=True))
         plotter.remove_actor(actor, reset_camera=False)
@@ -106,18 +97,11 @@ def _draw_matplotlib(scene: Scene) -> ByteArray:
         order = np.argsort(middle[:, 2], kind="stable")
         figure = Figure(figsize=(width * over / 100, height * over / 100), dpi=100)
         canvas = FigureCanvasAgg(figure)
-        axes = figure.add_axes((0, 0, 1, 1))
+        x, y = scene.half_size
+        axes = figure.add_axes((0, 0, 1, 1), xlim=(-x, x), ylim=(-y, y))
         axes.set_axis_off()
-        axes.set_xlim(-scene.half_size[0], scene.half_size[0])
-        axes.set_ylim(-scene.half_size[1], scene.half_size[1])
-        axes.add_collection(
-            PolyCollection(
-                list(corners[order, :, :2]),
-                facecolors=np.clip(face_colors[order], 0, 1),
-                linewidths=0,
-                antialiaseds=False,
-            )
-        )
+        polygons, paint = list(corners[order, :, :2]), np.clip(face_colors[order], 0, 1)
+        axes.add_collection(PolyCollection(polygons, facecolors=paint, linewidths=0, antialiaseds=False))
         canvas.draw()
         pixels = np.asarray(canvas.buffer_rgba())[..., :3].astype(np.float64)
         images.append(pixels.reshape(height, over, width, over, 3).mean(axis=(1, 3)).round().astype(np.uint8))

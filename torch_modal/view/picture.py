@@ -228,10 +228,7 @@ def render_sequence(
     paint[:] = np.array([KEYFRAME_COLOR if n in keyframes else BETWEEN_COLOR for n in chosen])[:, None]
     color_bar = None
     if colors:
-        mappable, painted = _colored(colors, rows, shapes[0].shape[:2], chosen)
-        for r, rgb in painted.items():
-            paint[r] = rgb
-        color_bar = (mappable, color_label)
+        color_bar = _paint(paint, colors, rows, shapes[0].shape[:2], chosen), color_label
     scene = Scene(
         points.reshape(-1, *shown.shape[2:]),
         (paint * 255).round().astype(np.uint8).reshape(-1, *shown.shape[2:]),
@@ -245,10 +242,10 @@ def render_sequence(
     return path
 
 
-def _colored(
-    colors: Mapping[str, Array], rows: list[str], size: tuple[int, ...], chosen: list[int]
-) -> tuple[Any, dict[int, FloatArray]]:
-    """The colour scale, shared by all rows, and for each coloured row its RGB ``(C, V, 3)`` in [0, 1]."""
+def _paint(
+    paint: FloatArray, colors: Mapping[str, Array], rows: list[str], size: tuple[int, ...], chosen: list[int]
+) -> Any:
+    """Paint the rows with colours, RGB in [0, 1]; the colour scale, which they share. *Shape:* ``(R, C, V, 3)``."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import LinearSegmentedColormap, Normalize
 
@@ -264,9 +261,9 @@ def _colored(
         values[rows.index(row)] = array[chosen].astype(np.float64)
     everything = np.concatenate([v.reshape(-1) for v in values.values()])
     low, high = everything.min(), np.percentile(everything, 99.5)  # a few extreme vertices must not hide the rest
-    mappable = ScalarMappable(
-        Normalize(low, high if high > low else low + 1.0),
-        LinearSegmentedColormap.from_list("error", ERROR_COLORS),
-    )
+    norm = Normalize(low, high if high > low else low + 1.0)
+    mappable = ScalarMappable(norm, LinearSegmentedColormap.from_list("error", ERROR_COLORS))
     mappable.set_array(everything)
-    return mappable, {r: mappable.to_rgba(v)[..., :3] for r, v in values.items()}
+    for r, v in values.items():
+        paint[r] = mappable.to_rgba(v)[..., :3]
+    return mappable
