@@ -1,7 +1,5 @@
 """A sequence as numbered meshes."""
 
-from __future__ import annotations
-
 from itertools import chain
 from os.path import realpath
 from pathlib import Path
@@ -92,10 +90,11 @@ def _write(shapes: FloatArray, faces: IntArray, paths: list[Path], asset: Asset 
     for path in paths:
         refuse_existing(path, overwrite)
     beside: list[tuple[Path, bytes]] = []
+    fmt, own = MESH_FORMATS[suffix], asset is not None and asset.suffix == suffix
     if asset is not None:
         asset.check(shapes)
-    if asset is not None and asset.suffix == suffix:
-        asset.warn_lost(paths[0].name, asset.keeps)
+        asset.warn_lost(paths[0].name, asset.keeps if own else fmt.holds)
+    if asset is not None and own:
         companions = {folder / name: data for name, data in asset.companions.items()}
         if taken := companions.keys() & paths:
             raise ValueError(f"{taken.pop()} is the name of a texture or library of {asset.path.name}; take another")
@@ -105,8 +104,5 @@ def _write(shapes: FloatArray, faces: IntArray, paths: list[Path], asset: Asset 
             refuse_existing(path, overwrite)
         files = ((path, asset.with_positions(x)) for path, x in zip(paths, shapes, strict=True))
     else:
-        fmt = MESH_FORMATS[suffix]
-        if asset is not None:
-            asset.warn_lost(paths[0].name, fmt.holds)
         files = ((path, fmt.write(x, faces, asset)) for path, x in zip(paths, shapes, strict=True))
     write_files(chain(beside, files))
