@@ -1,7 +1,5 @@
 """A sequence as positions over time: point caches (MDD, PC2, NPZ), for a mesh that is already there, and USD."""
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Mesh files with all their content besides positions."""
 
-from __future__ import annotations
-
 import io
 import warnings
 from abc import ABC, abstractmethod
@@ -92,6 +90,11 @@ class Asset(ABC):
     def __init__(self, path: Path) -> None:
         self.path = path
         self.carries = {}
+
+    def _note(self, feature: str, name: str, there: object) -> None:
+        """Add to what the file carries, if it is there."""
+        if there:
+            self.carries[feature] = name
 
     @abstractmethod
     def with_positions(self, positions: FloatArray) -> bytes:

@@ -1,7 +1,5 @@
 """A sequence, or one shape, as GLB."""
 
-from __future__ import annotations
-
 import warnings
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """GLB and GLTF files: their own nodes, materials and textures around other positions."""
 
-from __future__ import annotations
-
 import copy
 from pathlib import Path
 from typing import NamedTuple
@@ -92,15 +90,11 @@ class GltfAsset(Asset):
                 self._primitives.append(_Primitive(node, primitive, points, triangles))
         self.positions, self.faces = np.concatenate(positions), np.concatenate(faces)
         names = {name for primitive in self._primitives for name in primitive.json["attributes"]}
-        for feature, said, there in (
-            ("texcoords", "texture coordinates", "TEXCOORD_0" in names),
-            ("normals", "normals", "NORMAL" in names),
-            ("colors", "vertex colours", "COLOR_0" in names),
-            ("materials", "materials", bool(self.document.get("materials"))),
-            ("posing", " and ".join(name for name, there in posing.items() if there), any(posing.values())),
-        ):
-            if there:
-                self.carries[feature] = said
+        self._note("texcoords", "texture coordinates", "TEXCOORD_0" in names)
+        self._note("normals", "normals", "NORMAL" in names)
+        self._note("colors", "vertex colours", "COLOR_0" in names)
+        self._note("materials", "materials", self.document.get("materials"))
+        self._note("posing", " and ".join(name for name, there in posing.items() if there), any(posing.values()))
 
     def morphs(self) -> FloatArray:
         """The file's shape, and that of each morph target at weight 1. *Shape:* ``(N, V, 3)``.
@@ -135,10 +129,8 @@ class GltfAsset(Asset):
         local[..., :3, :3], local[..., :3, 3], local[..., 3, 3] = turns, translations, 1
         frames = np.empty((local.shape[1], *self.positions.shape))
         for primitive in self._primitives:
-            skin, read = (
-                document.get("skins", document.get("nodes", primitive.node)["skin"]),
-                primitive.json["attributes"],
-            )
+            skin = document.get("skins", document.get("nodes", primitive.node)["skin"])
+            read = primitive.json["attributes"]
             inverse = document.floats(skin["inverseBindMatrices"]).reshape(-1, 1, 4, 4).swapaxes(2, 3)
             bones = (local[0] @ local[1:] @ inverse)[:, :, :3].swapaxes(0, 1)
             joints, weights = document.accessor(read["JOINTS_0"]), document.floats(read["WEIGHTS_0"])

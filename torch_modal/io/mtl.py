@@ -1,7 +1,5 @@
 """Material libraries of OBJ files (MTL) and the textures that they name."""
 
-from __future__ import annotations
-
 import math
 import os
 import posixpath

@@ -79,18 +79,12 @@ class ObjAsset(Asset):
         self._triangles = self._starts[fan][:, None] + np.stack([0 * second, second, second + 1], axis=1)
         self._material_of = np.array(material_of, dtype=np.int64)[fan]
         self.faces = self._corners[self._triangles, 0]
-        if (self._sizes > 3).any():
-            self.carries["polygons"] = "quads" if (self._sizes <= 4).all() else "polygons"
-        if (self._corners[:, 1] >= 0).any():
-            self.carries["texcoords"] = "texture coordinates"
-        if (self._corners[:, 2] >= 0).any():
-            self.carries["normals"] = "normals"
-        if self._colors is not None:
-            self.carries["colors"] = "vertex colours"
-        if self._materials:
-            self.carries["materials"] = f"{len(self._materials)} material{'s' * (len(self._materials) > 1)}"
-        if len(groups) > 1:
-            self.carries["groups"] = "groups"
+        self._note("polygons", "quads" if (self._sizes <= 4).all() else "polygons", (self._sizes > 3).any())
+        self._note("texcoords", "texture coordinates", (self._corners[:, 1] >= 0).any())
+        self._note("normals", "normals", (self._corners[:, 2] >= 0).any())
+        self._note("colors", "vertex colours", self._colors is not None)
+        self._note("materials", f"{len(materials)} material{'s' * (len(materials) > 1)}", materials)
+        self._note("groups", "groups", len(groups) > 1)
 
     # ------------------------------------------------------------------------------------------------ the file again
     def with_positions(self, positions: FloatArray) -> bytes:

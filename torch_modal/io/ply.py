@@ -126,21 +126,16 @@ class PlyAsset(Asset):
         self.positions, self.faces = read_triangles(path, self._file.n_vertices, n_faces)
         names = self._file.properties.keys()
         self._uv_names = next((pair for pair in _UV_NAMES if names >= set(pair)), None)
-        if len(self.faces) > n_faces:
-            self.carries["polygons"] = "polygons"
-        if names >= {*_NORMALS}:
-            self.carries["normals"] = "normals"
-        if names >= {*_COLORS}:
-            self.carries["colors"] = "vertex colours"
-        if self._uv_names is not None:
-            self.carries["texcoords"] = "texture coordinates"
-        if self._file.textures:
-            self.carries["materials"] = "texture"
+        self._note("polygons", "polygons", len(self.faces) > n_faces)
+        self._note("normals", "normals", names >= {*_NORMALS})
+        self._note("colors", "vertex colours", names >= {*_COLORS})
+        self._note("texcoords", "texture coordinates", self._uv_names)
+        self._note("materials", "texture", self._file.textures)
         of_vertices = names - {"x", "y", "z", *_NORMALS, *_COLORS, "alpha", *(self._uv_names or ())}
         of_faces = face_properties.keys() - {"vertex_indices", "vertex_index"}
         others = [name for name in self._file.elements if name not in ("vertex", "face")]
-        if further := [*sorted(of_vertices | of_faces), *others]:
-            self.carries["properties"] = "properties " + ", ".join(further)
+        further = [*sorted(of_vertices | of_faces), *others]
+        self._note("properties", "properties " + ", ".join(further), further)
 
     @cached_property
     def _carried(self) -> CarriedNormals:
@@ -191,10 +186,8 @@ class OffAsset(Asset):
         counts, *rows = [line.split() for line in content.splitlines() if line.strip()]
         n_vertices, n_faces = map(int, counts[:2])
         self.positions, self.faces = read_triangles(path, n_vertices, n_faces)
-        if rows and len(rows[0]) > 3:
-            self.carries["properties"] = "further numbers of vertices"
-        if len(self.faces) > n_faces:
-            self.carries["polygons"] = "polygons"
+        self._note("properties", "further numbers of vertices", rows and len(rows[0]) > 3)
+        self._note("polygons", "polygons", len(self.faces) > n_faces)
 
     def with_positions(self, positions: FloatArray) -> bytes:
         """The mesh with other positions."""

@@ -1,7 +1,5 @@
 """Checks of arrays and paths that all writers share."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any

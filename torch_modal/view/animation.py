@@ -1,7 +1,5 @@
 """A sequence as one file that plays; its suffix chooses the format. Those that are drawn, MP4 and GIF, stand here."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Sequence
 from dataclasses import replace
