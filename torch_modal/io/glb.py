@@ -27,12 +27,9 @@ def glb_bytes(vertices: FloatArray, faces: IntArray, asset: Asset | None) -> byt
 
 
 def write_glb(animation: Animation, path: Path) -> None:
-    """Frame 0, a morph target for each further frame, and an animation of their weights.
+    """Frame 0, a morph target for each further frame, and an animation of their weights; a skin; or principal shapes.
 
-    Key-frames are kept when frames are left out, and named in the animation's extras. Materials, textures and texture
-    coordinates come from the asset; from a GLB or GLTF file also its nodes and everything else.
-
-    A skin, or the mean and principal shapes, replace the morph targets where the animation has them.
+    A GLB or GLTF file gives its nodes and everything else, too.
     """
     shapes, asset, timing, keyframes = animation.shapes, animation.asset, animation.timing, animation.keyframes
     name, max_targets = animation.name, animation.max_targets
@@ -46,11 +43,12 @@ def write_glb(animation: Animation, path: Path) -> None:
             "players interpolate linearly between them.",
             stacklevel=3,
         )
-    drawn, weights = shapes[kept], None
     if skin is not None:
-        drawn = skin.rest[None].double().cpu().numpy()
+        drawn, weights = skin.rest[None].double().cpu().numpy(), np.empty((len(kept), 0))
     elif n_targets:
         drawn, weights = _principal(shapes, n_targets)
+    else:
+        drawn, weights = shapes[kept], np.eye(len(kept))[:, 1:]  # frame n is the target n - 1 alone
     move_normals = drawn.size * 4 <= LARGEST_FILE_WITH_NORMALS
     if not move_normals:
         warnings.warn(f"{name} is large: its normals stay those of frame 0.", stacklevel=3)
@@ -70,19 +68,15 @@ def write_glb(animation: Animation, path: Path) -> None:
         if skin is not None:
             samplers, channels = _add_skin(document, skin, asset, inputs, shown)
         else:
-            # Frame n is the target n - 1 alone: rows of the unit matrix, without its first column.
-            rows = np.arange(1, len(drawn)) == shown[:, None] if weights is None else weights[shown]
+            rows = weights[shown]
             outputs = document.add(rows.astype(np.float32).reshape(-1), "SCALAR")
             samplers = [{"input": inputs, "output": outputs, "interpolation": "LINEAR"}]
             names = [f"principal-{n}" if n_targets else f"frame-{kept[n]:03d}" for n in range(1, len(drawn))]
             for mesh in document.get("meshes"):
-                mesh["weights"] = rows[0].astype(float).tolist()
+                mesh["weights"] = rows[0].tolist()
                 mesh["extras"] = {**mesh.get("extras", {}), "targetNames": names}
-            channels = [
-                {"sampler": 0, "target": {"node": number, "path": "weights"}}
-                for number, node in enumerate(document.get("nodes"))
-                if "mesh" in node
-            ]
+            nodes = [number for number, node in enumerate(document.get("nodes")) if "mesh" in node]
+            channels = [{"sampler": 0, "target": {"node": number, "path": "weights"}} for number in nodes]
         played = {"name": "sequence", "samplers": samplers, "channels": channels, "extras": extras}
         document.append("animations", played)
     path.write_bytes(document.to_glb())
@@ -193,19 +187,15 @@ def _document(
         index_type = np.uint16 if len(part.vertices) <= 65535 else np.uint32  # 65535 itself is no valid uint16 index
         if part.material not in materials:
             materials[part.material] = document.append("materials", _material(document, part.material))
-        attributes, *targets = document.add_frames(
-            shapes[:, part.vertices], smooth[:, part.vertices] if normals is None else normals
-        )
-        if part.texcoords is not None:
-            attributes["TEXCOORD_0"] = document.add(part.texcoords.astype(np.float32), "VEC2", ARRAY_BUFFER)
-        if part.colors is not None:
-            attributes["COLOR_0"] = document.add(part.colors.astype(np.float32), "VEC4", ARRAY_BUFFER)
-        primitive: Json = {
-            "attributes": attributes,
-            "indices": document.add(part.triangles.astype(index_type).reshape(-1), "SCALAR", ELEMENT_ARRAY_BUFFER),
-            "material": materials[part.material],
-        }
-        primitives.append(primitive | ({"targets": targets} if targets else {}))
+        normals = smooth[:, part.vertices] if normals is None else normals
+        primitive = document.add_frames(shapes[:, part.vertices], normals)
+        for key, kind, numbers in (("TEXCOORD_0", "VEC2", part.texcoords), ("COLOR_0", "VEC4", part.colors)):
+            if numbers is not None:
+                primitive["attributes"][key] = document.add(numbers.astype(np.float32), kind, ARRAY_BUFFER)
+        corners = part.triangles.astype(index_type).reshape(-1)
+        primitive["indices"] = document.add(corners, "SCALAR", ELEMENT_ARRAY_BUFFER)
+        primitive["material"] = materials[part.material]
+        primitives.append(primitive)
     document.append("meshes", {"name": name, "primitives": primitives})
     document.append("nodes", {"name": name, "mesh": 0})
     document.append("scenes", {"name": "scene", "nodes": [0]})
@@ -214,11 +204,8 @@ def _document(
 
 
 def _material(document: Document, material: Material) -> Json:
-    surface: Json = {
-        "baseColorFactor": list(material.color),
-        "metallicFactor": material.metallic,
-        "roughnessFactor": material.roughness,
-    }
+    surface: Json = {"metallicFactor": material.metallic, "roughnessFactor": material.roughness}
+    surface["baseColorFactor"] = list(material.color)
     if material.texture is not None:
         image = document.append("images", document.add_image(material.texture))
         if not document.get("samplers"):

@@ -29,8 +29,9 @@ Json = dict[str, Any]
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963
-WHITE = base64.b64decode("iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAAAAAA6fptVAAAACklEQVR42mP4DwABAQEAHLCMmQAAAABJRU5ErkJggg==")
-"""A PNG file of one pixel."""
+WHITE = base64.b64decode(
+    "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAAAAAA6fptVAAAACklEQVR42mP4DwABAQEAHLCMmQAAAABJRU5ErkJggg=="
+)  # a PNG of one pixel
 
 
 class Document:
@@ -48,10 +49,10 @@ class Document:
     @classmethod
     def read(cls, path: Path) -> Document:
         """Read a GLB or GLTF file; raises ValueError if it is none, or of another version."""
-        data = path.read_bytes()
-        binary = b""
+        text = data = path.read_bytes()
+        binary, place = b"", 12
         if data[:4] == b"glTF":
-            text, place = b"", 12
+            text = b""
             while place + 8 <= len(data):
                 length, kind = struct.unpack_from("<I4s", data, place)
                 chunk = data[place + 8 : place + 8 + length]
@@ -62,8 +63,6 @@ class Document:
                 elif kind == b"BIN\0" and not binary:
                     binary = chunk
                 place += 8 + length
-        else:
-            text = data
         root = json.loads(text.decode("utf-8"))
         json.dumps(root, allow_nan=False)  # raises for NaN and infinite numbers, which Python reads
         if not isinstance(root, dict) or not str(root.get("asset", {}).get("version", "")).startswith("2"):
@@ -162,12 +161,7 @@ class Document:
         return {"bufferView": self.add_bytes(data), "mimeType": mime}
 
     def add(
-        self,
-        array: NDArray[Any],
-        kind: str,
-        target: int | None = None,
-        bounds: bool = False,
-        normalized: bool = False,
+        self, array: NDArray[Any], kind: str, target: int | None = None, bounds: bool = False, normalized: bool = False
     ) -> int:
         """Add numbers ``(count,)`` or ``(count, width)`` as an accessor with a view of its own; its number.
 
@@ -175,13 +169,11 @@ class Document:
         """
         rows = np.ascontiguousarray(array).reshape(len(array), -1)
         size = rows.dtype.itemsize * rows.shape[1]
-        if target == ARRAY_BUFFER and size % 4:  # each vertex starts at a multiple of four bytes
-            stored = np.zeros((len(rows), size + -size % 4), "u1")
-            stored[:, :size] = rows.view("u1").reshape(len(rows), size)
-            view = self.add_bytes(stored.tobytes(), target)
-            self.root["bufferViews"][view]["byteStride"] = stored.shape[1]
-        else:
-            view = self.add_bytes(rows.tobytes(), target)
+        gap = -size % 4 if target == ARRAY_BUFFER else 0  # each vertex starts at a multiple of four bytes
+        stored = np.pad(rows.view("u1"), ((0, 0), (0, gap))) if gap else rows
+        view = self.add_bytes(stored.tobytes(), target)
+        if gap:
+            self.root["bufferViews"][view]["byteStride"] = size + gap
         code = next(code for code, name in COMPONENTS.items() if np.dtype(name) == rows.dtype)
         accessor: Json = {"bufferView": view, "componentType": code, "count": len(rows), "type": kind}
         if normalized:
@@ -190,8 +182,8 @@ class Document:
             accessor |= {"min": rows.min(axis=0).tolist(), "max": rows.max(axis=0).tolist()}
         return self.append("accessors", accessor)
 
-    def add_frames(self, shapes: FloatArray, normals: FloatArray | None) -> list[Json]:
-        """Add the points of a primitive; its attributes in frame 0, and a morph target for each further frame.
+    def add_frames(self, shapes: FloatArray, normals: FloatArray | None) -> Json:
+        """Add the points of a primitive: its attributes in frame 0, and a morph target for each further frame.
 
         Normals may be those of frame 0 alone. *Shape:* ``(N, P, 3)``, and ``(N, P, 3)`` or ``(1, P, 3)``.
         """
@@ -199,7 +191,7 @@ class Document:
         if normals is not None:
             for attributes, x in zip(added, _differences(_unit(normals)), strict=False):
                 attributes["NORMAL"] = self.add(x, "VEC3", ARRAY_BUFFER)
-        return added
+        return {"attributes": added[0], **({"targets": added[1:]} if added[1:] else {})}
 
     def add_influences(self, weights: FloatArray) -> Json:
         """Add the largest four weights of bones at points, as attributes. *Shape:* ``(P, J)``."""
@@ -217,10 +209,8 @@ class Document:
         text = json.dumps(self.root, separators=(",", ":"), ensure_ascii=False, allow_nan=False).encode("utf-8")
         text += b" " * (-len(text) % 4)
         binary = bytes(data) + bytes(-len(data) % 4)
-        head = struct.pack("<4sII", b"glTF", 2, 28 + len(text) + len(binary))
-        return b"".join(
-            [head, struct.pack("<I4s", len(text), b"JSON"), text, struct.pack("<I4s", len(binary), b"BIN\0"), binary]
-        )
+        head = struct.pack("<4sIII4s", b"glTF", 2, 28 + len(text) + len(binary), len(text), b"JSON")
+        return b"".join([head, text, struct.pack("<I4s", len(binary), b"BIN\0"), binary])
 
 
 def world_transforms(document: Document) -> dict[int, FloatArray]:

@@ -97,11 +97,7 @@ class GltfAsset(Asset):
         self._note("posing", " and ".join(name for name, there in posing.items() if there), any(posing.values()))
 
     def morphs(self) -> FloatArray:
-        """The file's shape, and that of each morph target at weight 1. *Shape:* ``(N, V, 3)``.
-
-        Raises:
-            ValueError: Its meshes do not have the same number of targets.
-        """
+        """The file's shape, and that of each morph target at weight 1. *Shape:* ``(N, V, 3)``."""
         counts = {len(primitive.json.get("targets", [])) for primitive in self._primitives}
         if len(counts) > 1:
             raise ValueError(f"meshes of {sorted(counts)} morph targets")
@@ -122,11 +118,10 @@ class GltfAsset(Asset):
         if not document.get("skins"):
             first, *others = self.morphs()
             return first + np.tensordot(tracks[0].reshape(-1, len(others)), np.array(others) - first, 1)
-        # Rotations of the root and the joints, then their translations.
-        rotations, translations = np.split(np.array([track[:, :3] for track in tracks]), 2)
-        turns = [Rotation.from_quat(track).as_matrix() for track in tracks[: len(rotations)]]
-        local = np.zeros((*rotations.shape[:2], 4, 4))
-        local[..., :3, :3], local[..., :3, 3], local[..., 3, 3] = turns, translations, 1
+        half = len(tracks) // 2  # rotations of the root and the joints, then their translations
+        local = np.tile(np.eye(4), (half, len(tracks[0]), 1, 1))
+        local[..., :3, :3] = [Rotation.from_quat(track).as_matrix() for track in tracks[:half]]
+        local[..., :3, 3] = tracks[half:]
         frames = np.empty((local.shape[1], *self.positions.shape))
         for primitive in self._primitives:
             skin = document.get("skins", document.get("nodes", primitive.node)["skin"])
@@ -158,9 +153,7 @@ class GltfAsset(Asset):
             image.pop("uri", None)
             data = old.image(number)
             added = document.add_image(data)
-            if data is WHITE or "mimeType" not in image:
-                image["mimeType"] = added["mimeType"]
-            image["bufferView"] = added["bufferView"]
+            image |= added if data is WHITE or "mimeType" not in image else {"bufferView": added["bufferView"]}
         for node_json in document.get("nodes"):
             for key in ("mesh", "skin", "weights"):
                 node_json.pop(key, None)
@@ -181,9 +174,8 @@ class GltfAsset(Asset):
             if not own:
                 continue
             # Each node gets a mesh of its own: the same mesh may be shown, and deformed, at several places.
-            mesh = copy.deepcopy(old.get("meshes", old.get("nodes", node)["mesh"]))
+            mesh = copy.deepcopy({**old.get("meshes", old.get("nodes", node)["mesh"]), "primitives": []})
             mesh.pop("weights", None)
-            mesh["primitives"] = []
             inverse = self._inverse(node)
             given, shapes = [], []
             for primitive in own:
@@ -192,23 +184,19 @@ class GltfAsset(Asset):
                 given.append((normals, old.floats(primitive.json["attributes"]["POSITION"]), primitive.triangles))
                 shapes.append(frames[:, primitive.points] @ inverse[:3, :3].T + inverse[:3, 3])
             turned = carry_together(given, shapes if move_normals else [x[:1] for x in shapes])
-            placed: dict[tuple[int, int | None], list[Json]] = {}
+            placed: dict[tuple[int, int | None], Json] = {}
             for primitive, shape, normals in zip(own, shapes, turned, strict=True):
                 attributes = primitive.json["attributes"]
                 points = attributes["POSITION"], attributes.get("NORMAL")
                 if points not in placed:
                     placed[points] = document.add_frames(shape, normals)
-                first, *targets = placed[points]
-                copied: Json = {"attributes": dict(first)}
-                for key in {"material", "mode", "extras"} & primitive.json.keys():
-                    copied[key] = copy.deepcopy(primitive.json[key])
+                kept = {key: primitive.json[key] for key in ("material", "mode", "extras") if key in primitive.json}
+                copied = copy.deepcopy(kept | placed[points])
                 for name, accessor in attributes.items():
                     if name not in ("POSITION", "NORMAL", "TANGENT") and not name.startswith(("JOINTS_", "WEIGHTS_")):
                         copied["attributes"][name] = take(accessor, ARRAY_BUFFER)
                 if "indices" in primitive.json:
                     copied["indices"] = take(primitive.json["indices"], ELEMENT_ARRAY_BUFFER)
-                if targets:
-                    copied["targets"] = targets
                 mesh["primitives"].append(copied)
             document.get("nodes", node)["mesh"] = document.append("meshes", mesh)
         return document
