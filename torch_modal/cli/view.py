@@ -101,7 +101,7 @@ def _sequences(given: list[list[Path]], args: argparse.Namespace) -> tuple[Page,
     names, shapes, n = [_name(paths) for paths in given], [first], len(first)
     for paths in given[1:]:
         frames, other_faces, _ = read_shapes(paths)
-        require_same_mesh(given[0][0], first[0], faces, paths[0], frames[0], other_faces)
+        require_same_mesh(given[0][0], (first[0], faces), paths[0], (frames[0], other_faces))
         if len(frames) != n:
             raise ValueError(
                 f"{paths[0]} has {len(frames)} shapes, {given[0][0]} has {n}; sequences are compared shape by shape, "

@@ -20,6 +20,7 @@ READERS: dict[str, type[Asset]] = {
     ".gltf": GltfAsset,
 }
 SUFFIXES = tuple(READERS)
+Mesh = tuple[FloatArray, IntArray]  # vertices and faces
 
 
 def open_asset(path: str | os.PathLike[str]) -> Asset:
@@ -72,16 +73,12 @@ def open_asset(path: str | os.PathLike[str]) -> Asset:
 
 
 def require_same_mesh(
-    first: str | os.PathLike[str],
-    vertices: FloatArray,
-    faces: IntArray,
-    other: str | os.PathLike[str],
-    other_vertices: FloatArray,
-    other_faces: IntArray,
+    first: str | os.PathLike[str], mesh: Mesh, other: str | os.PathLike[str], other_mesh: Mesh
 ) -> None:
     """Raise unless the vertices and faces of a file match those of the first."""
     hint = "all key-frames need the same vertices and faces, in the same vertex order"
-    for what, mine, its in (("vertices", vertices, other_vertices), ("faces", faces, other_faces)):
+    (_, faces), (_, other_faces) = mesh, other_mesh
+    for what, mine, its in zip(("vertices", "faces"), mesh, other_mesh, strict=True):
         if len(mine) != len(its):
             raise MeshError(f"{other} has {len(its)} {what}, {first} has {len(mine)}; {hint}")
     if np.array_equal(faces, other_faces):

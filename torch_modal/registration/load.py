@@ -84,7 +84,7 @@ def load_keyframes(
     shapes = [vertices]
     for k, (there, there_faces) in enumerate(meshes[1:], 1):
         try:
-            require_same_mesh(paths[0], vertices, faces, paths[k], there, there_faces)
+            require_same_mesh(paths[0], meshes[0], paths[k], (there, there_faces))
         except MeshError:
             if not register:
                 raise
