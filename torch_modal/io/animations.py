@@ -68,8 +68,7 @@ def write_usd(animation: Animation, path: Path) -> None:
         extent.Set(Vt.Vec3fArray.FromNumpy(bounds), at)
     primvars = UsdGeom.PrimvarsAPI(mesh)
     if texcoords is not None:
-        kind = Sdf.ValueTypeNames.TexCoord2fArray
-        st = primvars.CreatePrimvar("st", kind, UsdGeom.Tokens.faceVarying)
+        st = primvars.CreatePrimvar("st", Sdf.ValueTypeNames.TexCoord2fArray, UsdGeom.Tokens.faceVarying)
         st.Set(Vt.Vec2fArray.FromNumpy(texcoords.astype(np.float32)))
     colors = None
     if asset is not None and "colors" in asset.carries:

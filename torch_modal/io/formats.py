@@ -101,13 +101,11 @@ class Timing:
             name = "ping_pong" if ping_pong else "ease"
             raise ValueError(f"{name} is for sequences that begin and end; a cyclic one does neither.")
         steps = max(n_frames if cyclic else n_frames - 1, 1)
-        if duration is None:
-            if fps is not None:
-                duration = steps / fps
-            elif cyclic:
-                duration = SECONDS_OF_A_CYCLE
-            else:
-                duration = max(SECONDS_OF_A_PAIR, SECONDS_OF_AN_INTERVAL * (n_keyframes - 1))
+        if duration is None and fps is not None:
+            duration = steps / fps
+        elif duration is None:
+            of_keyframes = max(SECONDS_OF_A_PAIR, SECONDS_OF_AN_INTERVAL * (n_keyframes - 1))
+            duration = SECONDS_OF_A_CYCLE if cyclic else of_keyframes
         #: Time of each frame over the duration, from 0 on. *Shape:* ``(N,)``.
         self.parts = np.arange(n_frames) / steps
         if times is not None:

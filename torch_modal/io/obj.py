@@ -159,16 +159,10 @@ class ObjAsset(Asset):
                 material = Material(name) if name else Material()
                 if colors is not None:
                     material = material._replace(color=(1.0, 1.0, 1.0, 1.0))
-            found.append(
-                Part(
-                    vertices,
-                    triangles.reshape(-1, 3),
-                    material,
-                    self._texcoords[texcoords] * [1, -1] + [0, 1] if (texcoords >= 0).all() else None,
-                    colors[vertices] if colors is not None else None,
-                    self._normals[normals] if (normals >= 0).all() else None,
-                )
-            )
+            uv = self._texcoords[texcoords] * [1, -1] + [0, 1] if (texcoords >= 0).all() else None
+            rgba = None if colors is None else colors[vertices]
+            given = self._normals[normals] if (normals >= 0).all() else None
+            found.append(Part(vertices, triangles.reshape(-1, 3), material, uv, rgba, given))
         return found
 
 

@@ -22,11 +22,8 @@ from torch_modal.view.picture import BETWEEN_COLOR, centred, view_rotation
 
 logger = logging.getLogger("torch_modal")
 
-PIXELS = 640
-"""The longer side of a picture of a video."""
-
-PICTURES_AT_ONCE = 24
-"""Drawn by one process of the renderer."""
+PIXELS = 640  # the longer side of a picture of a video
+PICTURES_AT_ONCE = 24  # drawn by one process of the renderer
 
 
 def require_packages(path: Path) -> None:
@@ -124,24 +121,14 @@ def save_animation(
         keyframes = [number for number in keyframes if number < len(shapes)]
     if times is None and isinstance(bones, Skin) and bones.times is not None:
         times = bones.times.tolist()
-    timing = Timing(
-        len(shapes),
-        max(2, len(keyframes)),
-        duration=duration,
-        fps=fps,
-        cyclic=cyclic and len(shapes) > 1,
-        ping_pong=ping_pong,
-        ease=ease,
-        times=times,
-    )
+    repeats = {"cyclic": cyclic and len(shapes) > 1, "ping_pong": ping_pong, "ease": ease}
+    timing = Timing(len(shapes), len(keyframes), duration=duration, fps=fps, times=times, **repeats)
     skin = bones if bones is None or isinstance(bones, Skin) else bake(shapes, triangles, bones)
-    if skin is not None and (
-        skin.rest.shape != shapes.shape[1:] or not 0 <= len(skin.transforms) - len(shapes) <= cyclic
-    ):
-        raise ValueError(
-            f"bones is a skin of {len(skin.transforms)} other frames than these {len(shapes)}; bake these."
-        )
-    skin = skin and replace(skin, transforms=skin.transforms[: len(shapes)])
+    if skin is not None:
+        n = len(skin.transforms)
+        if skin.rest.shape != shapes.shape[1:] or not 0 <= n - len(shapes) <= cyclic:
+            raise ValueError(f"bones is a skin of {n} other frames than these {len(shapes)}; bake these.")
+        skin = replace(skin, transforms=skin.transforms[: len(shapes)])
     path.parent.mkdir(parents=True, exist_ok=True)
     animation = Animation(shapes, triangles, timing, path.name, keyframes, asset, max_targets, progress, skin, targets)
     with temporary_beside(path, suffix) as temporary:

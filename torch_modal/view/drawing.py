@@ -142,15 +142,9 @@ def _draw_in_child(scene: Scene) -> ByteArray:
 
 
 def draw(scene: Scene, renderer: str) -> ByteArray:
-    """Images of all shapes. *Shape:* ``(S, height, width, 3)``.
+    """Images of all shapes, by ``"pyvista"``, ``"matplotlib"``, or ``"auto"``. *Shape:* ``(S, height, width, 3)``.
 
-    Args:
-        scene: What to draw.
-        renderer: ``"pyvista"``, ``"matplotlib"``, or ``"auto"``: the first where it is installed, and the second where
-            it is not or fails.
-
-    Raises:
-        RuntimeError: ``renderer="pyvista"`` and pyvista cannot render here, or is not installed.
+    Automatic is pyvista, and matplotlib where that is not installed or fails.
     """
     if renderer == "matplotlib":
         return _draw_matplotlib(scene)

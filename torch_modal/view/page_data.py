@@ -27,10 +27,8 @@ from torch_modal.geometry.skin import STEPS
 from torch_modal.motion.skin import bake
 from torch_modal.view.picture import up_axis, view_rotation
 
-FOLLOWED = 1e-3
-"""Largest error of bones, over the diagonal."""
-LEVELS = 65_535
-"""Steps of the grid along the longest side."""
+FOLLOWED = 1e-3  # largest error of bones, over the diagonal
+LEVELS = 65_535  # steps of the grid along the longest side
 
 
 def pack_group(
@@ -49,8 +47,7 @@ def pack_group(
     origin = corners.min(0)
     step = float(np.ptp(corners, axis=0).max()) / LEVELS or 1.0
     numbers = {
-        name: np.clip(np.rint((frames - origin) / step), 0, LEVELS).astype(np.uint16)
-        for name, frames in sequences.items()
+        name: np.clip(np.rint((x - origin) / step), 0, LEVELS).astype(np.uint16) for name, x in sequences.items()
     }
     # The box around everything along right, up and front; the camera orbits its middle. A frame at a time saves memory.
     rotation = view_rotation(first, view, up)

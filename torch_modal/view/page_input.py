@@ -19,32 +19,20 @@ GENERATOR = "torch_modal"
 
 
 def read_shapes(paths: Sequence[str | os.PathLike[str]]) -> tuple[FloatArray, IntArray, dict[str, Any]]:
-    """Read a sequence of shapes.
+    """Read a sequence: shapes ``(N, V, 3)``, their faces ``(F, 3)``, and options of :func:`torch_modal.show`.
 
-    Args:
-        paths: Mesh files in their order; or one folder, of which the files of one kind are taken in the order of the
-            numbers in their names; or one GLB that :func:`torch_modal.save_animation` wrote, with all its frames.
-
-    Returns:
-        The shapes in the files' coordinates ``(N, V, 3)``, their faces ``(F, 3)``, and what the files say of them:
-        options of :func:`torch_modal.show`.
-
-    Raises:
-        FileNotFoundError: A file does not exist.
-        MeshError: A file cannot be read, or does not match the first; a folder holds no meshes, or of several kinds.
+    From mesh files in their order; or one folder, of which the files of one kind are taken in the order of the numbers
+    in their names; or one GLB that :func:`torch_modal.save_animation` wrote, with all its frames.
     """
     files = [Path(path) for path in paths]
     if len(files) == 1 and files[0].is_dir():
         folder, found = files[0], [path for path in files[0].iterdir() if path.is_file()]
-        files = sorted(
-            (path for path in found if path.suffix.lower() in FRAME_SUFFIXES), key=lambda path: natural(path.name)
-        )
+        meshes = [path for path in found if path.suffix.lower() in FRAME_SUFFIXES]
+        files = sorted(meshes, key=lambda path: natural(path.name))
         kinds = sorted({path.suffix.lower() for path in files})
         if len(kinds) != 1:
-            what = (
-                f"meshes of several kinds ({', '.join(kinds)})" if kinds else f"no meshes ({', '.join(FRAME_SUFFIXES)})"
-            )
-            raise MeshError(f"{folder}: {what} in this folder; name the files instead")
+            what, listed = ("meshes of several kinds", kinds) if kinds else ("no meshes", FRAME_SUFFIXES)
+            raise MeshError(f"{folder}: {what} ({', '.join(listed)}) in this folder; name the files instead")
     if len(files) == 1 and files[0].suffix.lower() == ".glb" and files[0].is_file():
         asset = open_asset(files[0])
         assert isinstance(asset, GltfAsset)

@@ -229,14 +229,10 @@ def render_sequence(
     color_bar = None
     if colors:
         color_bar = _paint(paint, colors, rows, shapes[0].shape[:2], chosen), color_label
-    scene = Scene(
-        points.reshape(-1, *shown.shape[2:]),
-        (paint * 255).round().astype(np.uint8).reshape(-1, *shown.shape[2:]),
-        triangles,
-        half,
-        np.maximum((CELL_PIXELS * half / half.max()).round(), 1).astype(np.int64),
-    )
-    images = draw(scene, renderer)
+    pixels = np.maximum((CELL_PIXELS * half / half.max()).round(), 1).astype(np.int64)
+    each = (-1, *shown.shape[2:])
+    paint = (paint * 255).round().astype(np.uint8).reshape(each)
+    images = draw(Scene(points.reshape(each), paint, triangles, half, pixels), renderer)
     labels = [(title, "#b4581a" if n in keyframes else "#333333") for n, title in zip(chosen, titles, strict=True)]
     write_file(path, _sheet(images.reshape(*shown.shape[:2], *images.shape[1:]), rows, labels, color_bar, fmt))
     return path
