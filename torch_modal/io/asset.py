@@ -14,8 +14,7 @@ from torch_modal.errors import MeshWarning
 
 FEATURES = ("polygons", "texcoords", "normals", "colors", "materials", "groups", "properties", "posing")
 """Content of mesh files besides positions and triangles."""
-CLAY = (0.66, 0.52, 0.42, 1.0)
-"""Linear RGBA of surfaces without a colour."""
+CLAY = (0.66, 0.52, 0.42, 1.0)  # linear RGBA of surfaces without a colour
 
 
 def as_png_or_jpeg(data: bytes) -> bytes | None:
@@ -48,28 +47,21 @@ class Material(NamedTuple):
     """Appearance of a surface, in the terms of glTF."""
 
     name: str = "clay"
-    color: tuple[float, ...] = CLAY
-    """Linear RGBA; multiplies the texture and the vertex colours."""
+    color: tuple[float, ...] = CLAY  # linear RGBA; multiplies the texture and the vertex colours
     metallic: float = 0.0
     roughness: float = 0.85
-    texture: bytes | None = None
-    """A PNG or JPEG file."""
+    texture: bytes | None = None  # a PNG or JPEG file
 
 
 class Part(NamedTuple):
     """Triangles of one material. A point is a vertex with one texture coordinate and one normal."""
 
-    vertices: IntArray
-    """The vertex of each point. *Shape:* ``(P,)``."""
-    triangles: IntArray
-    """Indices of points. *Shape:* ``(F, 3)``."""
+    vertices: IntArray  # (P,) the vertex of each point
+    triangles: IntArray  # (F, 3) indices of points
     material: Material
-    texcoords: FloatArray | None = None
-    """Origin at the upper left, as in glTF. *Shape:* ``(P, 2)``."""
-    colors: FloatArray | None = None
-    """Linear RGBA. *Shape:* ``(P, 4)``."""
-    normals: FloatArray | None = None
-    """Those of the file. *Shape:* ``(P, 3)``."""
+    texcoords: FloatArray | None = None  # (P, 2) origin at the upper left, as in glTF
+    colors: FloatArray | None = None  # (P, 4) linear RGBA
+    normals: FloatArray | None = None  # (P, 3) those of the file
 
 
 class Asset(ABC):

@@ -23,15 +23,12 @@ from torch import Tensor
 from torch_modal.io.tensors import TensorFile, bytes_of, write_tensors
 from torch_modal.version import __version__
 
-CACHE_VERSION = 6
-"""Part of every key: raise it when the algorithm of cached results changes."""
+CACHE_VERSION = 6  # part of every key: raise it when the algorithm of cached results changes
 CACHE_VARIABLE = "TORCH_MODAL_CACHE"
 LIMIT_VARIABLE = "TORCH_MODAL_CACHE_LIMIT"
 DEFAULT_LIMIT = 4 * 2**30
-KEPT_PART = 0.9
-"""Share of the limit that is left after entries were removed, so that not each new entry removes others."""
-ABANDONED = 3600.0
-"""Seconds after which a partial file belongs to no running process."""
+KEPT_PART = 0.9  # of the limit is left after entries were removed, so that not each new entry removes others
+ABANDONED = 3600.0  # seconds after which a partial file belongs to no running process
 FORMAT = "torch_modal.cache"
 SUFFIX = ".safetensors"
 _OWN_NAME = re.compile(r"[a-z]+-[0-9a-f]{64}\.safetensors|\.[a-z]+-[0-9a-f]{64}\.safetensors\..+\.tmp")
@@ -55,11 +52,7 @@ def default_cache_dir() -> Path:
 
 
 def size_limit() -> int:
-    """The largest size of a cache folder in bytes: ``TORCH_MODAL_CACHE_LIMIT``, such as ``500M`` or ``4G``, or 4 GiB.
-
-    Raises:
-        ValueError: The variable is no size.
-    """
+    """Largest size of a cache folder in bytes: ``TORCH_MODAL_CACHE_LIMIT``, such as ``500M`` or ``4G``, or 4 GiB."""
     named = os.environ.get(LIMIT_VARIABLE)
     if not named:
         return DEFAULT_LIMIT
@@ -79,14 +72,10 @@ class Cache:
 
     Damaged or foreign entries are computed again and replaced. Several processes may share the folder: entries are
     moved into place whole. When they take more than the limit, the least recently used are removed.
-
-    Attributes:
-        folder: Of the entries; it is made when the first is written. None: nothing is cached.
-        limit: Largest size of all entries, in bytes. A single entry may be larger.
     """
 
-    folder: Path | None
-    limit: int = DEFAULT_LIMIT
+    folder: Path | None  # made when the first entry is written; with None nothing is cached
+    limit: int = DEFAULT_LIMIT  # bytes of all entries; a single one may be larger
 
     @classmethod
     def at(cls, cache_dir: str | os.PathLike[str] | None = None, *, enabled: bool = True) -> "Cache":
@@ -102,11 +91,7 @@ class Cache:
         parameters: Mapping[str, Any],
         compute: Callable[[], Mapping[str, NDArray[Any]]],
     ) -> Arrays:
-        """The cached result; computed and cached if there is none.
-
-        It depends on arrays, and on parameters that are numbers or strings. The kind is the first part of the file's
-        name. A :class:`CacheWarning` says that the folder cannot be written.
-        """
+        """The cached result of a kind, from arrays, and numbers or strings; computed and cached if there is none."""
         if self.folder is None:
             return dict(compute())
         path = self.folder / entry_name(kind, inputs, parameters)
@@ -170,13 +155,7 @@ def cache_content(cache_dir: str | os.PathLike[str] | None = None) -> CacheConte
 
 
 def clear_cache(cache_dir: str | os.PathLike[str] | None = None) -> CacheContent:
-    """Remove the entries of a cache folder, and partial files of killed processes; returns what was removed.
-
-    Other files stay, and other processes recompute what they miss.
-
-    Raises:
-        OSError: An entry cannot be removed.
-    """
+    """Remove the entries of a cache folder, and partial files of killed processes, not others; what was removed."""
     sizes = []
     for path, stat in _entries(cache_dir):
         with contextlib.suppress(FileNotFoundError):
@@ -200,11 +179,8 @@ def _entries(cache_dir: str | os.PathLike[str] | None) -> list[tuple[Path, os.st
 def content_digest(value: Any) -> str:
     """SHA-256 of all contents of a value, the same in every process.
 
-    Numbers count with their types and shapes, objects of this package with their classes and all their attributes.
-
-    Raises:
-        ContentError: Some of it is neither plain data nor an object of this package: results would depend on code that
-            has no digest.
+    Numbers count with their types and shapes, objects of this package with their classes and all their attributes. The
+    rest raises a :class:`ContentError`: results would depend on code that has no digest.
     """
     try:
         return _digest(value).hex()

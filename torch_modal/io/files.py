@@ -17,17 +17,10 @@ LARGEST_COMPANION = 2**30  # bytes
 
 @contextlib.contextmanager
 def temporary_beside(path: Path, ending: str = ".tmp") -> Iterator[Path]:
-    """A temporary name in the same folder; the file of that name is moved to ``path`` at the end.
+    """A temporary name in the same folder, which exists; the file of that name is moved to ``path`` at the end.
 
-    Readers, and other processes that write the same file, see the old content or the new one, never a part.
-
-    Args:
-        path: Of the final file; its folder must exist.
-        ending: Of the temporary name, for libraries that choose a format by it.
-
-    Raises:
-        OSError: The folder is missing, full, or not writable; the error names ``path``, not the temporary file. That
-            is not left behind.
+    Readers, and other processes that write the same file, see the old content or the new one, never a part. An OSError
+    names ``path``, not the temporary file, which is not left behind. Some libraries choose a format by the ending.
     """
     temporary = path.with_name(f".{path.name}.{os.getpid()}-{uuid.uuid4().hex[:8]}{ending}")
     try:

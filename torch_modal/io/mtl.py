@@ -19,14 +19,10 @@ LARGEST_LIBRARY = 2**24  # bytes
 
 
 def read_libraries(path: Path, lines: dict[int, str]) -> tuple[dict[str, Material], dict[str, bytes], dict[int, str]]:
-    """Read the material libraries that an OBJ file names, by the numbers of its lines.
+    """Read the material libraries that an OBJ file names, by the numbers of its lines; warn of those left out.
 
-    Returns:
-        The materials; the libraries and their textures, by their paths below the folder of the file or of a copy; the
-        names in those lines that differ in a copy.
-
-    Warns:
-        MeshWarning: A library or a texture cannot be read, or lies outside the folder of the file.
+    Returns the materials; the libraries and their textures, by their paths below the folder of the file or of a copy;
+    and the names in those lines that differ in a copy.
     """
     materials: dict[str, Material] = {}
     files: dict[str, bytes] = {}

@@ -30,13 +30,7 @@ _NORMALS, _COLORS = ("nx", "ny", "nz"), ("red", "green", "blue")
 class PlyFile:
     """A PLY file in memory: its header, and the numbers of its vertices.
 
-    Attributes:
-        elements: Number and properties of each element. A property is its type; a list has that of its length first.
-        properties: Those of the vertices.
-        textures: Names of pictures in the header.
-
-    Raises:
-        ValueError: It has no header, no vertices, or fewer bytes than the header promises.
+    A ValueError says that it has no header, no vertices, or fewer bytes than the header promises.
     """
 
     def __init__(self, path: Path) -> None:
@@ -46,6 +40,7 @@ class PlyFile:
             raise ValueError("no end_header")
         self._start = match.end()
         self._order, self.textures = "", []
+        #: Number and properties of each element. A property is its type; a list has that of its length first.
         self.elements: dict[str, tuple[int, dict[str, list[str]]]] = {}
         properties: dict[str, list[str]] = {}
         for line in re.split(r"\r\n|\n|\r", self.data[: self._start].decode("utf-8", errors="replace")):

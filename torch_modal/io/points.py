@@ -12,27 +12,19 @@ _QUATERNION = [f"rot_{i}" for i in range(4)]
 _SCALES = [f"scale_{i}" for i in range(3)]
 _NORMALS = ["nx", "ny", "nz"]
 
-MOST_DEGREE = 3
-"""Of spherical harmonics."""
+MOST_DEGREE = 3  # of spherical harmonics
 
 # Directions from which the harmonics of a degree follow: more than it has, and none of another's opposite.
 _DIRECTIONS = np.random.default_rng(0).standard_normal((12, 3))
 _DIRECTIONS /= np.linalg.norm(_DIRECTIONS, axis=1, keepdims=True)
 
-# Rotations that are applied at a time.
-_CHUNK = 65_536
+_CHUNK = 65_536  # rotations that are applied at a time
 
 
 class PointFile:
-    """A PLY file whose vertices move, with or without faces; all else stays as it is.
+    """A PLY file whose vertices, at ``positions`` ``(P, 3)``, move, with or without faces; all else stays as it is.
 
-    Attributes:
-        positions: *Shape:* ``(P, 3)``.
-        is_splats: Whether the points are splats: with a rotation and logarithms of scales.
-
-    Raises:
-        FileNotFoundError: There is none.
-        ValueError: It is no PLY file of points.
+    They may be splats, with a rotation and logarithms of scales.
     """
 
     def __init__(self, path: Path) -> None:
@@ -46,10 +38,8 @@ class PointFile:
         self._names = self._file.properties.keys()
         self.is_splats = {*_QUATERNION, *_SCALES} <= self._names
         #: Properties of the harmonics above degree 0, one channel after the other.
-        self._harmonics = sorted(
-            (name for name in self._names if name.startswith("f_rest_")),
-            key=lambda name: int(name.removeprefix("f_rest_")),
-        )
+        rest = [name for name in self._names if name.startswith("f_rest_")]
+        self._harmonics = sorted(rest, key=lambda name: int(name.removeprefix("f_rest_")))
         if self.is_splats and len(self._harmonics) not in [3 * (n * n - 1) for n in range(1, MOST_DEGREE + 2)]:
             raise ValueError(
                 f"{path} has {len(self._harmonics)} f_rest properties; splats of degree 0 to {MOST_DEGREE} have 0, 9, "

@@ -44,15 +44,7 @@ def write_tensors(
 class TensorFile:
     """A file that is open for reading and mapped into memory: tensors are read when they are used, and outlive it.
 
-    It must have the format, the version and the tensors that are named.
-
-    Attributes:
-        metadata: Entries of the header.
-        shapes: Shape of each tensor.
-
-    Raises:
-        FileNotFoundError: There is no such file.
-        ValueError: It is damaged, holds something else, or has another version.
+    A ValueError says that it is damaged, or lacks the format, the version or the tensors that are named.
     """
 
     def __init__(self, path: Path, format: str, version: str, needs: Sequence[str] = ()) -> None:
@@ -67,7 +59,7 @@ class TensorFile:
         except SafetensorError as error:
             raise ValueError(f"{path} is no safetensors file, or a damaged one: {error}") from error
         try:
-            self.metadata: dict[str, Any] = dict(json.loads(header))
+            self.metadata: dict[str, Any] = dict(json.loads(header))  # with what the writer added
         except (TypeError, ValueError, RecursionError):  # not of this package
             self.metadata = {}
         if self.metadata.get("format") != format:
