@@ -217,18 +217,14 @@ def _digest(value: Any) -> bytes:
         return _joined("tensor", [str(x.dtype).encode(), str(tuple(x.shape)).encode(), numbers])
     if isinstance(value, (np.ndarray, np.generic)) and not value.dtype.hasobject:
         return _joined("array", [str(value.dtype.descr).encode(), str(value.shape).encode(), value.tobytes()])
-    if _is_of_package(kind):
-        content = tuple(value) if isinstance(value, tuple) else dict(vars(value))
-        return _joined(f"{kind.__module__}.{kind.__qualname__}", [_digest(content)])
-    raise ContentError(f"a {kind.__qualname__} is neither plain data nor of a class of torch_modal")
-
-
-def _is_of_package(kind: type) -> bool:
-    """True for a class that stands in this package under its own name."""
+    # A class counts that stands in this package under its own name.
     found: Any = sys.modules.get(kind.__module__) if kind.__module__.startswith("torch_modal.") else None
     for name in kind.__qualname__.split("."):
         found = getattr(found, name, None)
-    return found is kind
+    if found is kind:
+        content = tuple(value) if isinstance(value, tuple) else dict(vars(value))
+        return _joined(f"{kind.__module__}.{kind.__qualname__}", [_digest(content)])
+    raise ContentError(f"a {kind.__qualname__} is neither plain data nor of a class of torch_modal")
 
 
 def _joined(kind: str, parts: Iterable[bytes]) -> bytes:
