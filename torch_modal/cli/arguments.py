@@ -41,13 +41,8 @@ def file_name(suffixes: Collection[str]) -> Callable[[str], Path]:
 
 def add_levels(sub: argparse.ArgumentParser, lowest: int) -> None:
     """``--levels`` of subdivision."""
-    sub.add_argument(
-        "--levels",
-        type=number(int, lowest),
-        metavar="L",
-        default=3,
-        help="how often the number of intervals doubles (default: %(default)s, 8 frames an interval)",
-    )
+    text = "how often the number of intervals doubles (default: %(default)s, 8 frames an interval)"
+    sub.add_argument("--levels", type=number(int, lowest), metavar="L", default=3, help=text)
 
 
 def add_modes(sub: argparse.ArgumentParser) -> None:
@@ -72,9 +67,9 @@ def add_registration(sub: argparse.ArgumentParser) -> None:
 def add_common(
     sub: argparse.ArgumentParser,
     overwrite: str = "replace files that exist (default: refuse)",
-    cache_dir: str | None = None,
+    cache_dir: str | None = CACHE_DIR,
 ) -> None:
-    """The group "files and messages"; with ``cache_dir``, the help of that option, if the command has it."""
+    """The group "files and messages"; ``cache_dir`` is the help of that option, None if the command has no cache."""
     group = sub.add_argument_group("files and messages")
     group.add_argument("--overwrite", action="store_true", help=overwrite)
     if cache_dir:
@@ -85,6 +80,11 @@ def add_common(
     group.add_argument("--quiet", action="store_true", help="report warnings and errors only")
 
 
+def picked(args: argparse.Namespace, *names: str) -> dict[str, Any]:
+    """Arguments that functions know by the same names."""
+    return {name: getattr(args, name) for name in names}
+
+
 def caching(args: argparse.Namespace) -> dict[str, Any]:
     """Options of computations that are kept in the cache."""
     return {"cache_dir": args.cache_dir, "cache": not args.no_cache, "progress": False if args.quiet else None}
@@ -92,7 +92,12 @@ def caching(args: argparse.Namespace) -> dict[str, Any]:
 
 def mode_options(args: argparse.Namespace) -> dict[str, Any]:
     """Options of `extract_bases`."""
-    return {"n_modes": args.modes, "method": args.method, "mesher": args.mesher, **caching(args)}
+    return {"n_modes": args.modes, **picked(args, "method", "mesher"), **caching(args)}
+
+
+def register_options(args: argparse.Namespace) -> dict[str, Any]:
+    """Options of `register`."""
+    return {"landmarks": args.landmarks, "same_subject": not args.across, **caching(args)}
 
 
 def reporter(args: argparse.Namespace) -> Callable[[str], None]:

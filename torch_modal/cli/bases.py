@@ -1,7 +1,4 @@
-"""Commands on modes: ``modes``, ``precompute`` and ``cache`` of ``torch-modal``.
-
-Each checks its output paths before any heavy import and any work.
-"""
+"""Commands on modes: ``modes``, ``precompute`` and ``cache`` of ``torch-modal``."""
 
 import argparse
 import os
@@ -16,6 +13,7 @@ from torch_modal.cli.arguments import (
     is_file,
     mode_options,
     number,
+    picked,
     reporter,
 )
 
@@ -29,7 +27,7 @@ def add_modes_command(sub: argparse.ArgumentParser) -> None:
     text = "FILE.safetensors for one mesh, or a folder for a file of each mesh's name"
     sub.add_argument("--out", type=Path, required=True, metavar="FILE_OR_FOLDER", help=text)
     add_modes(sub)
-    add_common(sub, cache_dir=CACHE_DIR)
+    add_common(sub)
 
 
 def modes(args: argparse.Namespace) -> None:
@@ -122,25 +120,11 @@ def precompute(args: argparse.Namespace) -> int:
     from torch_modal.data.precompute_set import DONE, Options
     from torch_modal.data.precompute_tree import precompute_tree
 
-    options = Options(
-        n_modes=args.modes,
-        method=args.method,
-        mesher=args.mesher,
-        cache_dir=args.cache_dir and os.path.abspath(os.path.expanduser(args.cache_dir)),
-        timeout=args.timeout,
-        retry=args.retry,
-        overwrite=args.overwrite,
-        sequence=args.sequence,
-    )
-    records = precompute_tree(
-        args.root,
-        args.out,
-        options,
-        workers=args.workers,
-        scheduler=args.scheduler,
-        say=reporter(args),
-        bar=not args.quiet and sys.stderr.isatty(),
-    )
+    cache_dir = args.cache_dir and os.path.abspath(os.path.expanduser(args.cache_dir))
+    same = picked(args, "method", "mesher", "timeout", "retry", "overwrite", "sequence")
+    options, where = Options(n_modes=args.modes, cache_dir=cache_dir, **same), picked(args, "workers", "scheduler")
+    bar = not args.quiet and sys.stderr.isatty()
+    records = precompute_tree(args.root, args.out, options, **where, say=reporter(args), bar=bar)
     return 0 if all(record.status == DONE for record in records.values()) else INCOMPLETE
 
 

@@ -1,22 +1,11 @@
-"""Commands on meshes: ``register``, ``check`` and ``carry`` of ``torch-modal``.
-
-Each checks its output paths before any heavy import and any work.
-"""
+"""Commands on meshes: ``register``, ``check`` and ``carry`` of ``torch-modal``."""
 
 import argparse
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
-from torch_modal.cli.arguments import (
-    CACHE_DIR,
-    add_common,
-    add_registration,
-    caching,
-    check_output,
-    file_name,
-    reporter,
-)
+from torch_modal.cli.arguments import add_common, add_registration, check_output, file_name, register_options, reporter
 from torch_modal.io.formats import MESH_FORMATS, PICTURES
 
 CROSSES = 3
@@ -30,7 +19,7 @@ def add_register(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--out", type=file_name(MESH_FORMATS), required=True, metavar="FILE", help=text)
     sub.add_argument("--keep-doubtful", action="store_true", help="write a doubtful result too, with a warning")
     add_registration(sub)
-    add_common(sub, cache_dir=CACHE_DIR)
+    add_common(sub)
 
 
 def register(args: argparse.Namespace) -> None:
@@ -56,16 +45,8 @@ def register(args: argparse.Namespace) -> None:
     from torch_modal.registration.load import ADVICE
 
     template, target = map(tm.open_asset, args.meshes)
-    found = tm.register(
-        template.positions,
-        template.faces,
-        target.positions,
-        target.faces,
-        landmarks=args.landmarks,
-        same_subject=not args.across,
-        **caching(args),
-    )
-    report = reporter(args)
+    report, options = reporter(args), register_options(args)
+    found = tm.register(template.positions, template.faces, target.positions, target.faces, **options)
     report(found.summary())
     if found.doubtful:
         why = f"the result is doubtful: {'; '.join(found.warnings)}"
@@ -84,7 +65,7 @@ def add_check(sub: argparse.ArgumentParser) -> None:
     add("--keyframes", nargs="+", type=Path, default=[], metavar="FILE", help=text)
     text = "draw the meshes with crossings in colour, as .png or .pdf"
     add("--picture", type=file_name(PICTURES), metavar="FILE", help=text)
-    add_common(sub, "replace the picture if it exists (default: refuse)")
+    add_common(sub, "replace the picture if it exists (default: refuse)", cache_dir=None)
 
 
 def check(args: argparse.Namespace) -> int:
@@ -153,7 +134,7 @@ def add_carry(sub: argparse.ArgumentParser) -> None:
     add("meshes", nargs="+", type=Path, metavar="MESH", help=text)
     add("--points", type=Path, required=True, metavar="FILE.ply", help="points, or splats")
     add("--out", type=Path, required=True, metavar="FOLDER", help="for a PLY file for each mesh")
-    add_common(sub)
+    add_common(sub, cache_dir=None)
 
 
 def carry(args: argparse.Namespace) -> None:

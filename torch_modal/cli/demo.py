@@ -8,16 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from torch_modal.cli.arguments import (
-    CACHE_DIR,
-    add_common,
-    add_levels,
-    add_modes,
-    check_output,
-    is_file,
-    mode_options,
-    reporter,
-)
+from torch_modal.cli.arguments import add_common, add_levels, add_modes, check_output, is_file, mode_options, reporter
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -35,7 +26,7 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
     add("--sample", choices=list(PICTURE_TIMES), help="only this one (default: both)")
     add_levels(sub, 1)
     add_modes(sub)
-    add_common(sub, cache_dir=CACHE_DIR)
+    add_common(sub)
 
 
 def run(args: argparse.Namespace) -> None:

@@ -6,17 +6,17 @@ from functools import partial
 from pathlib import Path
 
 from torch_modal.cli.arguments import (
-    CACHE_DIR,
     add_common,
     add_levels,
     add_modes,
     add_registration,
-    caching,
     check_output,
     file_name,
     is_file,
     mode_options,
     number,
+    picked,
+    register_options,
     reporter,
 )
 from torch_modal.io.formats import ANIMATION_FORMATS, MESH_FORMATS, PICTURES
@@ -67,7 +67,7 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
     add("--register", action="store_true", help=text)
     add_registration(sub)
     add_modes(sub)
-    add_common(sub, cache_dir=CACHE_DIR)
+    add_common(sub)
 
 
 def times(text: str) -> list[float]:
@@ -105,15 +105,14 @@ def run(args: argparse.Namespace) -> None:
     if (args.landmarks or args.across) and not args.register:
         args.fail("--landmarks and --across are for --register")
     if args.cyclic and (args.ping_pong or args.ease):
-        args.fail(
-            f"--{'ping-pong' if args.ping_pong else 'ease'} is for sequences that begin and end; a cycle does not"
-        )
+        option = "ping-pong" if args.ping_pong else "ease"
+        args.fail(f"--{option} is for sequences that begin and end; a cycle does not")
     single = is_file(args, ANIMATION_FORMATS)
     animation = args.out if single else args.out / "animation.glb"
-    if args.bones or args.targets:
-        if animation.suffix.lower() != ".glb" or (args.bones and args.targets):
-            args.fail("--bones and --targets are two forms of a .glb file; take one of them")
-    fmt = args.format or {".gltf": "glb"}.get(args.meshes[0].suffix.lower(), args.meshes[0].suffix.lower()[1:])
+    if (args.bones or args.targets) and (animation.suffix.lower() != ".glb" or (args.bones and args.targets)):
+        args.fail("--bones and --targets are two forms of a .glb file; take one of them")
+    own = args.meshes[0].suffix.lower()[1:]
+    fmt = args.format or ("glb" if own == "gltf" else own)
     earlier = [] if single else sorted(args.out.glob(f"frame-*.{fmt}"))
     check_output([animation, *([args.picture] if args.picture else []), *earlier], args.meshes, args.overwrite)
 
@@ -126,8 +125,8 @@ def run(args: argparse.Namespace) -> None:
     places = tm.keyframe_places(n, args.levels, **spread)
     when = tm.frame_times(n, args.levels, **spread).tolist() + args.times[-1:] * args.cyclic if args.times else None
     report = reporter(args)
-    registration = {"register": args.register, "landmarks": args.landmarks, "same_subject": not args.across}
-    keyframes, faces = tm.load_keyframes(args.meshes, **registration, **caching(args), report=report)
+    registration = {"register": args.register, **register_options(args)}
+    keyframes, faces = tm.load_keyframes(args.meshes, **registration, report=report)
     asset = tm.open_asset(args.meshes[0])
     welded = tm.weld_seams(keyframes, faces)
     progress = False if args.quiet else None
@@ -137,13 +136,8 @@ def run(args: argparse.Namespace) -> None:
         args.levels,
         bases=partial(tm.extract_bases, **mode_options(args)),
         **spread,
-        smooth=args.smooth,
+        **picked(args, "smooth", "preset", "contact", "mu", "regions", "proxy"),
         progress=progress,
-        preset=args.preset,
-        contact=args.contact,
-        mu=args.mu,
-        regions=args.regions,
-        proxy=args.proxy,
     )
     n_proxy = proxy_size(args.proxy, welded.keyframes.shape[1])
     if n_proxy:
@@ -166,15 +160,9 @@ def run(args: argparse.Namespace) -> None:
         animation,
         args.fps,
         keyframe_indices=keys,
-        cyclic=args.cyclic,
-        overwrite=args.overwrite,
-        duration=args.duration,
-        ping_pong=args.ping_pong,
-        ease=args.ease,
         times=when,
         asset=asset,
-        bones=args.bones,
-        targets=args.targets,
+        **picked(args, "cyclic", "overwrite", "duration", "ping_pong", "ease", "bones", "targets"),
         progress=progress,
     )
     report(f"animation: {animation}")

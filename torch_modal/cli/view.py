@@ -36,7 +36,7 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
     add("--bones", type=number(int, 0), metavar="N", default=40, help=text)
     text = "a page to pick landmarks of two meshes or more; with a FILE, those of it are there already"
     add("--landmarks", nargs="?", const=True, metavar="FILE", help=text)
-    add_common(sub, "replace the file if it exists (default: refuse)")
+    add_common(sub, "replace the file if it exists (default: refuse)", cache_dir=None)
 
 
 def run(args: argparse.Namespace) -> None:
