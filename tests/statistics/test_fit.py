@@ -10,7 +10,7 @@ import torch_modal as tm
 from torch_modal.data.samples import load_sample
 from torch_modal.geometry.rigid import best_fit
 from torch_modal.geometry.rotations import exp
-from torch_modal.statistics.fit import Pulls, fit
+from torch_modal.statistics.fit import fit, pull
 from torch_modal.statistics.local_weights import LocalWeights, Observations
 from torch_modal.statistics.variation import MOST_BELOW_ZERO, LocalMixtures, Patches, Variation, bounded
 
@@ -178,7 +178,7 @@ def test_what_points_leave_open_is_as_in_the_likely_key_frame(space: tm.ShapeSpa
 def test_pulls_are_the_derivatives_of_their_energy(generator: torch.Generator) -> None:
     x, points = (torch.randn(n, 3, generator=generator, dtype=DOUBLE) for n in (6, 4))
     to = Observations(points, torch.tensor([1, 4, 4, 0]), torch.tensor([1.0, 0.5, 2.0, 1.0], dtype=DOUBLE))
-    pulls = Pulls(to, 3.0)
+    pulls = pull(to, 3.0, len(x))
     at = pulls.at(x[None])
     torch.testing.assert_close(at.value, pulls.value(x[None]))
     slope = torch.func.grad(lambda y: pulls.value(y).sum())

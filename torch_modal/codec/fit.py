@@ -6,7 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torch_modal.geometry.rigid import RigidMotion, best_fit
+from torch_modal.geometry.rigid import best_fit, infinitesimal_motions
 from torch_modal.geometry.rotations import log
 from torch_modal.motion.decoder import ModalDecoder
 
@@ -54,7 +54,7 @@ def fit(
                     linear = _Linearisation(decoder, a, times[f])
                 a = _fit_frame(decoder, frames[f], times[f], a, linear)
                 x = decoder(a, times[f])
-                motion = _best_fit(x, frames[f])
+                motion = best_fit(x, frames[f])
                 found.amplitudes[f] = a
                 found.motions[f] = torch.cat([log(motion.rotation), (motion.target - motion.source) / decoder.size])
                 found.errors[f] = (motion.apply(x) - frames[f]).norm(dim=-1).mean() / decoder.size
@@ -74,9 +74,7 @@ class _Linearisation:
         self.x = decoder(a, t)
         shapes = decoder(a + DIFFERENCE * torch.eye(k).double(), t)
         flat = ((shapes - self.x) / DIFFERENCE).flatten(1)
-        axes = torch.eye(3).double()[:, None].expand(3, *self.x.shape)
-        rigid = torch.cat([axes, torch.linalg.cross(axes, (self.x - self.x.mean(0)).expand_as(axes))])
-        rigid = torch.linalg.qr(rigid.flatten(1).mT).Q
+        rigid = torch.linalg.qr(infinitesimal_motions(self.x - self.x.mean(0)).flatten(1).mT).Q
         #: *Shape:* ``(k, 3V)``.
         self.rows = flat - (flat @ rigid) @ rigid.mT
         normal = self.rows @ self.rows.mT
@@ -86,7 +84,7 @@ class _Linearisation:
     def holds(self, x: Tensor) -> bool:
         """True if a shape is so near that the derivatives serve it. *Shape:* ``(V, 3)``."""
         i, j = self._ends
-        own, other = (shape[j] - shape[i] for shape in (self.x, _best_fit(x, self.x).apply(x)))
+        own, other = (shape[j] - shape[i] for shape in (self.x, best_fit(x, self.x).apply(x)))
         length = own.norm(dim=1).clamp_min(torch.finfo(torch.float64).tiny)
         change = (other - own).norm(dim=1) / length
         return float(change.kthvalue(max(1, int(QUANTILE * len(change)))).values) < MAX_TURN
@@ -102,8 +100,8 @@ def _fit_frame(decoder: ModalDecoder, frame: Tensor, t: Tensor, start: Tensor, l
 
     def tried(a: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         x = decoder(a, t)
-        x = _best_fit(x, linear.x).apply(x)
-        residual = _best_fit(frame, x).apply(frame) - x
+        x = best_fit(x, linear.x).apply(x)
+        residual = best_fit(frame, x).apply(frame) - x
         return a, residual, residual.square().sum()
 
     best = min((tried(a) for a in (start, torch.zeros_like(start))), key=lambda one: float(one[2]))
@@ -119,7 +117,3 @@ def _fit_frame(decoder: ModalDecoder, frame: Tensor, t: Tensor, start: Tensor, l
         if 1 - float(new[2] / squared.clamp_min(torch.finfo(torch.float64).tiny)) < MIN_GAIN:
             break
     return best[0]
-
-
-def _best_fit(x: Tensor, y: Tensor) -> RigidMotion:
-    return best_fit(x, y, torch.ones(len(x)).double())

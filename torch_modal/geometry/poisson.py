@@ -174,7 +174,7 @@ class Reconstruction(nn.Module):
         out = placed = self.poisson(self.poisson.pulls(edges), rest.movedim(0, -1)).movedim(-1, 0)
         for piece, anchors in self.loose:
             before, after = (x[..., anchors].movedim(0, -1) for x in (rest, placed))
-            motion = best_fit(before, after, before.new_ones(len(anchors)))
+            motion = best_fit(before, after)
             centre = (rest[..., piece] * self.poisson.shares.to(rest)[piece]).sum(-1).T[:, None]
             moved = placed[..., piece] + (motion.apply(centre) - centre).movedim(-1, 0)
             out = out.index_copy(-1, piece, moved)

@@ -93,14 +93,15 @@ def best_rotation(covariance: Tensor) -> Tensor:
     return rotation
 
 
-def best_fit(x: Tensor, y: Tensor, weights: Tensor) -> RigidMotion:
+def best_fit(x: Tensor, y: Tensor, weights: Tensor | None = None) -> RigidMotion:
     """The rigid motion that best aligns ``x`` with ``y`` (weighted Kabsch).
 
     Args:
         x: Vertex positions. *Shape:* ``(..., V, 3)``.
         y: Vertex positions. *Shape:* ``(..., V, 3)``.
-        weights: Weight of each vertex, for example its area. *Shape:* ``(V,)``.
+        weights: Weight of each vertex, for example its area; by default, all have the same. *Shape:* ``(V,)``.
     """
+    weights = x.new_ones(x.shape[-2]) if weights is None else weights
     source, target = centroid(x, weights), centroid(y, weights)
     centred_x = x - source[..., None, :]
     centred_y = (y - target[..., None, :]) * weights[:, None]

@@ -82,7 +82,7 @@ class BendingCoordinates:
         found = []
         for row, (_, anchors) in zip(self.centres, self.reconstruction.loose, strict=True):
             before = self.mean[anchors].expand(len(shapes), -1, -1)
-            motion = best_fit(before, shapes[:, anchors], self.mean.new_ones(len(anchors)))
+            motion = best_fit(before, shapes[:, anchors])
             found.append((motion.apply((row @ self.mean).expand(len(shapes), 1, -1)), motion))
         return found
 

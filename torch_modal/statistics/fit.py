@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from torch_modal.autograd import transformed
-from torch_modal.backends.torch.fine_steps import FurtherDerivatives
+from torch_modal.contact.active import Pull
 from torch_modal.statistics.local_weights import LocalWeights, Observations
 from torch_modal.statistics.variation import Variation, bounded
 
@@ -36,26 +36,12 @@ class Fitted(NamedTuple):
     """Final weight of each observation: less than one for outliers. *Shape:* ``(n,)``."""
 
 
-class Pulls:
-    """``stiffness sum_i weights_i |x_i - p_i|^2`` of one shape, as an energy beside that of the terms."""
-
-    def __init__(self, to: Observations, stiffness: float) -> None:
-        self.to, self.factors = to, stiffness * to.weights
-
-    def value(self, x: Tensor) -> Tensor:
-        """*Shape:* ``(1, V, 3) -> (1,)``."""
-        return (self.factors * (x[0, self.to.vertices] - self.to.points).square().sum(-1)).sum()[None]
-
-    def at(self, x: Tensor) -> FurtherDerivatives:
-        """*Shape:* ``(1, V, 3)``."""
-
-        def spread(at_vertices: Tensor) -> Tensor:  # from the observed vertices to all, doubled
-            values = 2 * self.factors[:, None] * at_vertices
-            return x.new_zeros(x.shape[1], values.shape[1]).index_add(0, self.to.vertices, values)[None]
-
-        diagonal = spread(x.new_tensor([1, 0, 0, 1, 0, 1]).expand(len(self.factors), 6))
-        gradient = spread(x[0, self.to.vertices] - self.to.points)
-        return FurtherDerivatives(self.value(x), gradient, diagonal, lambda f: spread(f[0, self.to.vertices]))
+def pull(to: Observations, stiffness: float, n_vertices: int) -> Pull:
+    """``stiffness sum_i weights_i |x_i - p_i|^2`` of one shape, but for a constant where points share a vertex."""
+    weights = to.weights.new_zeros(n_vertices).index_add(0, to.vertices, stiffness * to.weights)
+    weighted = stiffness * to.weights[:, None] * to.points
+    sums = weighted.new_zeros(n_vertices, 3).index_add(0, to.vertices, weighted)
+    return Pull((sums / weights.clamp_min(torch.finfo(weights.dtype).tiny)[:, None])[None], weights)
 
 
 def fit(
@@ -99,7 +85,8 @@ def _fit_one(variation: Variation, to: Observations, about: Tensor, robust: bool
     pose = to.pose(assembled)
     with torch.no_grad():
         stiffness = min(LARGEST_STIFFNESS, STIFFNESS / len(to.points))
-        pulls = Pulls(to._replace(points=variation.scale * pose.inverse().apply(to.points)), stiffness)
+        there = to._replace(points=variation.scale * pose.inverse().apply(to.points))
+        pulls = pull(there, stiffness, len(assembled))
         own = bounded(weights)
         x = variation.relaxed(assembled, own, *FIRST_ROUND, pulls)
         for _ in range(N_ROUNDS):

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torch_modal.autograd import recorded
 from torch_modal.backends.torch.fine_steps import conjugate_gradients
-from torch_modal.geometry.rigid import RigidMotion, best_fit
+from torch_modal.geometry.rigid import RigidMotion, best_fit, centroid, infinitesimal_motions
 from torch_modal.geometry.triangle_frames import edge_means
 from torch_modal.solve.fitting import levenberg_marquardt
 from torch_modal.statistics.variation import Variation
@@ -109,10 +109,7 @@ class LocalWeights:
         """Gauss-Newton matrix without the rigid motion, and half the negative gradient. *Shape:* ``(K n,)``."""
         seen = self.shape(factors)[to.vertices]
         off = best_fit(seen, to.points, to.weights).inverse().apply(to.points) - seen
-        arms = seen - (to.weights @ seen) / to.weights.sum()
-        eye = torch.eye(3).to(seen).expand(len(arms), 3, 3)
-        turns = torch.linalg.cross(eye, arms[:, None].expand(-1, 3, -1)).mT
-        rigid = torch.cat([turns, eye], -1).flatten(0, 1)
+        rigid = infinitesimal_motions(seen - centroid(seen, to.weights)).flatten(1).mT
         root = (to.weights.sqrt() / noise).repeat_interleave(3)[:, None]
         q = torch.linalg.qr(root * rigid)[0]
         rows = root * self.jacobian(factors)
