@@ -17,8 +17,7 @@ from torch_modal.cli.arguments import (
     reporter,
 )
 
-INCOMPLETE = 3
-"""Exit status of `precompute` when some sets have no bases."""
+INCOMPLETE = 3  # exit status of `precompute` when some sets have no bases
 
 
 def add_modes_command(sub: argparse.ArgumentParser) -> None:

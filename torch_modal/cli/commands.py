@@ -8,8 +8,7 @@ from pathlib import Path
 from torch_modal.cli.arguments import add_common, add_registration, check_output, file_name, register_options, reporter
 from torch_modal.io.formats import MESH_FORMATS, PICTURES
 
-CROSSES = 3
-"""Exit status of `check` when parts newly pass through each other."""
+CROSSES = 3  # exit status of `check` when parts newly pass through each other
 
 
 def add_register(sub: argparse.ArgumentParser) -> None:
@@ -61,8 +60,7 @@ def add_check(sub: argparse.ArgumentParser) -> None:
     """Arguments of ``check``."""
     add = sub.add_argument
     add("meshes", nargs="+", type=Path, metavar="MESH", help="meshes of one connectivity")
-    text = "meshes whose own crossings are known"
-    add("--keyframes", nargs="+", type=Path, default=[], metavar="FILE", help=text)
+    add("--keyframes", nargs="+", type=Path, default=[], metavar="FILE", help="meshes whose own crossings are known")
     text = "draw the meshes with crossings in colour, as .png or .pdf"
     add("--picture", type=file_name(PICTURES), metavar="FILE", help=text)
     add_common(sub, "replace the picture if it exists (default: refuse)", cache_dir=None)

@@ -36,8 +36,7 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
     add("--times", type=times, metavar="T,T,...", help=text)
     text = "treat each pair of key-frames alone, without what its neighbours in time know"
     add("--no-smooth", dest="smooth", action="store_const", const=False, help=text)
-    text = "keep parts from passing through each other (extra contact)"
-    add("--contact", action="store_true", help=text)
+    add("--contact", action="store_true", help="keep parts from passing through each other (extra contact)")
     text = (
         "a coarser mesh of N vertices moves, and carries the detail; 0: the mesh itself (default: 20000, for meshes "
         "of more than 100000 vertices)"
@@ -63,8 +62,7 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
     group.add_argument("--bones", type=number(int, 1), metavar="N", help=text)
     text = "GLB: N principal shapes as the only morph targets"
     group.add_argument("--targets", type=number(int, 1), metavar="N", help=text)
-    text = "the meshes have different connectivity: lay the first onto the others"
-    add("--register", action="store_true", help=text)
+    add("--register", action="store_true", help="the meshes have different connectivity: lay the first onto the others")
     add_registration(sub)
     add_modes(sub)
     add_common(sub)

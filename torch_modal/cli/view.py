@@ -22,13 +22,11 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
     add("meshes", nargs="+", type=Path, metavar="MESH", help="shapes in their order, a folder, or one GLB")
     text = "another sequence of as many shapes, of the same faces; may be given several times"
     add("--compare", nargs="+", type=Path, action="append", default=[], metavar="FILE", help=text)
-    text = "also show linear interpolation of the key-frames of the first sequence"
-    add("--linear", action="store_true", help=text)
+    add("--linear", action="store_true", help="also show linear interpolation of the key-frames of the first sequence")
     text = "which frames are key-frames, from 0 (default: the GLB's, or the first and the last)"
     add("--keyframes", nargs="+", type=number(int, 0), metavar="N", help=text)
     add("--cyclic", action="store_true", help="the last frame leads on to the first")
-    text = "frames a second (default: the GLB's, or 24)"
-    add("--fps", type=number(float, 0, above=True), metavar="X", help=text)
+    add("--fps", type=number(float, 0, above=True), metavar="X", help="frames a second (default: the GLB's, or 24)")
     add("--up", choices=("y", "z"), help="what is up (default: Y, unless the first shape is flat in Y)")
     text = "write the page there, as .html (default: a temporary file, opened)"
     add("--page", type=file_name(PAGES), metavar="FILE", help=text)
