@@ -11,18 +11,13 @@ from torch_modal.geometry.rotations import log
 from torch_modal.motion.decoder import ModalDecoder
 
 MAX_STEPS = 6
-MIN_GAIN = 0.01
-"""A frame is done when a step lowers the squared residual by less than this part."""
-SHORTER = 0.4
-"""Part of a step that is tried where the whole step does not lower the residual."""
-RIDGE = 1e-4
-"""Over the mean diagonal of the normal equations: amplitudes that hardly move the vertices stay near zero."""
-DIFFERENCE = 1e-3
-"""Difference of amplitudes, for the Jacobian."""
+MIN_GAIN = 0.01  # a frame is done when a step lowers the squared residual by less than this part
+SHORTER = 0.4  # part of a step that is tried where the whole step does not lower the residual
+RIDGE = 1e-4  # over the mean diagonal of the normal equations: amplitudes that hardly move the vertices stay near zero
+DIFFERENCE = 1e-3  # difference of amplitudes, for the Jacobian
 MAX_TURN = 0.3
 """Change of edges, over their lengths, from which on the Jacobian is recomputed; about a rotation in radians."""
-QUANTILE = 0.95
-"""Quantile of the edges' changes that is compared with that limit."""
+QUANTILE = 0.95  # quantile of the edges' changes that is compared with that limit
 
 
 class FittedFrames(NamedTuple):

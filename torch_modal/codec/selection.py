@@ -14,10 +14,8 @@ from torch_modal.modes.extract import extract_modes
 from torch_modal.motion.decoder import ModalDecoder
 from torch_modal.progress import Progress, ProgressReport
 
-ERROR = 0.002
-"""Default for the largest mean distance of a frame's vertices, over the diagonal."""
-N_SAMPLES = 5
-"""Frames of an interval that are fitted to estimate its error."""
+ERROR = 0.002  # default for the largest mean distance of a frame's vertices, over the diagonal
+N_SAMPLES = 5  # frames of an interval that are fitted to estimate its error
 
 
 def select_keyframes(
@@ -92,7 +90,7 @@ class Selection:
         keys = [0, n // 2] if self.cyclic else [0, n - 1]
         with ProgressReport(n_keyframes or n, "key-frames", progress) as bar:
             while len(keys) < (n_keyframes or n):
-                intervals = [(errors, a, b) for errors, (a, b) in zip(self.errors(keys), self._ends(keys), strict=True)]
+                intervals = self.intervals(keys)
                 if n_keyframes is None:
                     scores = [max(errors.values(), default=0.0) for errors, _, _ in intervals]
                     if max(scores) <= error:
@@ -106,11 +104,13 @@ class Selection:
                 bar.update()
         return keys if n_keyframes is None else self._moved(keys)
 
-    def errors(self, keys: Sequence[int]) -> list[dict[int, float]]:
-        """Errors of a few frames of each interval between key-frames, by their numbers."""
-        found = []
-        for i, (a, b) in enumerate(self._ends(keys)):
-            n, period = len(keys), len(self.frames)
+    def intervals(self, keys: Sequence[int]) -> list[tuple[dict[int, float], int, int]]:
+        """Errors of a few frames of each interval between key-frames, by their numbers, and its first and last frame.
+
+        The last interval of a cycle ends at the number of frames.
+        """
+        found, n, period = [], len(keys), len(self.frames)
+        for i, (a, b) in enumerate(pairwise([*keys, period] if self.cyclic else keys)):
             # The path of an interval depends on four key-frames; those of later periods of a cycle count on.
             if self.cyclic:
                 around = [keys[j % n] + period * (j // n) for j in range(i - 1, i + 3)]
@@ -120,19 +120,13 @@ class Selection:
             if name not in self._known:
                 samples = torch.linspace(a + 1, b - 1, min(N_SAMPLES, b - a - 1)).round().long()
                 self._known[name] = self._fitted(around, samples)
-            found.append(self._known[name])
+            found.append((self._known[name], a, b))
         return found
 
     def mean(self, keys: Sequence[int]) -> float:
         """Estimated mean error of all frames."""
-        total = 0.0
-        for errors, (a, b) in zip(self.errors(keys), self._ends(keys), strict=True):
-            total += sum(errors.values()) / max(len(errors), 1) * (b - a - 1)
-        return total / len(self.frames)
-
-    def _ends(self, keys: Sequence[int]) -> list[tuple[int, int]]:
-        """First and last frame of each interval; the last interval of a cycle ends at the number of frames."""
-        return list(pairwise([*keys, len(self.frames)] if self.cyclic else keys))
+        each = [sum(e.values()) / max(len(e), 1) * (b - a - 1) for e, a, b in self.intervals(keys)]
+        return sum(each) / len(self.frames)
 
     def _fitted(self, around: list[int], samples: Tensor) -> dict[int, float]:
         if not len(samples):

@@ -21,8 +21,7 @@ from torch_modal.progress import Progress, ProgressReport
 FORMAT = "torch_modal.sequence"
 VERSION = "3"
 STORED = ("keyframes", "faces", "keyframe_times", "times", "amplitudes", "motions", "modes", "errors")
-CHUNK = 16
-"""Frames that are decoded at once."""
+CHUNK = 16  # frames that are decoded at once
 
 
 @dataclass(frozen=True, eq=False)
