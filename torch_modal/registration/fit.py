@@ -1,6 +1,6 @@
 """As-rigid-as-possible fit of a template to a target."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -11,6 +11,7 @@ from torch_modal.geometry.closest import dot
 from torch_modal.geometry.connectivity import half_cotangents
 from torch_modal.geometry.rigid import best_rotation
 from torch_modal.geometry.sparse import SparseSolver, graph_laplacian
+from torch_modal.progress import ProgressReport
 from torch_modal.registration.maps import SpectralShape
 from torch_modal.registration.surface import MeshSurface
 
@@ -29,7 +30,7 @@ COARSE_STAGES: tuple[Stage, ...] = ((0.05, 6, 4), (0.2, 5, 6), (0.5, 4, 6), (2.0
 FINE_STAGES: tuple[Stage, ...] = ((0.3, 4, 3), (1.0, 3, 3), (3.0, 3, 3))
 _RELEASED, _CAUGHT = (0.3, 5, 4), (0.5, 5, 3)  # without flipped faces, then with them
 
-MAP_WEIGHTS = (0.02, 0.1)
+_MAP_WEIGHTS = (0.02, 0.1)
 _MAP_ROUNDS = 40
 _MAP_SHARE = 0.05  # weight of the map relative to closest points
 _LANDMARK_WEIGHT = 5.0
@@ -114,9 +115,9 @@ class TemplateFit:
         coarse: The target's coarse shape.
         images: Vertex of that for each template vertex; closest points must be near, so that touching fingers do not
             mix. *Shape:* ``(V,)``.
-        landmarks: Points of the template and their target positions.
+        landmarks: Points on the template and their target positions. *Shape:* ``(n, 3), (n, 3)``.
+        progress: Counts the steps.
         stretchable: Allow parts to grow and shrink.
-        tick: Called after each step.
     """
 
     def __init__(
@@ -126,18 +127,18 @@ class TemplateFit:
         back: MeshSurface,
         coarse: SpectralShape,
         images: IntArray,
-        landmarks: tuple[sparse.csr_matrix, FloatArray] | None,
+        landmarks: tuple[FloatArray, FloatArray],
+        progress: ProgressReport,
         *,
         stretchable: bool,
-        tick: Callable[[], None],
     ) -> None:
-        self.template, self.target, self.back, self.tick = template, target, back, tick
+        self.template, self.target, self.back, self.progress = template, target, back, progress
         self.elastic = ElasticSurface(template, stretchable=stretchable)
         self._coarse, self._images = coarse, images
         self._everywhere = sparse.identity(len(images), format="csr")
         self._share = template.vertex_areas / template.vertex_areas.mean()
         self._back_share = back.vertex_areas / back.vertex_areas.mean() * (len(images) / len(back.vertices))
-        self._landmarks = [] if landmarks is None else [self._pull(*landmarks, _LANDMARK_WEIGHT)]
+        self._landmarks = self._pull(template.rows(template.closest(landmarks[0])), landmarks[1], _LANDMARK_WEIGHT)
         self._map: list[Pull] = []
 
     def _pull(self, points: sparse.csr_matrix, places: FloatArray, weights: FloatArray | float) -> Pull:
@@ -145,40 +146,43 @@ class TemplateFit:
 
     def follow_map(self, x: FloatArray, places: FloatArray) -> FloatArray:
         """Fit to the positions of a map, which keep a small weight in later steps. *Shape:* ``(V, 3), (V, 3)``."""
-        for weight in MAP_WEIGHTS:
-            x = self.elastic.follow(x, [self._pull(self._everywhere, places, weight), *self._landmarks], _MAP_ROUNDS)
-            self.tick()
+        self.progress.expect(len(_MAP_WEIGHTS))
+        for weight in _MAP_WEIGHTS:
+            x = self.elastic.follow(x, [self._pull(self._everywhere, places, weight), self._landmarks], _MAP_ROUNDS)
+            self.progress.update()
         self._map = [self._pull(self._everywhere, places, _MAP_SHARE)]
         return x
 
     def run(self, x: FloatArray, stages: Sequence[Stage], releases: int) -> FloatArray:
         """Run all stages, then release flipped regions several times. *Shape:* ``(V, 3)``."""
+        self.progress.expect(sum(n_steps for *_, n_steps in stages))
+        none = np.zeros(len(x), dtype=bool)
         for stage in stages:
-            x = self._steps(x, stage)
+            x = self._steps(x, stage, none)
         self._map = []
         for _ in range(releases):
             # Vertices of flipped faces and their neighbours.
             shape = self.template.moved(x)
-            flipped = np.zeros(len(x), dtype=bool)
+            flipped = none.copy()
             flipped[shape.faces[self.target.looks_away(x[shape.faces].mean(1), shape.face_normals)]] = True
             i, j = shape.edges.T
             released = flipped.copy()
             released[i[flipped[j]]] = released[j[flipped[i]]] = True
             if released.any():
-                x = self._steps(self._steps(x, _RELEASED, released), _CAUGHT)
+                x = self._steps(self._steps(x, _RELEASED, released), _CAUGHT, none)
         return x
 
-    def _steps(self, x: FloatArray, stage: Stage, released: BoolArray | None = None) -> FloatArray:
+    def _steps(self, x: FloatArray, stage: Stage, released: BoolArray) -> FloatArray:
         weight, reach, n_steps = stage
         for _ in range(n_steps):
             shape = self.template.moved(x)
             pulls = [self._to_target(shape, weight, reach, released), self._from_target(shape, weight, reach, released)]
             pulls += [(points, places, weights * weight) for points, places, weights in self._map]
-            x = self.elastic.follow(x, [*pulls, *self._landmarks, self._pull(self._everywhere, x, _FIXING_WEIGHT)])
-            self.tick()
+            x = self.elastic.follow(x, [*pulls, self._landmarks, self._pull(self._everywhere, x, _FIXING_WEIGHT)])
+            self.progress.update()
         return x
 
-    def _to_target(self, shape: MeshSurface, weight: float, reach: float, released: BoolArray | None) -> Pull:
+    def _to_target(self, shape: MeshSurface, weight: float, reach: float, released: BoolArray) -> Pull:
         """Pull template vertices to closest points on the target."""
         closest = self.target.closest(shape.vertices)
         places, normals = closest.points.copy(), shape.vertex_normals
@@ -191,13 +195,11 @@ class TemplateFit:
         used[hidden] = dot(normals[hidden], self.target.vertex_normals[beside]) > _ALIKE
         used[hidden] &= self._coarse.is_near(self._images[hidden], places[hidden])
         used &= np.linalg.norm(places - shape.vertices, axis=1) < reach
-        used &= shape.on_boundary | ~self.target.on_open_edge(closest)
-        if released is not None:
-            used &= ~released
+        used &= (shape.on_boundary | ~self.target.on_open_edge(closest)) & ~released
         kept = np.flatnonzero(used)
         return self._pull(self._everywhere[kept], places[kept], weight * self._share[kept])
 
-    def _from_target(self, shape: MeshSurface, weight: float, reach: float, released: BoolArray | None) -> Pull:
+    def _from_target(self, shape: MeshSurface, weight: float, reach: float, released: BoolArray) -> Pull:
         """Pull the closest points on the template to the target's vertices."""
         closest = shape.closest(self.back.vertices)
         corners = shape.faces[closest.faces]
@@ -205,8 +207,7 @@ class TemplateFit:
         used &= closest.distances < reach
         used &= self.back.on_boundary | ~shape.on_open_edge(closest)
         used &= self._coarse.is_near(self._images[corners[:, 0]], self.back.vertices)
-        if released is not None:
-            used &= ~released[corners].any(1)
+        used &= ~released[corners].any(1)
         kept = np.flatnonzero(used)
         return self._pull(shape.rows(closest)[kept], self.back.vertices[kept], weight * self._back_share[kept])
 

@@ -20,10 +20,8 @@ def landmark_table(landmarks: Any, shapes: Sequence[FloatArray]) -> FloatArray:
         FileNotFoundError: There is no such file.
         MeshError: Landmarks do not match the meshes, or a vertex does not exist.
     """
-    n = len(shapes)
-    if landmarks is None:
-        return np.zeros((0, n, 3))
-    table: Any = read_landmarks(landmarks, n) if isinstance(landmarks, (str, os.PathLike)) else to_numpy(landmarks)
+    n, given = len(shapes), np.zeros(0) if landmarks is None else landmarks
+    table: Any = read_landmarks(given, n) if isinstance(given, (str, os.PathLike)) else to_numpy(given)
     if table.size == 0:
         return np.zeros((0, n, 3))
     if table.ndim == 3 and table.shape[1:] == (n, 3) and table.dtype.kind in "iuf" and np.isfinite(table).all():

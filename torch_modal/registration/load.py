@@ -12,6 +12,7 @@ from torch_modal.errors import MeshError, MeshWarning
 from torch_modal.io.read import open_asset, require_same_mesh
 from torch_modal.keyframes.check import Keyframes
 from torch_modal.progress import Progress
+from torch_modal.registration.landmarks import landmark_table
 
 ADVICE = (
     "give landmarks, five or more: a text file with a line for each, which names one vertex of each mesh, counted from "
@@ -75,11 +76,7 @@ def load_keyframes(
     if posed:
         text = f"{posed[0]}: the shape at rest is read, so bake the pose to have it ({len(posed)} such key-frames)"
         warnings.warn(text, MeshWarning, stacklevel=2)
-    marks = None
-    if landmarks is not None:
-        from torch_modal.registration.landmarks import landmark_table
-
-        marks = landmark_table(landmarks, [vertices for vertices, _ in meshes])
+    marks = landmark_table(landmarks, [vertices for vertices, _ in meshes])
     vertices, faces = meshes[0]
     shapes = [vertices]
     for k, (there, there_faces) in enumerate(meshes[1:], 1):
@@ -93,9 +90,9 @@ def load_keyframes(
             continue
         from torch_modal.registration.register import register as registered
 
-        pair = None if marks is None else marks[:, k - 1 : k + 1]
-        caching: dict[str, Any] = {"cache_dir": cache_dir, "cache": cache, "progress": progress}
-        found = registered(shapes[-1], faces, there, there_faces, landmarks=pair, same_subject=same_subject, **caching)
+        options: dict[str, Any] = {"same_subject": same_subject, "cache_dir": cache_dir, "cache": cache}
+        options |= {"landmarks": marks[:, k - 1 : k + 1], "progress": progress}
+        found = registered(shapes[-1], faces, there, there_faces, **options)
         name, origin = os.fspath(paths[k]), os.fspath(paths[k - 1])
         report(f"{name} registered from {origin}: {found.summary()}")
         if found.doubtful:

@@ -6,9 +6,9 @@ square roots of the area.
 """
 
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 from scipy import sparse
@@ -21,24 +21,18 @@ from torch_modal.arrays import BoolArray, FloatArray, IntArray
 from torch_modal.geometry import inspect
 from torch_modal.geometry.closest import dot
 from torch_modal.geometry.decimation import decimate
+from torch_modal.progress import ProgressReport
 from torch_modal.registration.surface import DUST, MeshSurface, largest_pieces, main_part, referenced
 
-N_COARSE = 2000
-"""Approximate number of vertices of the coarse copies."""
-N_FUNCTIONS = 60
-"""Number of eigenfunctions, including the constant one."""
+N_COARSE = 2000  # approximate number of vertices of the coarse copies
+N_FUNCTIONS = 60  # number of eigenfunctions, including the constant one
 COARSE_FUNCTIONS = 20
 FINE_FUNCTIONS = 50
 N_SIGNS, MORE_SIGNS = 4, 6
 """Number of eigenfunctions with both signs in the initial maps, and in those of a second attempt."""
-N_OTHER_STARTS = 6
-"""Number of initial maps besides the sign patterns."""
-N_REFINED, N_DIFFERENT = 4, 2
-"""Number of fully refined maps: the best ones, and others that differ from them."""
-SAME = 0.1
-"""Largest difference of equal maps, for a surface of unit area."""
-N_SAMPLES = 40
-"""Number of samples between which distances are compared."""
+N_REFINED, N_DIFFERENT = 4, 2  # number of fully refined maps: the best ones, and others that differ from them
+SAME = 0.1  # largest difference of equal maps, for a surface of unit area
+N_SAMPLES = 40  # number of samples between which distances are compared
 _STEP = 3
 _NEAR = 0.12  # largest geodesic distance of closest points from the image of a map, for a surface of unit area
 
@@ -123,16 +117,28 @@ class SpectralShape:
         return np.array(chosen), distances
 
 
-class Map(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Map:
     """A map, and its scores for the second shape and for its mirror image. *Shape:* ``(n_first,)``.
 
     A score is the oriented area of the worse direction minus three times the mean round-trip error: 0.7 or more for
     correct maps of one subject, negative for mirrored ones.
     """
 
+    pair: "CoarsePair"
     vertices: IntArray
     score: float
     mirrored_score: float
+
+    @cached_property
+    def distortion(self) -> float:
+        """Mean over the vertices of the largest distance error to a sample."""
+        return float(self.pair.errors(self.vertices).max(1).mean())
+
+    def differs(self, others: Sequence["Map"]) -> bool:
+        """True if each of other maps has a different image of some part."""
+        places = self.pair.second.coarse.vertices
+        return all(difference(places[self.vertices], places[one.vertices]) > SAME for one in others)
 
 
 class CoarsePair:
@@ -150,19 +156,14 @@ class CoarsePair:
         back = nearest_rows(second.functions[:, :k] @ self._functional(vertices, k).T, first.functions[:, :k])
         areas = _oriented_area(first, second, vertices), _oriented_area(second, first, back)
         round_trip = np.linalg.norm(first.coarse.vertices[back[vertices]] - first.coarse.vertices, axis=1).mean()
-        return Map(
-            vertices, float(min(areas) - _ROUND_TRIP * round_trip), float(-max(areas) - _ROUND_TRIP * round_trip)
-        )
+        score, mirrored_score = (float(area - _ROUND_TRIP * round_trip) for area in (min(areas), -max(areas)))
+        return Map(self, vertices, score, mirrored_score)
 
     def errors(self, vertices: IntArray) -> FloatArray:
         """Errors of the distances from vertices to samples. *Shape:* ``(n_first,) -> (n_first, m)``."""
         images = self.second.geodesics_from(vertices[self.samples])[vertices]
         found: FloatArray = np.abs(self.distances - images)
         return found
-
-    def distortion(self, vertices: IntArray) -> float:
-        """Mean over the vertices of the largest distance error to a sample. *Shape:* ``(n_first,)``."""
-        return float(self.errors(vertices).max(1).mean())
 
     # ------------------------------------------------------------------------------------------------------------- maps
     def _functional(self, vertices: IntArray, k: int) -> FloatArray:
@@ -187,21 +188,21 @@ class CoarsePair:
             signatures.append(distances / distances.max(0))  # proportions differ
         return self.refined(nearest_rows(*signatures), 8)
 
-    def from_spectra(self, n_signs: int, tick: Callable[[], None] = lambda: None) -> list[Map]:
+    def from_spectra(self, n_signs: int, progress: ProgressReport) -> list[Map]:
         """The best maps from spectra, best first; the last is the best map to the mirrored target.
 
         The initial maps are all ``2**n_signs`` sign patterns of the lowest eigenfunctions, wave kernel signatures and
         rigid alignments of principal axes. All are refined with few eigenfunctions, the best with all.
         """
-        coarse = []
-        for vertices, k in self._starts(n_signs):
+        starts, coarse = list(self._starts(n_signs)), []
+        progress.expect(len(starts))
+        for vertices, k in starts:
             coarse.append(self.refined(vertices, k, COARSE_FUNCTIONS))
-            tick()
+            progress.update()
         coarse.sort(key=lambda found: -found.score)
-        best, places = coarse[:N_REFINED], self.second.coarse.vertices
+        best = coarse[:N_REFINED]
         for found in coarse[N_REFINED:]:  # the best ones are often the same map
-            apart = min(difference(places[found.vertices], places[one.vertices]) for one in best)
-            if len(best) < N_REFINED + N_DIFFERENT and apart > SAME:
+            if len(best) < N_REFINED + N_DIFFERENT and found.differs(best):
                 best.append(found)
         best.append(max(coarse, key=lambda found: found.mirrored_score))
         *fine, mirrored = [self.refined(found.vertices, COARSE_FUNCTIONS) for found in best]

@@ -15,28 +15,15 @@ from torch_modal.io.cache import Cache
 from torch_modal.keyframes.arrays import weld_seams
 from torch_modal.keyframes.check import check_keyframes
 from torch_modal.progress import Progress, ProgressReport
-from torch_modal.registration.fit import COARSE_STAGES, FINE_STAGES, MAP_WEIGHTS, TemplateFit, sliding_freedom
+from torch_modal.registration.fit import COARSE_STAGES, FINE_STAGES, TemplateFit, sliding_freedom
 from torch_modal.registration.landmarks import landmark_table
-from torch_modal.registration.maps import (
-    FINE_FUNCTIONS,
-    MORE_SIGNS,
-    N_OTHER_STARTS,
-    N_SIGNS,
-    SAME,
-    CoarsePair,
-    Map,
-    SpectralShape,
-    difference,
-)
+from torch_modal.registration.maps import FINE_FUNCTIONS, MORE_SIGNS, N_SIGNS, SAME, CoarsePair, Map, SpectralShape
 from torch_modal.registration.report import LEAD, SLIDING, TRUSTED, Quality, Registration, judge, measure, ramp
 from torch_modal.registration.surface import MeshSurface, main_part, outward, referenced
 
-VERSION = 7
-"""Part of the cache key: raise it when the algorithm changes."""
-MIN_VERTICES = MORE_SIGNS + 3
-"""Minimum number of vertices of a surface: two more than eigenfunctions."""
-MIN_LANDMARKS = 5
-"""Minimum number of landmarks between different subjects: fewer do not determine the map."""
+VERSION = 7  # part of the cache key: raise it when the algorithm changes
+MIN_VERTICES = MORE_SIGNS + 3  # minimum number of vertices of a surface: two more than eigenfunctions
+MIN_LANDMARKS = 5  # minimum number of landmarks between different subjects: fewer do not determine the map
 _SURE_SCORE = 0.62  # score of a spectral map below which more initial maps are tried
 _SCORE_SHARE = 0.5  # weight of a map's score relative to the stretch of its fit
 _NEAR_LANDMARK = 0.1  # largest landmark error of a spectral map, for a surface of unit area
@@ -53,7 +40,6 @@ _RESCALED = 0.02  # logarithm of the global scale above which the fit is repeate
 
 class _Candidate(NamedTuple):
     found: Map
-    distortion: float
     scale: float
     x: FloatArray
     fit: TemplateFit
@@ -62,7 +48,7 @@ class _Candidate(NamedTuple):
     @property
     def cost(self) -> float:
         """Cost of a candidate: fit and distortion minus the score of the map."""
-        return self.quality.cost + self.distortion - _SCORE_SHARE * self.found.score
+        return self.quality.cost + self.found.distortion - _SCORE_SHARE * self.found.score
 
 
 def register(
@@ -169,21 +155,19 @@ class _RegistrationProblem:
         self.pair = CoarsePair(self.first, self.second)
         self.marks = points[:, 0] * self.size
         self.mark_places = (points[:, 1] - self.origin) / self.unit
+        both = ((self.first, self.template, self.marks), (self.second, self.target, self.mark_places))
+        found = [
+            shape.placed.nearest_alike(at, surface.face_normals[surface.closest(at).faces])
+            for shape, surface, at in both
+        ]
         #: Landmarks as coarse vertices. *Shape:* ``(n, 2)``.
-        self.mark_vertices = np.zeros((0, 2), dtype=np.int64)
-        if len(points):
-            both = ((self.first, self.template, self.marks), (self.second, self.target, self.mark_places))
-            found = [
-                shape.placed.nearest_alike(at, surface.face_normals[surface.closest(at).faces])
-                for shape, surface, at in both
-            ]
-            self.mark_vertices = np.stack(found, axis=1)
+        self.mark_vertices = np.stack(found, axis=1)
         #: Score minus distortion of the best map onto the mirrored target.
         self.mirrored = -np.inf
 
     def solve(self) -> Registration:
         rivals = self._rivals(self._maps())
-        candidates = sorted((self._coarse(*rival) for rival in rivals), key=lambda one: one.cost)
+        candidates = sorted((self._coarse(rival) for rival in rivals), key=lambda one: one.cost)
         close = [self._refined(one) for one in candidates if one.cost < candidates[0].cost + _CLOSE]
         best, *others = sorted(close, key=lambda one: one.cost)
         # Advantage of the best fit over another one; most fits along other maps end at the best one.
@@ -205,9 +189,8 @@ class _RegistrationProblem:
         return maps if maps[0].score >= _SURE_SCORE else maps + self._spectral(MORE_SIGNS)
 
     def _spectral(self, n_signs: int) -> list[Map]:
-        self.progress.expect(2**n_signs + N_OTHER_STARTS)
-        *maps, other = self.pair.from_spectra(n_signs, tick=self.progress.update)
-        self.mirrored = max(self.mirrored, other.mirrored_score - self.pair.distortion(other.vertices))
+        *maps, other = self.pair.from_spectra(n_signs, self.progress)
+        self.mirrored = max(self.mirrored, other.mirrored_score - other.distortion)
         return maps
 
     def _agrees(self, found: Map) -> bool:
@@ -216,50 +199,36 @@ class _RegistrationProblem:
         errors = np.linalg.norm(places[found.vertices[here]] - places[target], axis=1)
         return bool((errors < _NEAR_LANDMARK).all())
 
-    def _rivals(self, maps: list[Map]) -> list[tuple[Map, float]]:
-        """Different maps that will be fitted, found and repaired ones, with their distortions."""
+    def _rivals(self, maps: list[Map]) -> list[Map]:
+        """Different maps that will be fitted, found and repaired ones."""
         repaired = [self.pair.repaired(found) for found in maps] if self.same_subject else []
         everything = [*maps, *(found for found in repaired if found is not None and self._agrees(found))]
-        rated = [(found, self.pair.distortion(found.vertices)) for found in everything]
-        rated.sort(key=lambda one: one[1] - one[0].score)
-        places = self.second.coarse.vertices
-        kept = rated[:1]
-        for found, distortion in rated[1:]:
-            apart = min(difference(places[found.vertices], places[one.vertices]) for one, _ in kept)
-            lead = (found.score - distortion) - (rated[0][0].score - rated[0][1])
-            if len(kept) < _RIVALS and lead > -_RIVAL_SCORE and apart > SAME:
-                kept.append((found, distortion))
+        best, *others = sorted(everything, key=lambda one: one.distortion - one.score)
+        kept = [best]
+        for found in others:
+            lead = (found.score - found.distortion) - (best.score - best.distortion)
+            if len(kept) < _RIVALS and lead > -_RIVAL_SCORE and found.differs(kept):
+                kept.append(found)
         return kept
 
     # ------------------------------------------------------------------------------------------------------------- fits
-    def _coarse(self, found: Map, distortion: float, scale: float = 1.0, x: FloatArray | None = None) -> _Candidate:
+    def _coarse(self, found: Map, scale: float = 1.0, x: FloatArray | None = None) -> _Candidate:
         template = self.first.placed.moved(scale * self.first.placed.vertices)
         back = self.second.placed
         fit = self._fit(template, back, found.vertices, scale)
-        self.progress.expect(len(MAP_WEIGHTS) + sum(n_steps for *_, n_steps in COARSE_STAGES))
-        places = self.second.placed.vertices[found.vertices]
+        places = back.vertices[found.vertices]
         if x is None:
             rest, goal, areas = map(torch.from_numpy, (template.vertices, places, template.vertex_areas))
             with torch.no_grad():
                 placed = best_fit(rest, goal, areas).apply(rest).numpy()
             x = fit.follow_map(placed, places)
         x = fit.run(x, COARSE_STAGES, releases=2)
-        return _Candidate(found, distortion, scale, x, fit, measure(template, x, back)[0])
+        return _Candidate(found, scale, x, fit, measure(template, x, back)[0])
 
     def _fit(self, template: MeshSurface, back: MeshSurface, images: IntArray, scale: float) -> TemplateFit:
-        landmarks = None
-        if len(self.marks):
-            rows = template.rows(template.closest(self.marks * scale))
-            landmarks = (rows, self.mark_places)
+        marks = self.marks * scale, self.mark_places
         return TemplateFit(
-            template,
-            self.target,
-            back,
-            self.second,
-            images,
-            landmarks,
-            stretchable=not self.same_subject,
-            tick=self.progress.update,
+            template, self.target, back, self.second, images, marks, self.progress, stretchable=not self.same_subject
         )
 
     def _refined(self, candidate: _Candidate) -> _Candidate:
@@ -271,7 +240,7 @@ class _RegistrationProblem:
             shape = self.first.placed.moved(candidate.x)
             vertices = self.second.placed.nearest_alike(shape.vertices, shape.vertex_normals)
             found = self.pair.refined(vertices, FINE_FUNCTIONS) if spectral else self.pair.rated(vertices)
-            again = self._coarse(found, self.pair.distortion(found.vertices))
+            again = self._coarse(found)
             if again.cost > most:
                 break
             if np.linalg.norm(again.x - candidate.x, axis=1).mean() < _CONVERGED:
@@ -287,7 +256,7 @@ class _RegistrationProblem:
         change = float(np.median(np.log(np.maximum(now, 1e-12) / np.maximum(rest, 1e-12))))
         if not self.same_subject or abs(change) < _RESCALED:
             return candidate
-        again = self._coarse(candidate.found, candidate.distortion, float(np.exp(change)), candidate.x)
+        again = self._coarse(candidate.found, float(np.exp(change)), candidate.x)
         return again if again.quality.cost <= candidate.quality.cost else candidate
 
     def _fine(self, candidate: _Candidate) -> tuple[FloatArray, FloatArray]:
@@ -298,7 +267,6 @@ class _RegistrationProblem:
         start = _carried(template.vertices, coarse, x, frames)
         images = self.second.placed.nearest_alike(start, template.moved(start).vertex_normals)
         fit = self._fit(template, self.target, images, candidate.scale)
-        self.progress.expect(sum(n_steps for *_, n_steps in FINE_STAGES))
         found = fit.run(start, FINE_STAGES, releases=1)
         everything = _carried(self.rest * candidate.scale, coarse, x, frames)
         everything[self.used] = found
@@ -309,24 +277,21 @@ class _RegistrationProblem:
         quality, supported = measure(self.template, x, self.target)
         coarse = best.fit.template.moved(best.x)
         images = self.second.placed.nearest_alike(coarse.vertices, coarse.vertex_normals)
-        score = self.pair.rated(images).score
+        rated = self.pair.rated(images)
         # Where sheets touch, the image of a sample may lie on the wrong one; the map has no such errors.
-        distortion = min(best.distortion, self.pair.distortion(images))
-        errors = np.zeros(0)
-        if len(self.marks):
-            rows = self.template.rows(self.template.closest(self.marks))
-            errors = np.linalg.norm(rows @ x - self.mark_places, axis=1)
+        score, distortion = rated.score, min(best.found.distortion, rated.distortion)
+        rows = self.template.rows(self.template.closest(self.marks))
+        errors = np.linalg.norm(rows @ x - self.mark_places, axis=1)
         mirrored = float(self.mirrored - (score - distortion))
+        near = self.first.placed.nearest_alike(self.template.vertices, self.template.vertex_normals)
         if self.same_subject:
             # Of a vertex in a wrong place, many distances are wrong; of the others, the few to such vertices.
             misplaced = np.quantile(self.pair.errors(images), _MOST, axis=1)
-            near = self.first.placed.nearest_alike(self.template.vertices, self.template.vertex_normals)
             supported = np.minimum(supported, ramp(misplaced, *_MISPLACED)[near])
         lost = float(self.template.vertex_areas[supported < TRUSTED].sum() / self.template.area)
         quality = quality._replace(unsupported_area=max(quality.unsupported_area, lost))
         freedom = sliding_freedom(self.first, self.mark_vertices[:, 0])
         confidence, said = judge(quality, score, distortion, errors, mirrored, lead, freedom, self.same_subject)
-        near = self.first.placed.nearest_alike(self.template.vertices, self.template.vertex_normals)
         unique = np.minimum(self.unique[near], ramp(freedom, *SLIDING))
         of_vertices = np.full(len(everything), confidence)
         of_vertices[self.used] = np.minimum(supported, unique)

@@ -13,13 +13,10 @@ from torch_modal.geometry.closest import dot
 from torch_modal.io.write import to_numpy
 from torch_modal.registration.surface import MeshSurface, referenced
 
-TRUSTED = 0.5
-"""Confidence below which a result is doubtful."""
+TRUSTED = 0.5  # confidence below which a result is doubtful
 
-SLIDING = 0.9, 0.65
-"""Freedom to slide along the target: no confidence, full confidence."""
-LEAD = 0.0, 0.1
-"""Advantage over the best fit along another map: no confidence, full confidence."""
+SLIDING = 0.9, 0.65  # freedom to slide along the target: no confidence, full confidence
+LEAD = 0.0, 0.1  # advantage over the best fit along another map: no confidence, full confidence
 _FAR = 0.01  # distance from the target above which a face is unsupported, in diagonals
 _SHRUNK = 0.2  # area change relative to the median below which a face is unsupported: missing parts collapse
 _STRAY = 0.03  # distance from the template above which a piece of the target is ignored, in diagonals
@@ -156,16 +153,14 @@ class Registration(NamedTuple):
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> "Registration":
         """Inverse of `arrays`."""
-        fields: dict[str, Any] = {}
-        for name, array in arrays.items():
-            if name == "warnings":
-                fields[name] = tuple(line for line in array.tobytes().decode().split("\n") if line)
-            elif name in ("to_target", "from_target"):
-                fields[name] = Distances(*array.tolist())
-            elif cls.__annotations__[name] in (float, int):
-                fields[name] = array.reshape(-1)[0].item()
+        fields: dict[str, Any] = {"warnings": tuple(arrays["warnings"].tobytes().decode().splitlines())}
+        for name in arrays.keys() - fields.keys():
+            if cls.__annotations__[name] in (float, int):
+                fields[name] = arrays[name].item()
+            elif cls.__annotations__[name] is Distances:
+                fields[name] = Distances(*arrays[name].tolist())
             else:
-                fields[name] = torch.from_numpy(array)
+                fields[name] = torch.from_numpy(arrays[name])
         return cls(**fields)
 
     def sample(self, values: Any) -> torch.Tensor:

@@ -16,10 +16,8 @@ from torch_modal.geometry.vectors import vertex_normals
 
 LEAN = 0.01
 """Weight of normals relative to positions, in diagonals; distinguishes sheets closer than twice this distance."""
-DUST = 0.01
-"""Part of the area below which a connected piece is ignored."""
-CUT = 0.04
-"""Widest cut through a surface that is closed, in diagonals."""
+DUST = 0.01  # part of the area below which a connected piece is ignored
+CUT = 0.04  # widest cut through a surface that is closed, in diagonals
 
 
 class Closest(NamedTuple):
