@@ -139,14 +139,14 @@ class Recent:
     def __reduce__(self) -> tuple[Any, ...]:
         return Recent, (self.limit,)  # copies and pickles are empty
 
-    def get(self, key: Hashable, make: Callable[[], Any]) -> Any:
+    def get(self, key: Hashable, make: Callable[[], Made]) -> Made:
         """The object of a key; computed if it is not in the cache, by :func:`made_outside`."""
         if key not in self._kept:
             while len(self._kept) >= self.limit:  # before making, so that there are never more
                 self._kept.popitem(last=False)
             self._kept[key] = made_outside(make)
         self._kept.move_to_end(key)
-        return self._kept[key]
+        return self._kept[key]  # type: ignore[no-any-return]
 
     def __len__(self) -> int:
         return len(self._kept)

@@ -152,8 +152,7 @@ class ShapeDataset(Dataset[Sample]):
 
     def _open(self, number: int) -> tuple[ShapeSpace, ShapeBatch]:
         """The space of a set, and its key-frames with their labels."""
-        found: tuple[ShapeSpace, ShapeBatch] = self._opened.get(number, lambda: self._read(number))
-        return found
+        return self._opened.get(number, lambda: self._read(number))
 
     def _read(self, number: int) -> tuple[ShapeSpace, ShapeBatch]:
         stored = StoredSet(self.sets[number])

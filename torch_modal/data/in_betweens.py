@@ -120,8 +120,7 @@ class InBetweens:
         times = self.times
         if times is None:
             raise ValueError("a space of times=None solves each in-between: it has no tables")
-        found: Tensor = self._tables.get((i, j), lambda: self._stored_or_solved(i, j, times))
-        return found
+        return self._tables.get((i, j), lambda: self._stored_or_solved(i, j, times))
 
     def _stored_or_solved(self, i: int, j: int, times: int) -> Tensor:
         def solved() -> tuple[Tensor, bool]:
@@ -137,8 +136,7 @@ class InBetweens:
             ends = [self.bases[i], self.bases[j]]
             return InBetween(ends, self.faces, **self.settings._asdict()).to(like)
 
-        found: InBetween = self._solvers.get((i, j, like.dtype, like.device), made)
-        return found
+        return self._solvers.get((i, j, like.dtype, like.device), made)
 
     def _solved(self, i: int, j: int, t: Tensor) -> InBetweenResult:
         """Solve between two key-frames: along the motion if they follow each other in it, else of the pair."""
@@ -158,8 +156,7 @@ class InBetweens:
         if span is not None:
             start, end = torch.tensor(span, dtype=torch.float64, device=t.device)
             t = torch.lerp(start, end, t.double())  # exact at both ends
-        found: InBetweenResult = path.solve(shapes, t)
-        return found
+        return path.solve(shapes, t)
 
     def _key(self, i: int, j: int) -> dict[str, str] | None:
         """Digest of all inputs of a table; None, with a warning, if the objective has terms of the user's own."""

@@ -145,15 +145,11 @@ class ShapeSpace:
     def reconstruction(self, device: torch.device | str = "cpu") -> Reconstruction:
         """The Poisson problem of the connectivity. The first key-frame's weights serve for all shapes."""
         device = torch.device(device)
-        found: Reconstruction = self._made.get(
-            device, lambda: Reconstruction(self._keyframes[0], self.faces).to(device)
-        )
-        return found
+        return self._made.get(device, lambda: Reconstruction(self._keyframes[0], self.faces).to(device))
 
     def mode_scales(self, index: int) -> Tensor:
         """Scales of the modes of a key-frame (:func:`~torch_modal.data.strain.mode_scales`). *Shape:* ``(k,)``."""
-        found: Tensor = self._made.get(index, lambda: mode_scales(self.bases[index], self.faces))
-        return found
+        return self._made.get(index, lambda: mode_scales(self.bases[index], self.faces))
 
     # ----------------------------------------------------------------------------------------------------- statistics
     @torch.no_grad()
@@ -198,8 +194,7 @@ class ShapeSpace:
             raise ValueError(
                 "one key-frame alone does not vary; a space for sample, fit or components needs two or more"
             )
-        found: Variation = self._made.get("variation", lambda: Variation(self._keyframes, self.faces))
-        return found
+        return self._made.get("variation", lambda: Variation(self._keyframes, self.faces))
 
     @torch.no_grad()
     def sample(
@@ -252,8 +247,7 @@ class ShapeSpace:
             content = content_digest([*versions(), self._keyframes, self.faces, str(self.dtype), *settings])
             return stored_or_made(folder / "between-all.safetensors", {"content": content}, drawn)
 
-        found: Tensor = self._made.get(settings, table)
-        return found
+        return self._made.get(settings, table)
 
     def fit(
         self, points: Tensor, vertices: Tensor, *, near: int | Tensor | None = None, robust: bool = False

@@ -196,8 +196,7 @@ def solve_exported(edges: Tensor, weights: Tensor, free: Tensor, right: Tensor) 
     def make() -> SparseSolver:
         return SparseSolver(graph_laplacian(given[0], given[1], right.shape[-2]), given[2].copy())
 
-    solver: SparseSolver = _EXPORTED.get(tuple(x.tobytes() for x in given), make)
-    return solver(right)
+    return _EXPORTED.get(tuple(x.tobytes() for x in given), make)(right)
 
 
 @solve_exported.register_fake
