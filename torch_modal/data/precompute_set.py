@@ -14,7 +14,6 @@ import json
 import os
 import signal
 import socket
-import subprocess
 import sys
 import tempfile
 import threading
@@ -32,7 +31,7 @@ from torch_modal.io.cache import CACHE_VERSION, content_digest
 from torch_modal.io.files import write_file
 from torch_modal.keyframes.arrays import checked_times
 from torch_modal.modes.extract import Method, extract_bases
-from torch_modal.modes.processes import describe_exit, end_process, last_line
+from torch_modal.modes.processes import describe_exit, last_line, run_child
 from torch_modal.modes.tetrahedra import Mesher
 from torch_modal.modes.tetwild import Auto, TetWild
 from torch_modal.registration.load import load_keyframes
@@ -48,7 +47,6 @@ THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB
 TIMES_FILE = "times.txt"
 FAILURE_FILE = "precompute-failure.json"
 """Record of a set without result; that of a result is the note of the stored set."""
-POLL = 0.5
 GRACE = 5.0
 """Seconds between interrupting a process and killing it."""
 OWN_GRACE = 30.0
@@ -142,7 +140,7 @@ def run_set(
         return before, False
 
     started = time.monotonic()
-    reason, log = _in_own_process(source / name, target, new, options, stop)
+    reason, log = _in_own_process(source / name, target, new, options, stop or threading.Event())
     found = read_record(target)
     if found is not None and found.status == DONE and found.key == new.key:
         return found, True  # by this process, or by another run meanwhile
@@ -170,48 +168,21 @@ def _obstacle(folder: Path, overwrite: bool) -> str:
 
 
 def _in_own_process(
-    source: Path, target: Path, record: Record, options: Options, stop: threading.Event | None
+    source: Path, target: Path, record: Record, options: Options, stop: threading.Event
 ) -> tuple[str | None, str]:
     """Why an interpreter of its own has no result for the set, None if it was stopped; and the end of its output."""
-    # Ctrl-C reaches this process alone; the other, whose session is new, ends itself when the pipe from here closes.
-    end, ended = time.monotonic() + options.timeout, False
     with tempfile.TemporaryDirectory(prefix="torch_modal-set-", ignore_cleanup_errors=True) as scratch:
-        reason_file, log_file = Path(scratch) / "reason.txt", Path(scratch) / "log.txt"
+        reason = Path(scratch) / "reason.txt"
         job = {"source": str(source), "target": str(target), "record": asdict(record), "options": asdict(options)}
-        with log_file.open("wb") as log:
-            process = subprocess.Popen(
-                [*COMMAND, str(reason_file)],
-                stdin=subprocess.PIPE,
-                stdout=log,
-                stderr=subprocess.STDOUT,
-                cwd=scratch,
-                env={**os.environ, **dict.fromkeys(THREADS, "1"), "TMPDIR": scratch},
-                start_new_session=True,
-            )
-        try:
-            assert process.stdin is not None
-            with contextlib.suppress(BrokenPipeError):  # it ended at once; its exit status says more
-                process.stdin.write(json.dumps(job).encode() + b"\n")
-                process.stdin.flush()
-            while not ended and time.monotonic() < end and not (stop is not None and stop.is_set()):
-                with contextlib.suppress(subprocess.TimeoutExpired):
-                    process.wait(min(POLL, max(end - time.monotonic(), 0.0)))
-                    ended = True
-        finally:
-            # Interrupted first, so that it ends the mesher, whose session is another.
-            if process.poll() is None:
-                process.send_signal(signal.SIGINT if os.name == "posix" else signal.SIGTERM)
-                with contextlib.suppress(subprocess.TimeoutExpired):
-                    process.wait(GRACE)
-            end_process(process)
-            with contextlib.suppress(OSError):
-                process.communicate()  # closes the pipe
-        said, code = log_file.read_text(errors="replace")[-2000:], process.returncode
-        if not ended:
-            stopped = stop is not None and stop.is_set()
-            return None if stopped else f"no result after the timeout of {options.timeout:g} s", said
-        if reason_file.is_file():
-            return reason_file.read_text(), said
+        environment = {**os.environ, **dict.fromkeys(THREADS, "1"), "TMPDIR": scratch}
+        line, command = json.dumps(job).encode() + b"\n", [*COMMAND, str(reason)]
+        # Interrupted first, so that it ends the mesher, whose session is another.
+        code, said = run_child(command, Path(scratch), options.timeout, stop, line, environment, GRACE)
+        said = said[-2000:]
+        if code is None:
+            return None if stop.is_set() else f"no result after the timeout of {options.timeout:g} s", said
+        if reason.is_file():
+            return reason.read_text(), said
         hint = "perhaps memory ran out" if code == -signal.SIGKILL else last_line(said)
         return f"its process ended with {describe_exit(code)}" + (f" ({hint})" if hint else ""), said
 

@@ -1,12 +1,9 @@
 """fTetWild in a child process: conforming tetrahedra inside a surface."""
 
-import contextlib
 import signal
-import subprocess
 import sys
 import tempfile
 import threading
-import time
 import zipfile
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
@@ -19,7 +16,7 @@ from scipy.spatial import cKDTree
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.modes.lattice import Lattice
 from torch_modal.modes.parallel import StoppedError
-from torch_modal.modes.processes import describe_exit, end_process, last_line
+from torch_modal.modes.processes import describe_exit, last_line, run_child
 from torch_modal.modes.surface import CanonicalSurface, clearances, self_proximity
 from torch_modal.modes.tetrahedra import Tetrahedra, TetrahedralizationError, oriented, without_debris
 from torch_modal.progress import logger
@@ -154,37 +151,21 @@ def _run_worker(points: FloatArray, faces: IntArray, settings: TetWild, stop: th
             "sys.executable is empty, so no worker process can be started. Run in a normal interpreter"
         )
     with tempfile.TemporaryDirectory(prefix="torch_modal-", ignore_cleanup_errors=True) as folder:
-        job, result, log = (Path(folder) / name for name in ("job.npz", "result.npz", "log.txt"))
+        job, result = (Path(folder) / name for name in ("job.npz", "result.npz"))
         np.savez(job, vertices=points, faces=faces, **asdict(settings))
-        # Output goes to a file: a full pipe would block the child.
-        with log.open("wb") as output:
-            process = subprocess.Popen(
-                [sys.executable, str(WORKER), str(job), str(result)],
-                stdin=subprocess.DEVNULL,
-                stdout=output,
-                stderr=subprocess.STDOUT,
-                cwd=folder,  # fTetWild leaves a __tracked_surface.stl where it runs
-                # A separate process group can be killed as a whole, and Ctrl-C reaches only this process.
-                start_new_session=True,
+        # In the folder, as fTetWild leaves a __tracked_surface.stl where it runs.
+        command = [sys.executable, str(WORKER), str(job), str(result)]
+        code, said = run_child(command, Path(folder), settings.timeout, stop)
+        if code is None and stop.is_set():
+            raise StoppedError
+        if code is None:
+            raise TetrahedralizationError(
+                f"no result after the timeout of {settings.timeout:g} s. "
+                "Give a longer timeout, a larger edge_length_fac, or a surface without self-intersections"
             )
-        end = time.monotonic() + settings.timeout
-        try:
-            # Polled, as Ctrl-C cannot interrupt a single wait on every platform.
-            while process.poll() is None:
-                if stop.is_set():
-                    raise StoppedError
-                if (left := end - time.monotonic()) <= 0:
-                    raise TetrahedralizationError(
-                        f"no result after the timeout of {settings.timeout:g} s. "
-                        "Give a longer timeout, a larger edge_length_fac, or a surface without self-intersections"
-                    )
-                with contextlib.suppress(subprocess.TimeoutExpired):
-                    process.wait(min(left, 0.2))
-        finally:
-            end_process(process)  # also on KeyboardInterrupt
-        if (code := process.returncode) != 0:
+        if code != 0:
             over = f"its processor_time of {settings.processor_time:g} s is over"
-            tail = over if code == _TIME_IS_OVER else last_line(log.read_text(errors="replace"))
+            tail = over if code == _TIME_IS_OVER else last_line(said)
             raise TetrahedralizationError(
                 f"the worker process ended with {describe_exit(code)}{f' ({tail})' if tail else ''}. "
                 "Check the surface for self-intersections and degenerate faces, or try other settings",
