@@ -69,7 +69,7 @@ def precompute_tree(
     say(f"{len(sets)} sets of key-frames in {root}")
     records: dict[str, Record] = {}
     started, n_now = time.monotonic(), 0
-    with _dask_cluster(scheduler) if scheduler else _local_processes(workers) as (executor, stop):
+    with _executor(workers, scheduler) as (executor, stop):
         futures: dict[Future[tuple[Record, bool]], str] = {}
         try:
             with tqdm(total=len(sets), unit="set", leave=False, dynamic_ncols=True, disable=not bar) as shown:
@@ -101,23 +101,16 @@ def precompute_tree(
 
 
 @contextmanager
-def _local_processes(workers: int | None) -> Iterator[tuple[Executor, Any]]:
-    """Threads that each wait for the process of one set, and the event that ends them."""
-    stop = threading.Event()
-    executor = ThreadPoolExecutor(workers or n_cpus(), thread_name_prefix="torch_modal-set")
-    try:
-        yield executor, stop
-    finally:
-        stop.set()
-        executor.shutdown(cancel_futures=True)
-
-
-@contextmanager
-def _dask_cluster(address: str) -> Iterator[tuple[Executor, Any]]:
-    """The workers of a Dask cluster, and an event on its scheduler: running tasks cannot be cancelled from outside."""
+def _executor(workers: int | None, scheduler: str | None) -> Iterator[tuple[Executor, Any]]:
+    """Threads that each wait for the process of one set, or the workers of a cluster; and the event that ends them."""
+    if not scheduler:
+        with ThreadPoolExecutor(workers or n_cpus(), thread_name_prefix="torch_modal-set") as executor:
+            yield executor, threading.Event()
+        return
     # Sets of a dead worker go to others, until one has killed several (distributed.scheduler.allowed-failures).
     distributed = require("distributed", "dask", "a Dask cluster")
-    with distributed.Client(address, set_as_default=False) as client:
+    with distributed.Client(scheduler, set_as_default=False) as client:
+        # An event on the scheduler: running tasks cannot be cancelled from outside.
         yield client.get_executor(pure=False, retries=RETRIES), distributed.Event(client=client)
 
 
