@@ -8,15 +8,8 @@ import torch
 from torch_modal.registration.load import load_keyframes
 
 FOLDER = Path(__file__).parents[1] / "samples"
-
-
 SAMPLES: dict[str, dict[str, Any]] = {
-    "creature": {
-        "true_times": (0.5, 1.5, 2.5, 3.5, 4.5, 5.5),
-        "cyclic": True,
-        "seconds": 1.0,
-        "view": (22.0, 9.0),
-    },
+    "creature": {"true_times": (0.5, 1.5, 2.5, 3.5, 4.5, 5.5), "cyclic": True, "seconds": 1.0, "view": (22.0, 9.0)},
     "hand": {"true_times": (0.25, 0.5, 0.75), "cyclic": False, "seconds": 1.5, "view": (-55.0, 12.0)},
 }
 """Further fields of each :class:`Sample`."""

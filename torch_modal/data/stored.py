@@ -74,8 +74,7 @@ class Motion:
         if n < 3 or step not in (1, back):
             return None
         first = i if step == 1 else j
-        period = self.times[-1] - self.times[0]
-        start, end = (float(self.times[place % n] + place // n * period) for place in (first, first + 1))
+        start, end = self.times[first : first + 2].tolist()
         return (start, end) if step == 1 else (end, start)
 
 
