@@ -14,6 +14,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from torch_modal.arrays import FloatArray, IntArray
+from torch_modal.geometry.connectivity import double_areas
 from torch_modal.modes.lattice import Lattice
 from torch_modal.modes.parallel import StoppedError
 from torch_modal.modes.processes import describe_exit, last_line, run_child
@@ -105,8 +106,8 @@ class TetWild:
             thickness = surface.thickness
             if self_proximity(surface) <= TOUCHING:  # otherwise, that of the overlap of two parts is measured
                 thin = clearances(surface)[0]
-                corners, order = surface.points[surface.faces], np.argsort(thin)
-                areas = np.linalg.norm(np.cross(*np.moveaxis(np.diff(corners, axis=1), 1, 0)), axis=1)[order].cumsum()
+                order = np.argsort(thin)
+                areas = double_areas(surface.points, surface.faces)[order].cumsum()
                 thickness = min(thickness, thin[order][np.searchsorted(areas, THIN_PART * areas[-1])])
             edges = EDGES_PER_THICKNESS * thickness / np.linalg.norm(high - low)
             edge_length_fac = float(np.clip(edges, *EDGE_RANGE))
