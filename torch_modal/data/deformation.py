@@ -51,11 +51,7 @@ class RandomModalDeformation(ShapeAugmentation):
     shown = ("strain", "max_strain")
 
     def __init__(
-        self,
-        strain: float | tuple[float, float] = (0.0, 0.02),
-        max_strain: float = 0.2,
-        p: float = 0.5,
-        **options: Any,
+        self, strain: float | tuple[float, float] = (0.0, 0.02), max_strain: float = 0.2, p: float = 0.5, **options: Any
     ) -> None:
         super().__init__(p, **options)
         strain = (strain, strain) if isinstance(strain, (int, float)) else strain

@@ -198,12 +198,7 @@ class ShapeSpace:
 
     @torch.no_grad()
     def sample(
-        self,
-        n: int,
-        generator: torch.Generator | None = None,
-        *,
-        concentration: float = 0.2,
-        locality: float = 3.0,
+        self, n: int, generator: torch.Generator | None = None, *, concentration: float = 0.2, locality: float = 3.0
     ) -> Tensor:
         """New members: random mixtures of the key-frames, with weights that vary from part to part of the surface.
 

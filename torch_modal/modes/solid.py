@@ -14,14 +14,7 @@ from torch_modal.modes.eigen import ElasticBody
 from torch_modal.modes.embedding import N_NEIGHBOURS, find_neighbours, fit_weights
 from torch_modal.modes.stiffness import HessianForm, arap_hessian, mass_matrix
 from torch_modal.modes.surface import CanonicalSurface
-from torch_modal.modes.tetrahedra import (
-    Mesher,
-    Tetrahedra,
-    kept_tetrahedra,
-    loose_pieces,
-    small_pieces,
-    solid_volumes,
-)
+from torch_modal.modes.tetrahedra import Mesher, Tetrahedra, kept_tetrahedra, loose_pieces, small_pieces, solid_volumes
 
 REACH = 2.0
 """Radius of the region that a small piece follows, relative to its distance from the body or its own size."""
