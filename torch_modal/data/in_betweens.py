@@ -1,10 +1,12 @@
 """In-betweens of key-frames in pairs, of which tables are kept, and of shapes near them."""
 
 import contextlib
+import math
 import os
 import warnings
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -34,14 +36,7 @@ class InBetweens:
     nearest key-frames. K key-frames have K (K - 1) / 2 pairs: layers and tables are made for those that are used, and
     the most recent stay in memory.
 
-    Args:
-        bases: The basis of each key-frame.
-        faces: Vertex indices. *Shape:* ``(F, 3)``.
-        settings: What the in-betweens minimise, and how they are solved.
-        motion: The order of the key-frames in time, if they are a motion.
-        times: Number of even times in a table, at least 4; None: there are no tables, and each in-between is solved.
-        dtype: Of the tables.
-        folder: Stores tables between runs, if it is given and writable.
+    Arguments are what :class:`~torch_modal.data.space.ShapeSpace` makes of its own; the folder need not be writable.
 
     Raises:
         ValueError: ``times`` is below 4.
@@ -205,12 +200,7 @@ def interpolate(table: Tensor, t: Tensor) -> Tensor:
     start = (place.detach().floor().long() - 1).clamp(0, n - 4)
     x = place - start
     # The basis polynomials of the nodes 0, 1, 2, 3.
-    weights = [
-        (1 - x) * (2 - x) * (3 - x) / 6,
-        x * (2 - x) * (3 - x) / 2,
-        x * (x - 1) * (3 - x) / 2,
-        x * (x - 1) * (x - 2) / 6,
-    ]
+    weights: list[Any] = [math.prod((x - j) / (i - j) for j in range(4) if j != i) for i in range(4)]
     return sum(weight[:, None, None] * table[start + i] for i, weight in enumerate(weights))  # type: ignore[return-value]
 
 
