@@ -6,7 +6,7 @@ from collections.abc import Callable
 import numpy as np
 
 from torch_modal.arrays import BoolArray, FloatArray, IntArray
-from torch_modal.modes.tetrahedra import Tetrahedra, oriented
+from torch_modal.modes.tetrahedra import EDGES, Tetrahedra, oriented
 
 UNITS = 256
 """Integer coordinates along the edge of a cube, so that edges can be bisected eight times."""
@@ -14,7 +14,6 @@ _ORDERS = np.array(list(itertools.permutations(range(3))))
 """Orders of the axes, each a path from the lowest corner of a cube to the highest. *Shape:* ``(6, 3)``."""
 _PATHS = np.array([[np.isin(range(3), order[:step]) for step in range(4)] for order in _ORDERS]).astype(np.int64)
 """Their corners, six tetrahedra: adjacent cubes cut their common face in the same way. *Shape:* ``(6, 4, 3)``."""
-_EDGES = np.array([(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)])
 _SECOND_HALF = np.array([(0, 1, 2, 3), (1, 1, 2, 3), (1, 2, 2, 3), (1, 2, 3, 3)])
 """Corners of the second half by the end of the bisected edge; the midpoint replaces the one at its place."""
 
@@ -104,7 +103,7 @@ class _Mesh:
             # Unchanged tetrahedra can only have a hanging vertex, the midpoint of an edge, that is new.
             for those, vertices in ((~changed, added), (changed, self.vertices)):
                 if len(vertices):
-                    middles = self.tets[those][:, _EDGES].sum(axis=2) // 2
+                    middles = self.tets[those][:, EDGES].sum(axis=2) // 2
                     place = np.minimum(np.searchsorted(vertices, middles), len(vertices) - 1)
                     chosen[those] = (vertices[place] == middles).any(axis=1)
 

@@ -95,15 +95,13 @@ def vertex_rotations(before: FloatArray, after: FloatArray, faces: IntArray) -> 
     It is the nearest to the mean by area of those of the faces. *Shape:* ``(U, 3), (U, 3), (F, 3) -> (U, 3, 3)``.
     """
     frames = []
-    for x in (before, after):
-        corners = x[faces]
-        one, two = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    for x in (after, before):
+        one, two = (x[faces[:, corner]] - x[faces[:, 0]] for corner in (1, 2))
         normal = np.cross(one, two)
-        # Scaled like the edges, so that the gradient does not depend on the size of the face.
         area = np.linalg.norm(normal, axis=1)
-        normal /= np.maximum(np.sqrt(area), 1e-300)[:, None]
-        frames.append((np.stack([one, two, normal], axis=2), area))
-    (rest, area), (posed, _) = frames
+        # Scaled like the edges, so that the gradient does not depend on the size of the face.
+        frames.append(np.stack([one, two, normal / np.maximum(np.sqrt(area), 1e-300)[:, None]], axis=2))
+    posed, rest = frames
     usable = area > 1e-12 * area.max()
     gradients = np.zeros((len(faces), 3, 3))
     gradients[usable] = posed[usable] @ np.linalg.inv(rest[usable])

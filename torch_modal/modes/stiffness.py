@@ -6,7 +6,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from torch_modal.arrays import FloatArray
-from torch_modal.modes.tetrahedra import Tetrahedra, solid_volumes
+from torch_modal.modes.tetrahedra import EDGES, Tetrahedra, solid_volumes
 
 HessianForm = Literal["edge", "vertex"]
 HESSIAN_FORMS: tuple[HessianForm, ...] = ("edge", "vertex")
@@ -78,9 +78,6 @@ def hat_gradients(tetrahedra: Tetrahedra) -> FloatArray:
     return np.concatenate([-gradients.sum(axis=1, keepdims=True), gradients], axis=1)
 
 
-_EDGES = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
-
-
 def _edge_hessian(tetrahedra: Tetrahedra) -> sp.csc_matrix:
     """Blocks ``K_ab = sum_e vol_e ((g_a · g_b) I + g_b g_aᵀ)`` with the mean hat gradients ``g`` around each edge.
 
@@ -91,7 +88,7 @@ def _edge_hessian(tetrahedra: Tetrahedra) -> sp.csc_matrix:
     starts = 12 * np.arange(t + 1)
     gradients = sp.csr_matrix((hat_gradients(tetrahedra).reshape(-1), columns.reshape(-1), starts), shape=(t, 3 * n))
 
-    ends = np.sort(np.concatenate([tetrahedra.tets[:, pair] for pair in _EDGES]), axis=1)
+    ends = np.sort(np.concatenate([tetrahedra.tets[:, pair] for pair in EDGES]), axis=1)
     edge = np.unique(ends[:, 0] * n + ends[:, 1], return_inverse=True)[1].reshape(-1)
     shares = np.tile(solid_volumes(tetrahedra) / 6, 6)
     volumes = np.bincount(edge, shares)

@@ -10,6 +10,8 @@ from torch_modal.arrays import BoolArray, FloatArray, IntArray
 from torch_modal.geometry.connectivity import connected_pieces
 from torch_modal.modes.surface import CanonicalSurface
 
+EDGES = np.array([(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)])
+"""Corners at the ends of the edges of a tetrahedron. *Shape:* ``(6, 2)``."""
 SMALL_AMOUNT = 0.01
 """Largest volume (or area, of a surface) of a small piece, as a fraction of the whole."""
 SMALL_SIZE = 0.1
