@@ -139,10 +139,5 @@ def _vertex_gradients(motions: FloatArray, points: FloatArray, faces: IntArray) 
     # How the normal turns, in the directions of the plane.
     lifts = [np.einsum("fck,fc->fk", move, normals) for move in moves]
     turned = -sum(hat[:, :, None] * lift[:, None] for hat, lift in zip(hats, lifts, strict=True))
-    parts = [*moves, turned]
-    found = np.empty((3, n, 3, k))
-    for axis in range(3):
-        along = (*(hat[:, axis] for hat in hats), normals[:, axis])
-        gradient = sum(part * slope[:, None, None] for part, slope in zip(parts, along, strict=True))
-        found[axis] = ((share.T @ gradient.reshape(len(faces), -1)) / total).reshape(n, 3, k)
-    return found
+    gradients = np.einsum("pfck,pfa->fack", np.stack([*moves, turned]), np.stack([*hats, normals]))
+    return np.moveaxis(((share.T @ gradients.reshape(len(faces), -1)) / total).reshape(n, 3, 3, k), 1, 0)
