@@ -128,8 +128,7 @@ def rigid_motions(positions: FloatArray, inertia: sp.csr_matrix) -> FloatArray:
     centered = centered / np.sqrt((centered**2).sum(axis=1).mean())
     motions = np.zeros((len(positions), 3, N_RIGID))
     motions[:, :, :3] = np.eye(3)
-    for axis in range(3):
-        motions[:, :, 3 + axis] = np.cross(np.eye(3)[axis], centered)
+    motions[:, :, 3:] = np.cross(centered[:, None], np.eye(3))  # row c has coordinate c of the three rotations
     return _orthonormal(motions.reshape(-1, N_RIGID), inertia)
 
 

@@ -119,10 +119,7 @@ def _vertex_hessian(tetrahedra: Tetrahedra) -> sp.csc_matrix:
     inertia = np.einsum("ei,ei->e", edges, edges)[:, None, None] * np.eye(3) - edges[:, :, None] * edges[:, None, :]
     weighted = (weights[:, None, None] * inertia).reshape(-1, 9)
     c = np.stack([np.bincount(tail, column, minlength=n) for column in weighted.T], axis=1).reshape(n, 3, 3)
-    cross = np.zeros((len(tail), 3, 3))  # the matrix of e ×
-    cross[:, [2, 0, 1], [1, 2, 0]] = edges[:, [0, 1, 2]]
-    cross[:, [1, 2, 0], [2, 0, 1]] = -edges[:, [0, 1, 2]]
-    cross *= weights[:, None, None]
+    cross = weights[:, None, None] * np.cross(np.eye(3), edges[:, None])  # the matrix of e ×, row by row
     starts, number = np.searchsorted(tail, np.arange(n + 1)), np.arange(len(tail))
     moments = sp.bsr_matrix((cross, number, starts), shape=(3 * n, 3 * len(tail)))
     ones = np.ones(len(tail))
