@@ -71,17 +71,12 @@ def sheet_body(surface: CanonicalSurface, n_modes: int) -> ElasticBody:
         if np.array_equal(coarsening.clusters, np.arange(len(surface.points))):
             return motions
         weights = _cluster_weights(coarsening.clusters, surface, fine, points, mesh)
-        n = len(points)
-        arms = surface.points[weights.row] - points[weights.col]
-        blend = sp.csr_matrix(
-            (
-                np.concatenate([weights.data, *(weights.data * arms.T)]),
-                (np.tile(weights.row, 4), np.concatenate([weights.col + part * n for part in range(4)])),
-            ),
-            shape=(len(surface.points), 4 * n),
-        )
-        local = np.concatenate([motions[None], _vertex_gradients(motions, points, mesh.faces)]).reshape(4 * n, -1)
-        return (blend @ local).reshape(-1, *motions.shape[1:])
+        entries = weights.row, weights.col
+        arms = (surface.points[weights.row] - points[weights.col]).T
+        slopes = [sp.coo_matrix((weights.data * along, entries), weights.shape) for along in arms]
+        local = np.concatenate([motions[None], _vertex_gradients(motions, points, mesh.faces)])
+        blend = sp.hstack([weights, *slopes], format="csr")
+        return (blend @ local.reshape(blend.shape[1], -1)).reshape(-1, *motions.shape[1:])
 
     return ElasticBody(points, stiffness, mass, to_surface, SHIFT, LARGEST_RESIDUAL)
 
