@@ -141,7 +141,7 @@ def _nearest_reached(
     # if there is none, somewhat beyond the last vertex.
     last = np.take_along_axis(squared, count[:, None] - 1, axis=1)
     radius = np.where(np.isfinite(squared[:, -1:]), squared[:, -1:], 1.2 * last)
-    kernel = np.clip(1 - np.where(np.isfinite(squared), squared, np.inf) / np.maximum(radius, 1e-300), 0, None) ** 2
+    kernel = np.clip(1 - squared / np.maximum(radius, 1e-300), 0, None) ** 2
     vertex = np.maximum(np.take_along_axis(index, order, axis=1)[:, :N_NEIGHBOURS], 0)
     return vertex, kernel[:, :N_NEIGHBOURS], count
 

@@ -167,11 +167,8 @@ def bases_of_checked(
         # lambda ~ 1 / length², and phi ~ length^(-3/2) since phi' M phi = 1 with a mass ~ length³.
         modes = np.zeros((n_modes, *shape.shape))
         modes[:, surface.used] = one["modes"] @ surface.axes * surface.scale**1.5
-        values = (one[name] * surface.scale**2 for name in ("eigenvalues", "rigid_eigenvalues"))
-        eigenvalues, rigid_eigenvalues = map(torch.from_numpy, values)
-        bases.append(
-            ModalBasis(torch.from_numpy(shape.copy()), eigenvalues, torch.from_numpy(modes), rigid_eigenvalues)
-        )
+        eigenvalues, rigid_eigenvalues = (one[name] * surface.scale**2 for name in ("eigenvalues", "rigid_eigenvalues"))
+        bases.append(ModalBasis(*map(torch.from_numpy, (shape.copy(), eigenvalues, modes, rigid_eigenvalues))))
     return bases
 
 
