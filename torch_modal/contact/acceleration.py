@@ -38,11 +38,7 @@ class AccelerationLimit:
     """
 
     def __init__(
-        self,
-        shapes: Tensor,
-        rotations: Tensor,
-        goes_on: tuple[bool, bool] = (False, False),
-        most: float | None = None,
+        self, shapes: Tensor, rotations: Tensor, goes_on: tuple[bool, bool] = (False, False), most: float | None = None
     ) -> None:
         x = shapes.double().nan_to_num()
         own = x[2:] - 2 * x[1:-1] + x[:-2]

@@ -14,15 +14,7 @@ from torch_modal.geometry.clusters import Clusters, beyond_a_turn
 from torch_modal.geometry.connectivity import Connectivity, spanning_forest
 from torch_modal.geometry.poisson import Poisson
 from torch_modal.geometry.rotations import agreeing, arc, conjugate, mean, product, quaternion, rotate, turned
-from torch_modal.geometry.triangle_frames import (
-    Frames,
-    Sides,
-    doubled_areas,
-    edge_means,
-    frames_of,
-    mapped,
-    stretched,
-)
+from torch_modal.geometry.triangle_frames import Frames, Sides, doubled_areas, edge_means, frames_of, mapped, stretched
 from torch_modal.geometry.vectors import pick
 
 # The tree along which turns are compared avoids slivers, whose normals mean little: one with an altitude of this part

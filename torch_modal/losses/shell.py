@@ -59,11 +59,7 @@ class ShellLoss(ShellEnergy):
 
     @lasting
     def __init__(
-        self,
-        faces: Tensor,
-        alpha: float | Tensor = 1.0,
-        beta: float | Tensor = BEND,
-        gamma: float | Tensor = VOLUME,
+        self, faces: Tensor, alpha: float | Tensor = 1.0, beta: float | Tensor = BEND, gamma: float | Tensor = VOLUME
     ) -> None:
         super().__init__(faces, alpha, beta, gamma)
         mesh = Connectivity(as_faces(faces))

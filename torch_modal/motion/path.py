@@ -215,13 +215,7 @@ class Path(PreciseModule):
 
     @full_precision
     def within(
-        self,
-        knots: list[Knots] | None,
-        flat: Tensor,
-        i: int,
-        which: Tensor,
-        u: Tensor,
-        n_searched: int = N_SEARCHED,
+        self, knots: list[Knots] | None, flat: Tensor, i: int, which: Tensor, u: Tensor, n_searched: int = N_SEARCHED
     ) -> InBetweenResult:
         """Shapes of one interval.
 
