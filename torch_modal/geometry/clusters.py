@@ -2,11 +2,10 @@
 
 import numpy as np
 import torch
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import breadth_first_order
 from torch import Tensor, nn
 
 from torch_modal.arrays import FloatArray, IntArray
+from torch_modal.geometry.connectivity import traversal
 from torch_modal.geometry.rotations import arc, conjugate, mean, product
 from torch_modal.geometry.vectors import pick
 
@@ -94,14 +93,11 @@ def _from_mean(turns: Tensor, areas: Tensor, ancestors: Tensor, piece: Tensor) -
 def _clusters(turns: FloatArray, middles: IntArray, parents: IntArray) -> tuple[IntArray, IntArray, IntArray]:
     """The cluster of each triangle, ``(F,)``; the root of each cluster, and its parent, C where none, ``(C,)`` each."""
     n = len(parents)
-    # An extra node above the middles: one traversal visits all pieces.
-    ends = np.append(np.arange(n), np.full(len(middles), n)), np.append(parents, middles)
-    tree = coo_matrix((np.ones(len(ends[0])), ends), shape=(n + 1, n + 1)).tocsr()
-    order, before = breadth_first_order(tree, n, directed=False)
+    order, before = traversal(np.arange(n), parents, middles, n)
     cluster = np.empty(n, dtype=np.int64)
     roots: list[int] = []
     above: list[int] = []
-    for f in order[1:]:
+    for f in order:
         own = -1 if before[f] == n else cluster[before[f]]
         if own < 0 or _half_spread(turns[f], turns[roots[own]]) > WIDEST / 2:
             above.append(own)

@@ -135,20 +135,26 @@ def spanning_forest(n: int, pairs: IntArray, costs: FloatArray) -> tuple[IntArra
     Returns:
         The parent of each node, itself for a root; its connected component. *Shape:* ``(n,)`` each.
     """
-    graph = sparse.coo_matrix((costs, pairs.T), shape=(n, n)).tocsr()
-    if graph.nnz < len(pairs):  # duplicate edges, whose costs were summed
-        key = pairs[:, 0] * n + pairs[:, 1]
-        order = np.lexsort((costs, key))
-        order = order[np.flatnonzero(np.diff(key[order], prepend=-1))]
-        graph = sparse.coo_matrix((costs[order], pairs[order].T), shape=(n, n)).tocsr()
+    key = pairs[:, 0] * n + pairs[:, 1]
+    order = np.lexsort((costs, key))
+    order = order[np.flatnonzero(np.diff(key[order], prepend=-1))]  # of duplicate edges the cheapest
+    graph = sparse.coo_matrix((costs[order], pairs[order].T), shape=(n, n)).tocsr()
     tree = minimum_spanning_tree(graph).tocoo()
     piece = connected_components(tree, directed=False)[1].astype(np.int64)
-    # An extra node above all roots: one traversal visits all components.
-    roots = np.unique(piece, return_index=True)[1]
-    ends = np.append(tree.row, np.full(len(roots), n)), np.append(tree.col, roots)
-    whole = sparse.coo_matrix((np.ones(len(ends[0])), ends), shape=(n + 1, n + 1)).tocsr()
-    parents = breadth_first_order(whole, n, directed=False)[1][:n]
+    parents = traversal(tree.row, tree.col, np.unique(piece, return_index=True)[1], n)[1]
     return np.where(parents == n, np.arange(n), parents).astype(np.int64), piece
+
+
+def traversal(one: IntArray, other: IntArray, roots: IntArray, n: int) -> tuple[IntArray, IntArray]:
+    """The nodes of a forest by breadth from its roots, and the one before each, n where none. *Shape:* ``(n,)`` each.
+
+    The forest joins the nodes ``one`` with ``other``. *Shape:* ``(m,)``.
+    """
+    # An extra node above all roots: one traversal visits all trees.
+    ends = np.append(one, np.full(len(roots), n)), np.append(other, roots)
+    whole = sparse.coo_matrix((np.ones(len(ends[0])), ends), shape=(n + 1, n + 1)).tocsr()
+    order, before = breadth_first_order(whole, n, directed=False)
+    return order[1:], before[:n]
 
 
 def half_cotangents(vertices: FloatArray, mesh: Connectivity) -> FloatArray:

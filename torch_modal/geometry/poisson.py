@@ -138,9 +138,12 @@ class Reconstruction(nn.Module):
         self.register_buffer("areas", torch.from_numpy(vertex_areas(shape, mesh.faces)), persistent=False)
         weights = torch.zeros(len(mesh.edges), dtype=torch.float64).index_add(0, self.sides, self.weights)
         self.poisson = Poisson(mesh, weights, self.areas)
-        loose = self._loose(shape, mesh)
+        labels, areas = mesh.vertex_pieces, self.areas.numpy()
+        pieces = [np.flatnonzero(labels == label) for label in np.unique(labels[mesh.used])]
+        largest, *loose = sorted(pieces, key=lambda piece: -float(areas[piece].sum()))
         self.n_loose = len(loose)
-        for i, (piece, anchors) in enumerate(loose):
+        for i, piece in enumerate(loose):
+            anchors = largest[_nearest(shape[largest], shape[piece])]
             self.register_buffer(f"piece_{i}", torch.from_numpy(piece), persistent=False)
             self.register_buffer(f"anchors_{i}", torch.from_numpy(anchors), persistent=False)
 
@@ -153,12 +156,6 @@ class Reconstruction(nn.Module):
     def loose(self) -> list[tuple[Tensor, Tensor]]:
         """Vertices of each piece except the largest, and vertices of the largest that it follows."""
         return [(getattr(self, f"piece_{i}"), getattr(self, f"anchors_{i}")) for i in range(self.n_loose)]
-
-    def _loose(self, shape: FloatArray, mesh: Connectivity) -> list[tuple[IntArray, IntArray]]:
-        labels, areas = mesh.vertex_pieces, self.areas.numpy()
-        pieces = [np.flatnonzero(labels == label) for label in np.unique(labels[mesh.used])]
-        pieces.sort(key=lambda piece: -float(areas[piece].sum()))
-        return [(piece, pieces[0][_nearest(shape[pieces[0]], shape[piece])]) for piece in pieces[1:]]
 
     def forward(self, wanted: Sides, rest: Tensor) -> Tensor:
         """The shape with the centroid of ``rest``. Unreferenced vertices do not move.
@@ -185,7 +182,6 @@ def _nearest(points: FloatArray, piece: FloatArray) -> IntArray:
     """Indices of a few points nearest to a piece."""
     count = min(_N_ANCHORS, len(points))
     distances, found = KDTree(points).query(piece, k=min(count, 4))
-    found, distances = np.asarray(found).reshape(-1), np.asarray(distances).reshape(-1)
-    order = found[np.argsort(distances, kind="stable")]
+    order = np.ravel(found)[np.argsort(np.ravel(distances), kind="stable")]
     _, first = np.unique(order, return_index=True)
     return order[np.sort(first)][:count]

@@ -126,8 +126,11 @@ def arc(q: Tensor) -> Tensor:
 
 def about(half: Tensor) -> Tensor:
     """Quaternion of axis times half the angle, the inverse of :func:`arc`. *Shape:* ``(3, ...) -> (4, ...)``."""
-    cosine, sinc = _cos_and_sinc((half * half).sum(0))
-    return torch.cat([cosine[None], sinc * half])
+    squared = (half * half).sum(0)
+    small = squared < SMALL
+    near, angle = torch.where(small, squared, 0), torch.where(small, 1, squared).sqrt()
+    cosine = torch.where(small, _series(_COS, near), angle.cos())
+    return torch.cat([cosine[None], torch.where(small, _series(_SINC, near), angle.sin() / angle) * half])
 
 
 def mean(rotations: Tensor, weights: Tensor) -> Tensor:
@@ -199,14 +202,6 @@ def _mean_step(found: Tensor, rotations: Tensor, weights: Tensor) -> Tensor:
     cofactors = cross(b, c), cross(c, a), cross(a, b)
     step = sum(x * part for x, part in zip(downhill, cofactors, strict=True)) / (a * cofactors[0]).sum(0)
     return product(found, about(step))
-
-
-def _cos_and_sinc(squared: Tensor) -> tuple[Tensor, Tensor]:
-    """``cos(a)`` and ``sin(a) / a`` from the squared angle."""
-    small = squared < SMALL
-    near, angle = torch.where(small, squared, 0), torch.where(small, 1, squared).sqrt()
-    cosine, sinc = angle.cos(), angle.sin() / angle
-    return torch.where(small, _series(_COS, near), cosine), torch.where(small, _series(_SINC, near), sinc)
 
 
 def _series(factors: list[float], x: Tensor) -> Tensor:

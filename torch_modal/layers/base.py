@@ -94,6 +94,24 @@ class PreciseModule(nn.Module):
         names = [f"{prefix}bases.{i}.reference" for i in range(len(self.bases))]
         checked_surface([given.get(name, own[name]).double().cpu() for name in names], self.faces.cpu())
 
+    def check_shapes(self, **given: Tensor) -> None:
+        """Raise where shapes do not fit the module.
+
+        Raises:
+            ValueError: One is no tensor, no shape of the mesh, or on another device.
+        """
+        reference = self.bases[0].reference
+        for name, x in given.items():
+            if not isinstance(x, Tensor):
+                raise ValueError(f"{name} is a {type(x).__name__}; pass a tensor, for instance torch.as_tensor({name})")
+            if x.shape[-2:] != reference.shape or not x.is_floating_point():
+                raise ValueError(
+                    f"{name} must be floating-point of shape (..., {len(reference)}, 3) as the bases are; got "
+                    f"{tuple(x.shape)} of {x.dtype}"
+                )
+            if x.device != reference.device:
+                raise ValueError(f"{name} is on {x.device}, the layer on {reference.device}; move one with .to()")
+
     def _marks(self) -> Tensor:
         """Numbers that tell the bases from others. *Shape:* ``(K, 3)``."""
         return torch.stack([torch.cat([b.reference, *b.modes[-1:]]).square().mean(0) for b in self.bases])
@@ -193,25 +211,6 @@ class InBetweenLayer(PreciseModule):
         for i, (own, core) in enumerate(zip(self.vertices, self.cores, strict=True)):
             found.append(core(Samples(flat[:, :, own], pulls, mu, self.stiffness_of(pulls, lead, i))))
         return of_bodies(found, self.vertices).unflattened(lead)
-
-    # ------------------------------------------------------------------------------------------------------ the border
-    def check_shapes(self, **given: Tensor) -> None:
-        """Raise where shapes do not fit the layer.
-
-        Raises:
-            ValueError: One is no tensor, no shape of the mesh, or on another device.
-        """
-        reference = self.bases[0].reference
-        for name, x in given.items():
-            if not isinstance(x, Tensor):
-                raise ValueError(f"{name} is a {type(x).__name__}; pass a tensor, for instance torch.as_tensor({name})")
-            if x.shape[-2:] != reference.shape or not x.is_floating_point():
-                raise ValueError(
-                    f"{name} must be floating-point of shape (..., {len(reference)}, 3) as the bases are; got "
-                    f"{tuple(x.shape)} of {x.dtype}"
-                )
-            if x.device != reference.device:
-                raise ValueError(f"{name} is on {x.device}, the layer on {reference.device}; move one with .to()")
 
     def mu_of(self, like: Tensor, lead: torch.Size) -> Tensor:
         """``mu`` of a flat batch of these leading dimensions. *Shape:* ``(B,)``."""

@@ -287,16 +287,12 @@ class Path(PreciseModule):
 
     def _located(self, keyframes: Tensor, t: Tensor | float) -> tuple[Tensor, Tensor, Tensor, Tensor, torch.Size]:
         """Motions, *shape* ``(L, K, V, 3)``; of each shape the motion, the interval, and the time there; dimensions."""
-        reference = self.bases[0].reference
-        wanted = (self.n_keyframes, *reference.shape)
-        if not isinstance(keyframes, Tensor) or not keyframes.is_floating_point() or keyframes.shape[-3:] != wanted:
-            is_tensor = isinstance(keyframes, Tensor)
-            got = f"{tuple(keyframes.shape)} of {keyframes.dtype}" if is_tensor else type(keyframes).__name__
+        self.check_shapes(keyframes=keyframes)
+        n, n_vertices = self.n_keyframes, keyframes.shape[-2]
+        if keyframes.shape[-3:-2] != (n,):
             raise ValueError(
-                f"keyframes of this path are floating-point of shape (..., {', '.join(map(str, wanted))}); got {got}"
+                f"keyframes of this path have the shape (..., {n}, {n_vertices}, 3); got {tuple(keyframes.shape)}"
             )
-        if keyframes.device != reference.device:
-            raise ValueError(f"keyframes are on {keyframes.device}, the path on {reference.device}; move one")
         require_numbers("Path", keyframes)
         self._require_own_bases()
         rounding = torch.finfo(t.dtype).eps if isinstance(t, Tensor) and t.is_floating_point() else 0.0
@@ -316,11 +312,9 @@ class Path(PreciseModule):
 
 
 def joined(parts: Sequence[InBetweenResult], order: Tensor) -> InBetweenResult:
-    """Flat batches as one.
+    """Flat batches as one, by where each shape of the whole stands among the parts. *Shape:* ``(B,)``.
 
-    Args:
-        parts: One or more. Where numbers of modes differ, zeros follow the amplitudes.
-        order: Where each shape of the whole stands among the parts. *Shape:* ``(B,)``.
+    Where numbers of modes differ, zeros follow the amplitudes.
     """
     widest = max(part.solution.amplitudes.shape[-1] for part in parts)
     wide = [nn.functional.pad(p.solution.amplitudes, (0, widest - p.solution.amplitudes.shape[-1])) for p in parts]

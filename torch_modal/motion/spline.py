@@ -77,9 +77,8 @@ class Spline(nn.Module):
         one, other = torch.tensor(mesh.face_neighbours).unbind(1)
         for i in range(1, len(times) - 1):
             ends = references[[i, (i + 1) % n]]
-            plain = first.clusters is None
-            if plain:
-                plain = not beyond_a_turn(*first.wound([frames_of(x[None], first.faces) for x in ends]))
+            between = first.wound([frames_of(x[None], first.faces) for x in ends])
+            plain = first.clusters is None and not beyond_a_turn(*between)
             if plain:
                 turns = first.turns(ends[:1], ends[1:])[:, 0]
                 plain = bool(((pick(turns, one) * pick(turns, other)).sum(0) >= 0).all())
@@ -122,16 +121,8 @@ class Spline(nn.Module):
         unit = torch.maximum(unit, SMALLEST * unit.mean(-1, keepdim=True))
         unit = torch.cat([torch.ones_like(unit)[None].expand(3, -1, -1), unit[None].expand(3, -1, -1)])
         triangles = Cubics(*(unit * part for part in through(torch.stack(steps) / unit, 1)))
-        return Knots(
-            usable,
-            shapes,
-            rotations,
-            centres,
-            triangles,
-            through(shapes.diff(dim=0)),
-            through(log(back.mT)),
-            through(centres.diff(dim=0)),
-        )
+        vertices, moves = through(shapes.diff(dim=0)), through(centres.diff(dim=0))
+        return Knots(usable, shapes, rotations, centres, triangles, vertices, through(log(back.mT)), moves)
 
     def trajectory(self, knots: Knots, i: int) -> Trajectory:
         """The cubics of the triangles in one interval."""

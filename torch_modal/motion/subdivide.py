@@ -133,7 +133,8 @@ def subdivide(
     total = (len(places) - 1) * (1 if by_path else levels)
     with ProgressReport(total, "in-between shapes", progress) as bar, torch.no_grad():
         if by_path:
-            parts = _along_path(keyframes, faces, made, places, times, cyclic, smooth, chosen)
+            path = Path(made, faces.cpu(), times, cyclic, smooth, objective=chosen.objective, solver=chosen.solver)
+            parts = _along_path(path.to(keyframes.device), keyframes, faces, places)
         else:
             parts = _by_recursion(keyframes, faces, made, places, levels, n_frames, chosen, bar)
         for i, shapes in enumerate(parts):
@@ -144,24 +145,14 @@ def subdivide(
     return carrier.carried(sequence, places, given) if carrier else sequence
 
 
-def _along_path(
-    keyframes: Tensor,
-    faces: Tensor,
-    bases: Sequence[ModalBasis] | Tensor,
-    places: Sequence[int],
-    times: Tensor | Sequence[float] | None,
-    cyclic: bool,
-    smooth: bool,
-    chosen: Settings,
-) -> Iterator[Tensor]:
+def _along_path(path: Path, keyframes: Tensor, faces: Tensor, places: Sequence[int]) -> Iterator[Tensor]:
     """Shapes between the key-frames of each interval."""
-    path = Path(bases, faces.cpu(), times, cyclic, smooth, objective=chosen.objective, solver=chosen.solver)
-    motion = keyframes[None].to(path.to(keyframes.device).dtype)
+    motion = keyframes[None].to(path.dtype)
     knots, left = path.knots(motion), 0
     for i, n in enumerate(b - a for a, b in pairwise(places)):
         u = torch.arange(1, n).to(motion) / n
         result = path.within(knots, motion, i, torch.zeros_like(u, dtype=torch.int64), u, n_searched=n - 1)
-        report(result.solution, chosen.solver)
+        report(result.solution, path.solver)
         if result.solution.n_crossing is not None:
             left += int((result.solution.n_crossing > 0).sum())
         yield result.shapes

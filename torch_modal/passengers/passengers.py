@@ -11,7 +11,8 @@ from torch import Tensor, nn
 
 from torch_modal.autograd import full_precision, lasting, plain
 from torch_modal.geometry.rigid import best_rotation
-from torch_modal.geometry.vectors import cross, inverse, norm, pick
+from torch_modal.geometry.triangle_frames import sides
+from torch_modal.geometry.vectors import cross, inverse, norm
 from torch_modal.keyframes.arrays import as_faces
 from torch_modal.passengers.binding import binding
 
@@ -73,17 +74,15 @@ class Passengers(nn.Module):
         ):
             raise ValueError(f"anchors hold a vertex of {len(reference)} for each of {len(points)} points, or -1")
         own, bound = (x.detach().double().cpu() for x in (reference, points))
-        first, second, _ = _sides(own.mT, corners)
-        if not bool(cross(first, second).any()):
+        if not bool(cross(*sides(own.mT, corners)).any()):
             raise ValueError("no face of the reference has an area: there is no surface to follow")
         known = None if anchors is None else anchors.detach().cpu().numpy()
         self._bind(own, bound, corners, binding(bound.numpy(), own.numpy(), corners.numpy(), known))
         self.to(reference)
 
     def _bind(self, reference: Tensor, points: Tensor, faces: Tensor, weights: sparse.csr_matrix) -> None:
-        self.register_buffer("faces", faces, persistent=False)
-        self.register_buffer("reference", reference, persistent=False)
-        self.register_buffer("points", points, persistent=False)
+        for name, given in (("faces", faces), ("reference", reference), ("points", points)):
+            self.register_buffer(name, given, persistent=False)
         first, second, normal = _sides(reference.mT, faces)
         area = 0.5 * norm(cross(first, second))
         flat = area <= 1e-12 * area.mean()
@@ -93,8 +92,7 @@ class Passengers(nn.Module):
         self.register_buffer("areas", torch.where(flat, 0, area), persistent=False)
         # Weights by rows, and their transpose: torch would make it anew at each backward pass.
         for prefix, matrix in (("", weights), ("transposed_", weights.T.tocsr())):
-            parts = {"starts": matrix.indptr, "columns": matrix.indices, "values": matrix.data}
-            for name, part in parts.items():
+            for name, part in (("starts", matrix.indptr), ("columns", matrix.indices), ("values", matrix.data)):
                 self.register_buffer(prefix + name, torch.from_numpy(part), persistent=False)
 
     @property
@@ -210,8 +208,7 @@ def _csr(starts: Tensor, columns: Tensor, values: Tensor, shape: tuple[int, int]
 
 def _sides(rows: Tensor, faces: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Two sides and the unit normal of each triangle. *Shape:* ``(3, ..., V) -> (3, ..., F)`` each."""
-    origin, first, second = (pick(rows, corner) for corner in faces.T)
-    first, second = first - origin, second - origin
+    first, second = sides(rows, faces)
     normal = cross(first, second)
     length = norm(normal)
     return first, second, normal * inverse(length, (normal * normal).sum(0) <= 0)
