@@ -22,14 +22,8 @@ GENERIC = np.array([1.0, 0.6180339887, 0.3247179572])
 def size(points: FloatArray, faces: IntArray) -> float:
     """``2 sqrt(3)`` times the radius of gyration of a surface: the length of a rod, the box diagonal of a sphere.
 
-    The bounding-box diagonal depends on the axes and on the tips of limbs.
-
-    Args:
-        points: *Shape:* ``(V, 3)``.
-        faces: Vertex indices. *Shape:* ``(F, 3)``.
-
-    Returns:
-        The size in the units of the points; for a surface without area, the bounding-box diagonal.
+    Of a surface without area it is the bounding-box diagonal, which depends on the axes and on the tips of limbs.
+    *Shape:* ``(V, 3), (F, 3)``.
     """
     return _moments(points, faces)[2]
 
@@ -40,14 +34,10 @@ def own_order(shapes: Sequence[FloatArray], faces: IntArray) -> list[int]:
 
 
 def placed(points: FloatArray, faces: IntArray) -> tuple[FloatArray, FloatArray, FloatArray, float]:
-    """A shape in its principal axes, centred, with a size of 100.
+    """A shape in its principal axes, centred, with a size of 100. *Shape:* ``(V, 3), (F, 3)``.
 
     The signs of the axes follow from the third moments. Undetermined axes and signs, as in symmetric shapes, are close
     to the caller's.
-
-    Args:
-        points: *Shape:* ``(V, 3)``.
-        faces: Vertex indices. *Shape:* ``(F, 3)``.
 
     Returns:
         Rounded coordinates along the axes, ``(V, 3)``; the axes, rows of a rotation, ``(3, 3)``; the centroid,

@@ -16,13 +16,7 @@ def leaves(faces: IntArray, shapes: FloatArray) -> IntArray:
     """Faces as leaves of a binary tree, split on each level along the longest axis of their centres.
 
     Node 1 is the root, node ``i`` has the children ``2 i`` and ``2 i + 1``, and the last ``F`` nodes are the leaves.
-
-    Args:
-        faces: *Shape:* ``(F, 3)``.
-        shapes: Shapes in which the faces of a node should be close. *Shape:* ``(K, V, 3)``.
-
-    Returns:
-        Face of each leaf. *Shape:* ``(F,)``.
+    The faces of a node are close in all of the shapes. *Shape:* ``(F, 3), (K, V, 3) -> (F,)``.
     """
     points = np.concatenate(shapes[:, faces].mean(2), 1)
     n = len(points)
@@ -51,12 +45,7 @@ def leaves(faces: IntArray, shapes: FloatArray) -> IntArray:
 
 
 class ClosestFaces:
-    """Exact queries for the closest triangle of a surface.
-
-    Args:
-        vertices: *Shape:* ``(V, 3)``.
-        faces: At least one. *Shape:* ``(F, 3)``.
-    """
+    """Exact queries for the closest triangle of a surface, which has one or more. *Shape:* ``(V, 3), (F, 3)``."""
 
     def __init__(self, vertices: FloatArray, faces: IntArray) -> None:
         #: *Shape:* ``(F, 3, 3)``.
@@ -98,12 +87,7 @@ class ClosestFaces:
 def closest_on_triangles(points: FloatArray, corners: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Barycentric coordinates of the closest points on triangles, and the distances.
 
-    Args:
-        points: *Shape:* ``(..., 3)``.
-        corners: *Shape:* ``(..., 3, 3)``.
-
-    Returns:
-        *Shape:* ``(..., 3)``, ``(...)``.
+    *Shape:* ``(..., 3), (..., 3, 3) -> (..., 3), (...)``.
     """
     a = corners[..., 0, :]
     first, second, to_point = corners[..., 1, :] - a, corners[..., 2, :] - a, points - a

@@ -106,12 +106,7 @@ def merge_seams(shapes: FloatArray, faces: IntArray) -> IntArray:
     Two vertices are merged if both lie on a boundary and coincide in every shape. Surfaces that merely touch stay
     separate: closed ones have no boundary, and open ones part in some shape.
 
-    Args:
-        shapes: *Shape:* ``(K, V, 3)``.
-        faces: *Shape:* ``(F, 3)``.
-
-    Returns:
-        Index of the merged vertex of each vertex, numbered by first vertices. *Shape:* ``(V,)``.
+    Merged vertices are numbered by first vertices. *Shape:* ``(K, V, 3), (F, 3) -> (V,)``.
     """
     n = shapes.shape[1]
     boundary = np.unique(Connectivity(faces).boundary_edges)
@@ -125,12 +120,9 @@ def merge_seams(shapes: FloatArray, faces: IntArray) -> IntArray:
 
 
 def spanning_forest(n: int, pairs: IntArray, costs: FloatArray) -> tuple[IntArray, IntArray]:
-    """Minimum spanning forest of a graph.
+    """Minimum spanning forest of a graph of n nodes, from its edges and their positive costs.
 
-    Args:
-        n: Number of nodes.
-        pairs: Edges, the smaller node first. *Shape:* ``(m, 2)``.
-        costs: Positive edge costs. *Shape:* ``(m,)``.
+    The smaller node of an edge is the first. *Shape:* ``(m, 2), (m,)``.
 
     Returns:
         The parent of each node, itself for a root; its connected component. *Shape:* ``(n,)`` each.

@@ -71,18 +71,16 @@ class Crossings:
     @cached_property
     def incidence(self) -> sparse.csr_matrix:
         """One of a vertex and a face around it. *Shape:* ``(V, F)``."""
-        faces = self.mesh.faces
-        owners = np.repeat(np.arange(len(faces)), 3)
-        shape = self.mesh.n_vertices, len(faces)
-        return sparse.coo_matrix((np.ones(3 * len(faces)), (faces.reshape(-1), owners)), shape=shape).tocsr()
+        n = len(self.mesh.faces)
+        ends = self.mesh.faces.reshape(-1), np.repeat(np.arange(n), 3)
+        return sparse.coo_matrix((np.ones(3 * n), ends), (self.mesh.n_vertices, n)).tocsr()
 
     @cached_property
     def lengths(self) -> sparse.csr_matrix:
         """Edge lengths as a graph. *Shape:* ``(V, V)``."""
         i, j = self.mesh.edges.T
         length = np.maximum(np.linalg.norm(self.like[i] - self.like[j], axis=1), 1e-12 * self.diagonal)
-        n = self.mesh.n_vertices
-        half = sparse.coo_matrix((length, (i, j)), shape=(n, n))
+        half = sparse.coo_matrix((length, (i, j)), (self.mesh.n_vertices,) * 2)
         return (half + half.T).tocsr()
 
     @cached_property
@@ -151,10 +149,10 @@ class Crossings:
 
     def reach(self, x: FloatArray, pairs: IntArray) -> float:
         """Largest reach of triangles of given pairs through each other, along a normal. *Shape:* ``(P, 2)``."""
-        least = np.full(len(pairs), np.inf)
+        surface, least = Surface(self, x), np.full(len(pairs), np.inf)
         for own, other in (pairs.T, pairs.T[::-1]):
-            a, b, c = x[self.mesh.faces[other]].transpose(1, 0, 2)
-            height = dot(x[self.mesh.faces[own]] - a[:, None], _unit(cross(b - a, c - a))[:, None])
+            arms = x[self.mesh.faces[own]] - x[self.mesh.faces[other, :1]]
+            height = dot(arms, surface.normals[other][:, None])
             least = np.minimum(least, np.minimum(height.max(1), -height.min(1)))
         return float(least.max(initial=0.0))
 
@@ -179,12 +177,7 @@ class Crossings:
         return far
 
     def separated(self, vertices: IntArray, faces: IntArray) -> BoolArray:
-        """True where a vertex and a face are more than :data:`FAR` apart along the surface.
-
-        Args:
-            vertices: *Shape:* ``(n,)``.
-            faces: Their corners. *Shape:* ``(n, 3)``.
-        """
+        """True where a vertex and a face are more than :data:`FAR` apart on the surface. *Shape:* ``(n,), (n, 3)``."""
         own, which = np.unique(vertices, return_inverse=True)
         new = [v for v in own.tolist() if v not in self._near]
         for part in (new[i : i + 256] for i in range(0, len(new), 256)):
@@ -210,11 +203,8 @@ class Crossings:
     def inside(self, x: FloatArray, pairs: IntArray) -> BoolArray:
         """Vertices that are inside since parts went through each other.
 
-        They are inside by winding number, were not so in any known shape, and hang together with the given pairs.
-
-        Args:
-            x: *Shape:* ``(V, 3)``.
-            pairs: Faces that cross far from each other. *Shape:* ``(P, 2)``.
+        They are inside by winding number, were not so in any known shape, and hang together with the given pairs of
+        faces, which cross far from each other. *Shape:* ``(V, 3), (P, 2) -> (V,)``.
         """
         corners = np.zeros(self.mesh.n_vertices, dtype=bool)
         corners[self.mesh.faces[pairs.reshape(-1)]] = True
@@ -252,12 +242,7 @@ class Crossings:
 
 
 class Surface:
-    """A shape, with its normals.
-
-    Args:
-        crossings: Of its connectivity.
-        x: *Shape:* ``(V, 3)``.
-    """
+    """A shape, with its normals. *Shape:* ``(V, 3)``."""
 
     def __init__(self, crossings: Crossings, x: FloatArray) -> None:
         self.x, self.faces, self._incidence = x, crossings.mesh.faces, crossings.incidence

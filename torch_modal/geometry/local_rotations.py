@@ -180,28 +180,17 @@ class LocalRotations(nn.Module):
         return torch.stack([*a.coordinates(2 * arc(self._signed(a, b))), *growth])
 
     def along(self, trajectory: Trajectory, which: Tensor, t: Tensor) -> Tensor:
-        """Edge vectors of shapes on trajectories, components first.
+        """Edge vectors of shapes on the trajectories of P pairs; of each the pair and the time are given.
 
-        Args:
-            trajectory: Of P pairs of shapes.
-            which: The pair of each shape. *Shape:* ``(B,)``.
-            t: Times. *Shape:* ``(B,)``.
-
-        Returns:
-            *Shape:* ``(3, B, E)``.
+        *Shape:* ``(B,), (B,) -> (3, B, E)``.
         """
         return self.bent_along(Trajectory._make(part.index_select(-2, which) for part in trajectory), t)
 
     def bent_along(self, trajectory: Trajectory, t: Tensor, bending: Tensor | None = None) -> Tensor:
         """Edge vectors of shapes on trajectories, whose triangles may be strained and turned beforehand.
 
-        Args:
-            trajectory: Of one pair, or of a pair for each shape.
-            t: *Shape:* ``(B,)``.
-            bending: In coordinates of the triangles: axis times angle, then strain. *Shape:* ``(6, B, F)``.
-
-        Returns:
-            *Shape:* ``(3, B, E)``.
+        Trajectories are of one pair, or of a pair for each shape. Bending is in coordinates of the triangles: axis
+        times angle, then strain. *Shape:* ``(B,), (6, B, F) -> (3, B, E)``.
         """
         u = t[:, None]
         straight = u * trajectory.step

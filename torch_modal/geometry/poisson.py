@@ -69,14 +69,9 @@ class Poisson(nn.Module):
         return solver
 
     def forward(self, pulls: Tensor, near: Tensor) -> Tensor:
-        """The shape that fits target edge vectors.
+        """The shape that fits target edge vectors, by their :meth:`pulls`, with the centres of the pieces of ``near``.
 
-        Args:
-            pulls: Of :meth:`pulls`. *Shape:* ``(..., V, 3)``.
-            near: A shape with the centres of the pieces of the result. *Shape:* ``(..., V, 3)``.
-
-        Returns:
-            Positions; unreferenced vertices have those of ``near``. *Shape:* ``(..., V, 3)``.
+        Unreferenced vertices have the positions of ``near``. *Shape:* ``(..., V, 3), (..., V, 3) -> (..., V, 3)``.
         """
         if torch.compiler.is_exporting():
             x = solve_exported(self.edges, self.weights, self.free, pulls)
@@ -111,11 +106,7 @@ class Poisson(nn.Module):
 class Reconstruction(nn.Module):
     r"""The shape that fits target sides of the triangles, :math:`\min_x \sum w_{ij} |x_j - x_i - s_{ij}|^2`.
 
-    The weights are cotangents of a reference, so all shapes share one factorisation.
-
-    Args:
-        reference: A shape that gives the weights. *Shape:* ``(V, 3)``.
-        faces: Vertex indices. *Shape:* ``(F, 3)``.
+    The weights are cotangents of a reference, so all shapes share one factorisation. *Shape:* ``(V, 3), (F, 3)``.
     """
 
     faces: Tensor
@@ -158,14 +149,9 @@ class Reconstruction(nn.Module):
         return [(getattr(self, f"piece_{i}"), getattr(self, f"anchors_{i}")) for i in range(self.n_loose)]
 
     def forward(self, wanted: Sides, rest: Tensor) -> Tensor:
-        """The shape with the centroid of ``rest``. Unreferenced vertices do not move.
+        """The shape of target sides with the centroid of ``rest``. Unreferenced vertices do not move.
 
-        Args:
-            wanted: Target sides of the triangles.
-            rest: The initial shape, which determines the positions of loose pieces. *Shape:* ``(3, B, V)``.
-
-        Returns:
-            *Shape:* ``(3, B, V)``.
+        The initial shape, ``rest``, determines the positions of loose pieces. *Shape:* ``(3, B, V) -> (3, B, V)``.
         """
         edges = edge_means(wanted, self.weights.to(rest), self.sides, self.signs.to(rest), len(self.edges))
         out = placed = self.poisson(self.poisson.pulls(edges), rest.movedim(0, -1)).movedim(-1, 0)

@@ -35,10 +35,8 @@ class RigidMotion(NamedTuple):
         """Motion at the time ``t`` of the geodesic from rest (0) to this motion (1).
 
         The rotation has constant angular velocity, the centroid moves on a straight line. A half turn has two shortest
-        geodesics: :func:`~torch_modal.geometry.rotations.log` chooses one.
-
-        Args:
-            t: Time, broadcast against the motion's leading dimensions. *Shape:* ``(...,)``.
+        geodesics: :func:`~torch_modal.geometry.rotations.log` chooses one. Times broadcast against the motion's leading
+        dimensions. *Shape:* ``(...,)``.
         """
         t = t[..., None]
         rotation = exp(t * log(self.rotation))
@@ -66,11 +64,7 @@ def best_rotation(covariance: Tensor) -> Tensor:
     fails on symmetric shapes, where the rotation itself is smooth. Derivatives come instead from two Newton steps at
     the solution, each of which makes them exact to a higher order.
 
-    Args:
-        covariance: *Shape:* ``(..., 3, 3)``.
-
-    Returns:
-        *Shape:* ``(..., 3, 3)``, determinant one; NaN where the covariance is not finite.
+    *Shape:* ``(..., 3, 3) -> (..., 3, 3)``, determinant one; NaN where the covariance is not finite.
     """
     known = covariance.detach()
     u, _, vh = torch.linalg.svd(known.nan_to_num(0, 0, 0))  # raises on a NaN anywhere in a batch
@@ -109,13 +103,9 @@ def best_fit(x: Tensor, y: Tensor, weights: Tensor | None = None) -> RigidMotion
 
 
 def blend(x: Tensor, y: Tensor, t: Tensor, weights: Tensor) -> Tensor:
-    """Interpolate two shapes: linear in the shape, geodesic in the rigid motion.
+    """Interpolate two shapes, at 0 and 1: linear in the shape, geodesic in the rigid motion.
 
-    Args:
-        x: Vertex positions at 0. *Shape:* ``(..., V, 3)``.
-        y: Vertex positions at 1. *Shape:* ``(..., V, 3)``.
-        t: Times. *Shape:* ``(...,)``.
-        weights: Weight of each vertex in the alignment. *Shape:* ``(V,)``.
+    Weights are those of the vertices in the alignment. *Shape:* ``(..., V, 3), (..., V, 3), (...,), (V,)``.
     """
     back = best_fit(y, x, weights)
     return back.inverse().fraction(t).apply(torch.lerp(x, back.apply(y), t[..., None, None]))
@@ -126,15 +116,7 @@ def looks_mirrored(first: Tensor, second: Tensor, faces: Tensor) -> Tensor:
     """Test whether normals agree clearly better after a reflection than after a rotation.
 
     For bodies with signed volumes of different sign: the volume of a thin plate also changes its sign if its sheets
-    intersect slightly.
-
-    Args:
-        first: *Shape:* ``(B, V, 3)``.
-        second: *Shape:* ``(B, V, 3)``.
-        faces: Vertex indices. *Shape:* ``(F, 3)``.
-
-    Returns:
-        *Shape:* ``(B,)``, bool.
+    intersect slightly. *Shape:* ``(B, V, 3), (B, V, 3), (F, 3) -> (B,)``, bool.
     """
     centres, normals = [], []
     for x in (first, second):

@@ -136,14 +136,8 @@ def about(half: Tensor) -> Tensor:
 def mean(rotations: Tensor, weights: Tensor) -> Tensor:
     """Weighted mean of K rotations, where the weighted sum of their relative logarithms vanishes.
 
-    Of two rotations it is the point on the geodesic between them. Of more it has first derivatives only.
-
-    Args:
-        rotations: Quaternions with the signs of :func:`agreeing`. *Shape:* ``(4, ..., K, F)``.
-        weights: Weights with sum one. *Shape:* ``(..., K, 1)``.
-
-    Returns:
-        *Shape:* ``(4, ..., F)``.
+    Of two rotations it is the point on the geodesic between them. Of more it has first derivatives only. Quaternions
+    have the signs of :func:`agreeing`, weights the sum one. *Shape:* ``(4, ..., K, F), (..., K, 1) -> (4, ..., F)``.
     """
     if rotations.shape[-2] == 2:
         first, second = rotations.unbind(-2)
@@ -164,14 +158,8 @@ def agreeing(products: Tensor, weights: Tensor) -> Tensor:
     r"""Signs with which K quaternions, or fields of them, are near their chordal mean (Markley et al. 2007).
 
     The mean is the dominant eigenvector of :math:`\sum_k w_k q_k q_k^T`: it is continuous in the weights and does not
-    depend on the order. The signs change only where a rotation is half a turn away from it.
-
-    Args:
-        products: Inner products of all pairs. *Shape:* ``(..., K, K)``.
-        weights: *Shape:* ``(..., K)``.
-
-    Returns:
-        *Shape:* ``(..., K)``.
+    depend on the order. The signs change only where a rotation is half a turn away from it. They follow from the inner
+    products of all pairs, and the weights. *Shape:* ``(..., K, K), (..., K) -> (..., K)``.
     """
     if weights.shape[-1] == 2:
         return torch.where(products[..., 0] < 0, -1.0, 1.0).to(products)

@@ -36,11 +36,9 @@ MOST_COLUMNS = 48
 
 
 def factorize(matrix: sparse.spmatrix, ordering: str = "MMD_AT_PLUS_A") -> SuperLU:
-    """Sparse LU factorisation of a symmetric positive definite matrix, without pivoting.
+    """Sparse LU factorisation of a symmetric positive definite matrix, without pivoting. *Shape:* ``(n, n)``.
 
-    Args:
-        matrix: *Shape:* ``(n, n)``.
-        ordering: Column ordering of SuperLU; ``"NATURAL"`` keeps the order of the unknowns.
+    The ordering is SuperLU's of the columns; ``"NATURAL"`` keeps the order of the unknowns.
     """
     options = {"SymmetricMode": True}
     return splu(sparse.csc_matrix(matrix), permc_spec=ordering, diag_pivot_thresh=0.0, options=options)
@@ -185,11 +183,7 @@ _EXPORTED = Recent(8)
 def solve_exported(edges: Tensor, weights: Tensor, free: Tensor, right: Tensor) -> Tensor:
     """Solve with the Laplacian of edges, as an operation of exported programs, which hold no solver.
 
-    Args:
-        edges: *Shape:* ``(E, 2)``.
-        weights: *Shape:* ``(E,)``.
-        free: Unknowns to solve for. *Shape:* ``(n,)``.
-        right: Right-hand sides in columns. *Shape:* ``(..., V, m)``.
+    Unknowns that are not free are zero. *Shape:* ``(E, 2), (E,), (n,), (..., V, m) -> (..., V, m)``.
     """
     given = [x.detach().cpu().numpy() for x in (edges, weights.double(), free)]
 

@@ -23,14 +23,7 @@ def triangles_cross(one: FloatArray, other: FloatArray) -> BoolArray:
 
     Two triangles intersect if each has vertices strictly on both sides of the other's plane, and their segments on the
     line of the planes overlap in more than a point (Guigue and Devillers 2003). Touching and coplanar triangles do not.
-    Signs of determinants are exact.
-
-    Args:
-        one: Corners. *Shape:* ``(n, 3, 3)``.
-        other: Corners. *Shape:* ``(n, 3, 3)``.
-
-    Returns:
-        *Shape:* ``(n,)``.
+    Signs of determinants are exact. *Shape:* ``(n, 3, 3), (n, 3, 3) -> (n,)``.
 
     Raises:
         MissingPackageError: ``libigl`` is not installed.

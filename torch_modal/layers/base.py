@@ -22,12 +22,7 @@ from torch_modal.modes.basis import ModalBasis, checked_bases
 
 
 class BasisBuffers(nn.Module):
-    """The buffers that a layer keeps of a basis; all else follows from them.
-
-    Args:
-        reference: *Shape:* ``(V, 3)``.
-        modes: *Shape:* ``(k, V, 3)``.
-    """
+    """The buffers that a layer keeps of a basis; all else follows from them. *Shape:* ``(V, 3), (k, V, 3)``."""
 
     reference: Tensor
     modes: Tensor
@@ -126,13 +121,7 @@ class PreciseModule(nn.Module):
 
 
 class InBetweenLayer(PreciseModule):
-    """A layer that solves in-betweens of the modal spaces of all its bases.
-
-    Args:
-        bases: Of :func:`basis_buffers`.
-        faces: Vertex indices. *Shape:* ``(F, 3)``.
-        chosen: The settings.
-    """
+    """A layer that solves in-betweens of the modal spaces of all its bases, those of :func:`basis_buffers`."""
 
     terms: Any
     cores: Any
@@ -196,10 +185,7 @@ class InBetweenLayer(PreciseModule):
     def solved(self, keyframes: Tensor, weights: Tensor, lead: torch.Size) -> InBetweenResult:
         """The in-betweens of key-frames and weights that were checked, in the layer's dtype.
 
-        Args:
-            keyframes: *Shape:* ``(*lead, K, V, 3)``, or one that expands to that.
-            weights: *Shape:* ``(*lead, K)``, likewise.
-            lead: The leading dimensions.
+        *Shape:* ``(*lead, K, V, 3), (*lead, K)``, or ones that expand to these.
         """
         if self.solver.gradient == "implicit" or self.solver.local_steps or self.solver.regions:
             require_numbers(type(self).__name__, keyframes)

@@ -61,10 +61,6 @@ class MidShape(nn.Module):
     def forward(self, x_a: Tensor, x_b: Tensor) -> Tensor:
         """The mid-shapes. *Shape:* ``(..., V, 3), (..., V, 3) -> (..., V, 3)``.
 
-        Args:
-            x_a: First key-frames. *Shape:* ``(..., V, 3)``.
-            x_b: Second key-frames. *Shape:* ``(..., V, 3)``.
-
         Raises:
             ValueError: Shapes, dtypes or devices that do not fit.
             ConvergenceError: A sample did not converge, gradients are recorded and ``unconverged="raise"``.

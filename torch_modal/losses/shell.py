@@ -84,12 +84,7 @@ class ShellLoss(ShellEnergy):
         return Rest((length, angle, volume), (shares * per_length.square(), bend, to_volume))
 
     def terms_of(self, x: Tensor, x_rest: Tensor) -> ShellTerms:
-        """The three terms on their own.
-
-        Args:
-            x: Predicted shapes. *Shape:* ``(..., V, 3)``.
-            x_rest: Rest shapes, broadcast against ``x``. *Shape:* ``(..., V, 3)``.
-        """
+        """The three terms on their own. Arguments as for :meth:`forward`."""
         self._check(x, x_rest)
         scale = self.scale(x_rest)
         rows, rest = self._rows(scale * x), self.rest(scale * x_rest)

@@ -280,24 +280,22 @@ def linear_sequence(keyframes: Tensor, places: Sequence[int]) -> Tensor:
 
 def _report_contacts(keyframes: Tensor, faces: Tensor, left: int, total: int) -> None:
     """Warn about key-frames that pass through themselves, and about in-betweens that still do."""
-    mesh = Connectivity(faces.cpu().numpy(), keyframes.shape[1])
+    mesh, messages = Connectivity(faces.cpu().numpy(), keyframes.shape[1]), []
     for i, shape in enumerate(keyframes.detach().double().cpu().numpy()):
         pairs = Crossings(mesh, shape[None]).pairs(shape)
         if len(pairs):
             where = ", ".join(f"{c:.4g}" for c in shape[mesh.faces[pairs[0]]].mean((0, 1)))
-            warnings.warn(
+            messages.append(
                 f"key-frame {i} passes through itself: {len(pairs)} pairs of triangles, the first "
-                f"{pairs[0].tolist()} near ({where}); beside it that is tolerated",
-                MeshWarning,
-                stacklevel=5,
+                f"{pairs[0].tolist()} near ({where}); beside it that is tolerated"
             )
     if left:
-        warnings.warn(
+        messages.append(
             f"in {left} of {total} in-betweens, parts still go through each other: a key-frame between those around "
-            "them may help",
-            MeshWarning,
-            stacklevel=5,
+            "them may help"
         )
+    for message in messages:
+        warnings.warn(message, MeshWarning, stacklevel=5)
 
 
 def _resample(shapes: Tensor, intervals: int, weights: Tensor) -> Tensor:

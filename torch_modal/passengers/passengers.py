@@ -83,10 +83,9 @@ class Passengers(nn.Module):
     def _bind(self, reference: Tensor, points: Tensor, faces: Tensor, weights: sparse.csr_matrix) -> None:
         for name, given in (("faces", faces), ("reference", reference), ("points", points)):
             self.register_buffer(name, given, persistent=False)
-        first, second, normal = _sides(reference.mT, faces)
-        area = 0.5 * norm(cross(first, second))
+        frame = _frames(reference.mT, faces).movedim(-1, 0)  # (F, 3, 3)
+        area = 0.5 * norm(cross(*sides(reference.mT, faces)))
         flat = area <= 1e-12 * area.mean()
-        frame = torch.stack([first, second, normal], 1).movedim(-1, 0)  # (F, 3, 3), sides as columns
         frame = torch.where(flat[:, None, None], torch.eye(3).to(frame), frame)
         self.register_buffer("inverses", torch.linalg.inv(frame), persistent=False)
         self.register_buffer("areas", torch.where(flat, 0, area), persistent=False)
@@ -161,8 +160,7 @@ class Passengers(nn.Module):
 
     def _deformation(self, x: Tensor) -> Tensor:
         """Mean deformation gradient around each vertex. *Shape:* ``(B, V, 3) -> (B, V, 3, 3)``."""
-        first, second, normal = _sides(x.movedim(-1, 0).contiguous(), self.faces)  # (3, B, F)
-        frame = torch.stack([first, second, normal], 1).movedim((0, 1), (-2, -1))  # (B, F, 3, 3)
+        frame = _frames(x.movedim(-1, 0).contiguous(), self.faces).movedim((0, 1), (-2, -1))  # (B, F, 3, 3)
         each = ((frame @ self.inverses) * self.areas[:, None, None]).flatten(2)
         total = x.new_zeros(x.shape[1], 1)
         summed = x.new_zeros(*x.shape[:2], 9)
@@ -206,9 +204,9 @@ def _csr(starts: Tensor, columns: Tensor, values: Tensor, shape: tuple[int, int]
         return torch.sparse_csr_tensor(starts, columns, values, shape, check_invariants=False)
 
 
-def _sides(rows: Tensor, faces: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Two sides and the unit normal of each triangle. *Shape:* ``(3, ..., V) -> (3, ..., F)`` each."""
+def _frames(rows: Tensor, faces: Tensor) -> Tensor:
+    """Two sides and the unit normal of each triangle, as columns. *Shape:* ``(3, ..., V) -> (3, 3, ..., F)``."""
     first, second = sides(rows, faces)
     normal = cross(first, second)
     length = norm(normal)
-    return first, second, normal * inverse(length, (normal * normal).sum(0) <= 0)
+    return torch.stack([first, second, normal * inverse(length, (normal * normal).sum(0) <= 0)], 1)
