@@ -221,7 +221,7 @@ def test_loose_pieces_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     vertices, faces = as_mesh(two)
     filled_with(monkeypatch, two, (vertices, faces))
     with pytest.warns(MeshWarning, match=r"has 2 loose pieces.* left to the interpolation") as said:
-        basis = extract_bases(np.stack([vertices, vertices]), faces, 8, cache=False)[0]
+        basis = extract_bases(np.stack([vertices, vertices + 1.0]), faces, 8, cache=False)[0]
     assert len(said) == 1
     each = solve(piece, 4).eigenvalues
     np.testing.assert_allclose(basis.eigenvalues, np.repeat(each, 2), rtol=1e-6)

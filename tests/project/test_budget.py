@@ -21,11 +21,11 @@ import torch
 import torch_modal as tm
 
 BOUNDS = {
-    "lines": 28652,
-    "lines of code": 18450,
+    "lines": 28033,
+    "lines of code": 18110,
     "files": 200,
-    "functions": 1559,
-    "named tuples": 52,
+    "functions": 1555,
+    "named tuples": 51,
     "docstrings that begin with no noun": 11,
     "functions of in-between": 138,
     "files of in-between": 32,
@@ -33,7 +33,7 @@ BOUNDS = {
     "files of in-between, forward and backward": 32,
     "functions of subdivide": 168,
     "files of subdivide": 39,
-    "functions of making a layer": 133,
+    "functions of making a layer": 134,
     "files of making a layer": 45,
 }
 

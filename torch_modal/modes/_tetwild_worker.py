@@ -35,7 +35,7 @@ def main(job_path: str, result_path: str) -> None:
     if hasattr(signal, "alarm"):
         # The parent enforces the timeout. If the parent is killed, the default action of SIGALRM ends this process
         # even while pytetwild holds the GIL.
-        signal.alarm(min(int(timeout) + 10, 2**31 - 1))
+        signal.alarm(int(min(timeout + 10, 2**31 - 1)))
 
     if processor_time < sys.maxsize and sys.platform != "win32":
         import resource
