@@ -157,7 +157,8 @@ def test_status_is_the_worst() -> None:
         x = torch.zeros(len(own), 2, 3, dtype=DOUBLE)
         known = unminimised(x, torch.tensor(own) == good)
         ones = torch.ones(len(own), dtype=DOUBLE)
-        results.append(InBetweenResult(x, known._replace(status=torch.tensor(own), energy=ones, gradient_norm=ones)))
+        changed = {"status": torch.tensor(own), "energy": ones, "gradient_norm": ones, "distortion_ratio": ones}
+        results.append(InBetweenResult(x, known._replace(**changed)))
     found = of_bodies(results, [torch.tensor([0, 3]), torch.tensor([1, 2])])
     assert found.solution.status.tolist() == [good, fell, steps, stalled, invalid, stalled, fell]
     assert bool((found.solution.energy == 2).all() and (found.solution.gradient_norm == 1).all())

@@ -21,8 +21,8 @@ import torch
 import torch_modal as tm
 
 BOUNDS = {
-    "lines": 28033,
-    "lines of code": 18110,
+    "lines": 28034,
+    "lines of code": 18111,
     "files": 200,
     "functions": 1555,
     "named tuples": 51,

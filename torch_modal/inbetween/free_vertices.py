@@ -8,7 +8,7 @@ from scipy import sparse
 from torch import Tensor, nn
 
 from torch_modal import trees
-from torch_modal.autograd import made_outside, recorded
+from torch_modal.autograd import lasting, made_outside, outlasting, recorded
 from torch_modal.energy.energy import Energy, Linearised, OnMesh, Reference, energy_rounding
 from torch_modal.geometry.canonical import CANONICAL_SIZE
 from torch_modal.geometry.sparse import Solve, factorize, solve_by
@@ -82,12 +82,13 @@ class FreeVertices(nn.Module):
         return RIDGE * placement[1].weights[0].mean(-1, keepdim=True).clamp_min(1)
 
     # ------------------------------------------------------------------------------------------------ Newton's method
-    @torch.no_grad()
+    @lasting
     def minimise(self, a: Tensor, placement: Placement, max_steps: int, tolerance: float) -> Solution:
         """Newton steps of each sample alone; arguments as for :func:`~torch_modal.solve.minimise.minimise`.
 
         A sample has converged where a step is below :data:`SMALL_STEP`; the tolerance plays no part.
         """
+        a, placement = trees.mapped((a, placement), outlasting)  # products with the Hessian are gradients
         each = [self._minimised(a[i : i + 1], trees.rows(placement, slice(i, i + 1)), max_steps) for i in range(len(a))]
         if not each:
             return Solution(a, a.sum(-1), a.sum(-1), *(torch.zeros(0, dtype=torch.int64, device=a.device),) * 2)

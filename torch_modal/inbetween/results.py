@@ -78,9 +78,9 @@ def of_bodies(results: Sequence[InBetweenResult], vertices: Sequence[Any]) -> In
     worst = (status % Status.FELL_BACK).amax(0)  # that a body fell back is the least of all
     worst = torch.where(worst > 0, worst, status.amax(0))
     shapes = torch.cat([result.shapes for result in results], 1)[:, torch.argsort(torch.cat(list(vertices)))]
-    ratio: Any = [result.solution.distortion_ratio for result in results]
+    ratios: Any = [result.solution.distortion_ratio for result in results]
     solution = Solution(torch.cat(a, 1), energy.sum(0), norm.amax(0), n_steps.amax(0), worst)
-    return InBetweenResult(shapes, solution._replace(distortion_ratio=torch.stack(ratio).amax(0)))
+    return InBetweenResult(shapes, solution._replace(distortion_ratio=torch.stack(ratios).amax(0)))
 
 
 def report(solution: Solution, solver: Solver) -> None:

@@ -150,9 +150,6 @@ class InBetweenLayer(PreciseModule):
             [getattr(basis, name).double().cpu() for basis in self.bases] for name in ("reference", "modes")
         )
         connectivity = checked_surface(references, self.faces.cpu())[1]
-        if self.objective.space == "joint":  # nothing depends on the caller's order
-            order = own_order([x.numpy() for x in references], connectivity.faces)
-            references, modes = ([own[i] for i in order] for own in (references, modes))
         self.faces = torch.tensor(connectivity.faces)
         chosen, found = self.objective, [(slice(None), connectivity)]
         numbers = all(torch.as_tensor(term.stiffness).shape[-1:] in ((), (1,)) for term in self.terms)
@@ -165,6 +162,9 @@ class InBetweenLayer(PreciseModule):
         kind = ContactSolver if chosen.contact else InBetweenSolver
         for own, mesh in found:
             shapes, moves = torch.stack(references)[:, own], [each[:, own] for each in modes]
+            if chosen.space == "joint":  # nothing depends on the caller's order
+                order = own_order([x.numpy() for x in shapes], mesh.faces)
+                shapes, moves = shapes[order], [moves[i] for i in order]
             if len(found) > 1:  # without the modes of other bodies
                 moves = [each[each.flatten(1).any(1)] for each in moves]
             self.cores.append(kind(shapes, moves, Mesh(mesh), list(self.terms), chosen, self.solver).to(like))
