@@ -225,7 +225,7 @@ def test_mu_and_regions_are_of_the_paired_space(bars: Shapes) -> None:
 
 @pytest.mark.parametrize(("ends", "truth"), [((0, 2), 1), ((0, 4), 2)], ids=["0-4", "0-8"])
 def test_hand(ends: tuple[int, int], truth: int, hands: Shapes) -> None:
-    """Measured with 30 modes: 0.16 and 0.38 of linear's edge error; in the regions, 0.30 and 0.48 of that without."""
+    """Measured with 30 modes: 0.16 and 0.30 of linear's edge error; in the regions, 0.30 and 0.33 of that without."""
     pair, wanted = hands.pick(*ends), hands.keyframes[truth]
     whole, plain = (MidShape(pair.bases, pair.faces, preset="paper", **more) for more in ({}, {"regions": 0}))
     result = whole.solve(*pair.keyframes)
