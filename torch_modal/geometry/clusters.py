@@ -87,7 +87,8 @@ def _from_mean(turns: Tensor, areas: Tensor, ancestors: Tensor, piece: Tensor) -
     total = torch.bincount(piece, areas)
     means = winding.new_zeros(*winding.shape[:2], len(total)).index_add(-1, piece, areas * winding) / total
     off = winding - pick(means, piece)
-    return torch.stack([(off - x[:, None]).norm(dim=0).amax(0) for x in off.unbind(1)]).amax(0)
+    later = [(off[:, i:] - off[:, i - 1 : i]).norm(dim=0).amax(0) for i in range(1, off.shape[1])]
+    return torch.stack(later).amax(0)
 
 
 def _clusters(turns: FloatArray, middles: IntArray, parents: IntArray) -> tuple[IntArray, IntArray, IntArray]:

@@ -127,10 +127,12 @@ def spanning_forest(n: int, pairs: IntArray, costs: FloatArray) -> tuple[IntArra
     Returns:
         The parent of each node, itself for a root; its connected component. *Shape:* ``(n,)`` each.
     """
-    key = pairs[:, 0] * n + pairs[:, 1]
-    order = np.lexsort((costs, key))
-    order = order[np.flatnonzero(np.diff(key[order], prepend=-1))]  # of duplicate edges the cheapest
-    graph = sparse.coo_matrix((costs[order], pairs[order].T), shape=(n, n)).tocsr()
+    graph = sparse.coo_matrix((costs, pairs.T), shape=(n, n)).tocsr()
+    if graph.nnz < len(pairs):  # duplicate edges, whose costs were summed: the cheapest counts
+        key = pairs[:, 0] * n + pairs[:, 1]
+        order = np.lexsort((costs, key))
+        order = order[np.flatnonzero(np.diff(key[order], prepend=-1))]
+        graph = sparse.coo_matrix((costs[order], pairs[order].T), shape=(n, n)).tocsr()
     tree = minimum_spanning_tree(graph).tocoo()
     piece = connected_components(tree, directed=False)[1].astype(np.int64)
     parents = traversal(tree.row, tree.col, np.unique(piece, return_index=True)[1], n)[1]
