@@ -196,6 +196,20 @@ def test_gradients_pass_through_the_regions(layer: MidShape, bars: Shapes, gener
     torch.testing.assert_close((slope * way).sum(), (ahead - behind) / 2e-5, rtol=1e-5, atol=0)
 
 
+def test_gradients_are_differentiated(layer: MidShape, bars: Shapes, generator: torch.Generator) -> None:
+    x_a, x_b = bars.keyframes[1:]
+    pull, way, further = (torch.randn(x_a.shape, dtype=torch.float64, generator=generator) for _ in range(3))
+
+    def slope(x: Tensor, create_graph: bool = False) -> Tensor:
+        x = x if x.requires_grad else x.clone().requires_grad_()
+        return torch.autograd.grad((pull * layer(x, x_b)).sum(), x, create_graph=create_graph)[0]
+
+    x = x_a.clone().requires_grad_()
+    (second,) = torch.autograd.grad((slope(x, True) * way).sum(), x)
+    ahead, behind = ((slope(x_a + step * further) * way).sum() for step in (1e-5, -1e-5))
+    torch.testing.assert_close((second * further).sum(), (ahead - behind) / 2e-5, rtol=1e-5, atol=0)
+
+
 def test_hand_is_one_function_with_its_gradient(hands: Shapes, generator: torch.Generator) -> None:
     """Truncated steps amplify rounding by 1e11, and have another gradient: regions are minimised to convergence."""
     pair = hands.pick(0, 2)
