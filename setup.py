@@ -92,9 +92,8 @@ setup(
         "pillow>=10",
         "tqdm>=4.65",
         "lazy_loader>=0.4",
-        # Kernels, where there are wheels. backends/warp/launch.py writes arguments into commands that Warp has
-        # recorded, whose layout is not documented.
-        f"warp-lang>=1.19,<1.20 ; {HAS_WARP}",
+        # Kernels, where there are wheels.
+        f"warp-lang>=1.19 ; {HAS_WARP}",
     ],
     extras_require={
         **EXTRAS,

@@ -18,7 +18,8 @@ from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from solids import as_it_is, box, eigenmodes, element_hessian, lumped_mass, surface
 from timing import limit_threads
 
-from torch_modal.energy.energy import RestShapes
+from torch_modal.elastic.energy import RestShapes
+from torch_modal.elastic.implicit import ConvergenceWarning
 from torch_modal.inbetween.settings import Objective, Solver
 from torch_modal.inbetween.solver import InBetweenSolver
 from torch_modal.keyframes.check import Keyframes
@@ -27,7 +28,6 @@ from torch_modal.modes.extract import extract_bases
 from torch_modal.modes.tetrahedra import Tetrahedra
 from torch_modal.modes.tetwild import TetWild
 from torch_modal.registration.load import load_keyframes
-from torch_modal.solve.implicit import ConvergenceWarning
 
 COARSE = TetWild(edge_length_fac=0.08, epsilon=5e-3)
 

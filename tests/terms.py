@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from torch_modal.energy.term import Mesh, Term
+from torch_modal.elastic.term import Mesh, Term
 
 
 class Edges(Term):

@@ -11,11 +11,11 @@ import torch
 from scipy import sparse
 from torch import Tensor
 
-from torch_modal.energy.bend import SquaredBend
-from torch_modal.energy.energy import Energy, Linearised, Reference, Rest
-from torch_modal.energy.stretch import Stretch
-from torch_modal.energy.term import Mesh
-from torch_modal.energy.volume import Volume
+from torch_modal.elastic.bend import SquaredBend
+from torch_modal.elastic.energy import Energy, Linearised, Reference, Rest
+from torch_modal.elastic.stretch import Stretch
+from torch_modal.elastic.term import Mesh
+from torch_modal.elastic.volume import Volume
 from torch_modal.geometry import connectivity
 from torch_modal.geometry.canonical import CANONICAL_SIZE
 from torch_modal.geometry.rigid import best_fit

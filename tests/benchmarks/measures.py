@@ -10,7 +10,7 @@ from shapes import edge_lengths
 from torch import Tensor
 
 import torch_modal as tm
-from torch_modal.energy.bend import wrap_angle
+from torch_modal.elastic.bend import wrap_angle
 from torch_modal.geometry.canonical import CANONICAL_SIZE
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.crossings import Crossings

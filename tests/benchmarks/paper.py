@@ -22,7 +22,7 @@ from timing import limit_threads
 from torch import Tensor
 
 import torch_modal as tm
-from torch_modal.energy.energy import RestShapes
+from torch_modal.elastic.energy import RestShapes
 
 DECREASE = 1e-10
 COLUMNS = ["pair", "floor", "linear", "Eq. 4", "the paper", "over linear", "in the regions, over Eq. 4", "steps"]

@@ -40,7 +40,7 @@ from torch import Tensor
 
 import torch_modal as tm
 from torch_modal.data.samples import load_sample
-from torch_modal.energy.bend import wrap_angle
+from torch_modal.elastic.bend import wrap_angle
 
 BODIES = ("fox", "husky", "cow", "trex", "velociraptor", "frog")
 N_MODES = 30

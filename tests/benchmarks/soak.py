@@ -28,12 +28,12 @@ from tqdm import tqdm
 from wild import FELL_BACK, WORSE, straight
 
 import torch_modal as tm
+from torch_modal.elastic.minimise import Status
 from torch_modal.errors import MeshError
 from torch_modal.geometry.canonical import CANONICAL_SIZE
 from torch_modal.inbetween.settings import PRESETS
 from torch_modal.modes.coarsening import coarsen
 from torch_modal.modes.extract import MESHERS
-from torch_modal.solve.minimise import Status
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

@@ -60,10 +60,10 @@ from wild_bodies import bent_and_twisted
 from wild_making import BODIES, WildBody
 
 import torch_modal as tm
+from torch_modal.elastic.minimise import Status
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.rigid import blend
 from torch_modal.modes.extract import METHODS, Method
-from torch_modal.solve.minimise import Status
 
 N_MODES = 30
 PRESETS = ("accurate", "fast", "paper")

@@ -21,8 +21,8 @@ from torch_modal.contact.acceleration import AccelerationLimit
 from torch_modal.contact.active import ContactEnergy, Contacts, ContactSearch, Pull
 from torch_modal.contact.separate import Timeline, through
 from torch_modal.data.samples import load_sample
-from torch_modal.energy.energy import RestShapes
-from torch_modal.energy.term import Mesh
+from torch_modal.elastic.energy import RestShapes
+from torch_modal.elastic.term import Mesh
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.crossings import Crossings
 from torch_modal.inbetween.results import Samples

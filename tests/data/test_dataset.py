@@ -14,7 +14,7 @@ from torch.utils.data import DataLoader, default_collate
 
 import torch_modal as tm
 from torch_modal.data.in_betweens import FORMAT, VERSION
-from torch_modal.energy.bend import Bend
+from torch_modal.elastic.bend import Bend
 from torch_modal.io.cache import CacheWarning
 from torch_modal.io.tensors import TensorFile, write_tensors
 

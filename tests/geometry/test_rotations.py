@@ -12,10 +12,10 @@ from sheets import rectangle, rolled
 from torch import Tensor
 
 import torch_modal as tm
-from torch_modal.backends.choice import choose
-from torch_modal.backends.torch.backend import TorchBackend
-from torch_modal.backends.warp.rotations import WarpRotations
 from torch_modal.data.samples import load_sample
+from torch_modal.elastic.backend import TorchBackend
+from torch_modal.elastic.choice import choose
+from torch_modal.elastic.warp_rotations import WarpRotations
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.local_rotations import LocalRotations
 from torch_modal.geometry.poisson import Poisson

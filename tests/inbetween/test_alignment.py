@@ -5,8 +5,8 @@ import torch
 from conftest import Shapes, random_rotation
 from torch import Tensor
 
-from torch_modal.backends.torch.backend import TorchBackend
-from torch_modal.energy.term import Mesh
+from torch_modal.elastic.backend import TorchBackend
+from torch_modal.elastic.term import Mesh
 from torch_modal.geometry.canonical import CANONICAL_SIZE, size
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.rotations import exp, log

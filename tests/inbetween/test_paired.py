@@ -6,7 +6,7 @@ from conftest import Shapes, modal, placement_of
 from torch import Tensor
 from torch.func import hessian, jacrev
 
-from torch_modal.energy.shell import ShellEnergy
+from torch_modal.elastic.shell import ShellEnergy
 from torch_modal.geometry import connectivity
 from torch_modal.geometry.rigid import blend
 from torch_modal.layers.in_between import InBetween

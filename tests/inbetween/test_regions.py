@@ -10,17 +10,17 @@ from conftest import Shapes
 from shapes import edge_error, largest
 from torch import Tensor
 
-from torch_modal.energy.bend import NEEDLE, SquaredBend, fullness
-from torch_modal.energy.energy import Energy, RestShapes
-from torch_modal.energy.shell import ShellEnergy
-from torch_modal.energy.stretch import Stretch
-from torch_modal.energy.term import Mesh
-from torch_modal.energy.volume import Volume
+from torch_modal.elastic.bend import NEEDLE, SquaredBend, fullness
+from torch_modal.elastic.energy import Energy, RestShapes
+from torch_modal.elastic.minimise import Status
+from torch_modal.elastic.shell import ShellEnergy
+from torch_modal.elastic.stretch import Stretch
+from torch_modal.elastic.term import Mesh
+from torch_modal.elastic.volume import Volume
 from torch_modal.inbetween import regions as regions_module
 from torch_modal.inbetween.regions import NO_ERROR, LocalInterpolation, fitting_error, segments, worst_regions
 from torch_modal.inbetween.settings import Objective, Solver
 from torch_modal.layers.mid_shape import MidShape
-from torch_modal.solve.minimise import Status
 
 
 @pytest.fixture(scope="module")

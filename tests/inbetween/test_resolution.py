@@ -12,7 +12,7 @@ from conftest import Shapes
 from shapes import edge_lengths
 
 import torch_modal as tm
-from torch_modal.energy.term import Mesh
+from torch_modal.elastic.term import Mesh
 from torch_modal.geometry.connectivity import Connectivity, connected_pieces
 from torch_modal.inbetween import coarse as coarse_mesh
 from torch_modal.inbetween.coarse import ENOUGH_FACES

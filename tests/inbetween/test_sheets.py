@@ -13,13 +13,13 @@ from sheets import cylinder, folded, rectangle, rolled
 from torch import Tensor
 
 import torch_modal as tm
-from torch_modal.energy.term import Mesh
-from torch_modal.energy.volume import encloses
+from torch_modal.elastic.minimise import Status
+from torch_modal.elastic.term import Mesh
+from torch_modal.elastic.volume import encloses
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.rigid import blend
 from torch_modal.inbetween.coarse import resolving
 from torch_modal.modes.coarsening import coarsen, collapsed
-from torch_modal.solve.minimise import Status
 
 BACKENDS = ["torch", "warp"]
 Direction = Callable[[np.ndarray], np.ndarray]

@@ -15,7 +15,7 @@ import pytest
 import torch
 
 import torch_modal as tm
-from torch_modal.energy.stretch import Stretch
+from torch_modal.elastic.stretch import Stretch
 from torch_modal.io import cache as cache_module
 from torch_modal.io.cache import (
     Cache,

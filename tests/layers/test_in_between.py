@@ -17,15 +17,15 @@ from torch import Tensor
 from torch.func import grad
 
 import torch_modal as tm
-from torch_modal.energy.shell import ShellEnergy
+from torch_modal.elastic import implicit
+from torch_modal.elastic.minimise import Status
+from torch_modal.elastic.shell import ShellEnergy
 from torch_modal.inbetween.joint import JointSpace
 from torch_modal.inbetween.results import ConvergenceError, ConvergenceWarning
 from torch_modal.inbetween.settings import Solver
 from torch_modal.layers.in_between import InBetween
 from torch_modal.layers.mid_shape import MidShape
 from torch_modal.modes.basis import ModalBasis
-from torch_modal.solve import implicit
-from torch_modal.solve.minimise import Status
 
 DOUBLE = torch.float64
 pytestmark = pytest.mark.usefixtures("converged")

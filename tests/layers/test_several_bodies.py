@@ -10,10 +10,10 @@ from terms import Edges
 from torch import Tensor
 
 import torch_modal as tm
+from torch_modal.elastic.minimise import Status
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.inbetween.results import InBetweenResult, of_bodies, unminimised
 from torch_modal.modes.basis import ModalBasis
-from torch_modal.solve.minimise import Status
 
 DOUBLE = torch.float64
 TIMES = torch.tensor([0.2, 0.5, 0.9], dtype=DOUBLE)

@@ -8,7 +8,7 @@ import torch
 from bodies import body
 from conftest import Shapes
 
-from torch_modal.energy.shell import ShellEnergy
+from torch_modal.elastic.shell import ShellEnergy
 from torch_modal.keyframes.check import Keyframes
 from torch_modal.modes import coarsening
 from torch_modal.modes.coarsening import Coarsening, coarsen

@@ -10,13 +10,13 @@ from conftest import Shapes
 from torch import Tensor
 
 import torch_modal as tm
-from torch_modal.backends.torch.distortion import Distortion, _weights
-from torch_modal.backends.warp.backend import WarpBackend
-from torch_modal.energy.energy import RestShapes
-from torch_modal.energy.term import Mesh
+from torch_modal.elastic.distortion import Distortion, _weights
+from torch_modal.elastic.energy import RestShapes
+from torch_modal.elastic.implicit import ConvergenceWarning
+from torch_modal.elastic.minimise import Status
+from torch_modal.elastic.term import Mesh
+from torch_modal.elastic.warp_backend import WarpBackend
 from torch_modal.inbetween.settings import PRESETS
-from torch_modal.solve.implicit import ConvergenceWarning
-from torch_modal.solve.minimise import Status
 
 BACKENDS = [pytest.param("warp", marks=pytest.mark.skipif(not WarpBackend.works(), reason="no Warp")), "torch"]
 

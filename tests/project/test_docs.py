@@ -18,8 +18,8 @@ from snippets import PAGES, ROOT, blocks, run_python
 from test_examples import load_example
 
 import torch_modal as tm
-from torch_modal.backends.torch.backend import TorchBackend
 from torch_modal.cli.main import COMMANDS, build_parser
+from torch_modal.elastic.backend import TorchBackend
 
 DOCS = ROOT / "docs"
 NOTEBOOKS = sorted((DOCS / "notebooks").glob("*.ipynb"))

@@ -25,10 +25,8 @@ FLOORS = [
     "geometry",
     "io",
     "keyframes",
-    "energy",
+    "elastic",
     "modes",
-    "backends",
-    "solve",
     "inbetween",
     "contact",
     "layers",
@@ -48,7 +46,7 @@ MODULES = sorted(
     str(path.relative_to(PACKAGE).with_suffix("")).replace("/", ".").removesuffix("__init__").removesuffix(".")
     for path in PACKAGE.rglob("*.py")
 )
-LAYERS = {"backends", "solve", "inbetween", "layers"}
+LAYERS = {"elastic", "inbetween", "layers"}
 FOREIGN_TO_LAYERS = set("numpy scipy fast_simplification trimesh pytetwild tqdm pyvista matplotlib pygltflib".split())
 
 
@@ -116,8 +114,9 @@ def test_layers_are_torch_only() -> None:
     """Bases are what comes in; only the coarse mesh and segments, made once on the host, use more."""
     allowed = {"inbetween.coarse": {"modes.coarsening"}, "inbetween.regions": {"numpy"}}
     allowed["inbetween.free_vertices"] = {"numpy", "scipy"}  # sparse factors
+    allowed["elastic.rest_hessian"] = {"numpy", "scipy"}
     # What kernels are given once comes in arrays of the host, which are NumPy's for Warp.
-    allowed |= {name: {"numpy"} for name in MODULES if name.startswith("backends.warp.")}
+    allowed["elastic.warp_crossings"] = {"numpy"}
     foreign = {
         (module, name)
         for module in MODULES
@@ -129,14 +128,12 @@ def test_layers_are_torch_only() -> None:
     assert not foreign
 
 
-def test_one_door_leads_to_the_backends() -> None:
-    """No other file names Warp or its kernels, or asks which backend it has; the setting of its name is one."""
+def test_one_door_leads_to_the_kernels() -> None:
+    """No other room names Warp or its kernels, or asks which backend it has; the setting of its name is one."""
     asks = re.compile(r"\bwarp\b|\.kernels\b|isinstance\([^)]*backend|backend(\.name)? *(==|!=| is )", re.I)
     paths = {str(path.relative_to(PACKAGE)): path for path in PACKAGE.rglob("*.py")}
-    found = {name for name, path in paths.items() if name.split("/")[0] != "backends" and asks.search(path.read_text())}
+    found = {name for name, path in paths.items() if name.split("/")[0] != "elastic" and asks.search(path.read_text())}
     assert found == {"inbetween/settings.py"}
-    users = {name for name in MODULES if any(each.startswith("backends.warp") for each in own(name))}
-    assert {name for name in users if not name.startswith("backends.warp")} == {"backends.choice"}
 
 
 def test_one_lock_guards_the_decimation() -> None:

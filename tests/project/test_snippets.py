@@ -15,8 +15,8 @@ import pytest
 from snippets import COMMAND, LANGUAGES, NOT_RUN, PAGES, ROOT, Block, blocks, commands, expanded, run_python
 from test_examples import load_example
 
-from torch_modal.backends.choice import BACKENDS
 from torch_modal.cli import main as cli
+from torch_modal.elastic.choice import BACKENDS
 from torch_modal.io.formats import ANIMATION_FORMATS, MESH_FORMATS
 
 QUICK = {"layer", "viewing"}

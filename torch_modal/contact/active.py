@@ -13,9 +13,9 @@ import torch
 from torch import Tensor
 
 from torch_modal.autograd import transformed
-from torch_modal.backends.torch.fine_steps import FurtherDerivatives
 from torch_modal.contact.detect import Search
-from torch_modal.energy.term import Mesh
+from torch_modal.elastic.steps import FurtherDerivatives
+from torch_modal.elastic.term import Mesh
 from torch_modal.geometry.crossings import Crossings, FloatArray, IntArray
 from torch_modal.geometry.vectors import cross, inverse, norm, pick
 

@@ -6,18 +6,18 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torch_modal.backends.torch.fine_steps import Beside
 from torch_modal.contact.acceleration import AccelerationLimit
 from torch_modal.contact.active import ContactEnergy, ContactSearch, refuse_transforms
 from torch_modal.contact.modal import modal_displacement
 from torch_modal.contact.separate import Timeline, separate, through
-from torch_modal.energy.energy import RestShapes
+from torch_modal.elastic.energy import RestShapes
+from torch_modal.elastic.minimise import Solution
+from torch_modal.elastic.steps import Beside
 from torch_modal.geometry.connectivity import vertex_areas
 from torch_modal.inbetween.alignment import Pose
 from torch_modal.inbetween.joint import JointSpace
 from torch_modal.inbetween.results import InBetweenResult, Samples
 from torch_modal.inbetween.solver import InBetweenSolver
-from torch_modal.solve.minimise import Solution
 
 PRODUCTS = 20
 """Iterations of conjugate gradients in a Newton step with contacts, which are stiff."""

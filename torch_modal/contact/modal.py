@@ -10,8 +10,8 @@ for the energies with contact, of which the elastic part is replaced with its se
 import torch
 from torch import Tensor
 
-from torch_modal.backends.torch.fine_steps import step_length
 from torch_modal.contact.active import ContactEnergy
+from torch_modal.elastic.steps import step_length
 
 SMOOTHNESS = 30.0
 """``lambda``, at a diagonal of 100, with the time between the ends as the unit."""

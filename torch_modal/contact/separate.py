@@ -16,9 +16,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torch_modal.backends.torch.fine_steps import Beside
 from torch_modal.contact.acceleration import AccelerationLimit
 from torch_modal.contact.active import GAP, ContactEnergy, Contacts, ContactSearch, Pull
+from torch_modal.elastic.steps import Beside
 
 LOOKED_AT = 8
 """Number of shapes that are looked at first: without intersections there, nothing is done."""

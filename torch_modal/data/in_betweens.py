@@ -13,6 +13,8 @@ from torch import Tensor
 
 from torch_modal.autograd import Recent
 from torch_modal.data.stored import Motion
+from torch_modal.elastic.implicit import ConvergenceWarning
+from torch_modal.elastic.minimise import Status
 from torch_modal.inbetween.results import InBetweenResult
 from torch_modal.inbetween.settings import Settings
 from torch_modal.io.cache import CacheWarning, ContentError, code_digest, content_digest
@@ -20,8 +22,6 @@ from torch_modal.io.tensors import TensorFile, write_tensors
 from torch_modal.layers.in_between import InBetween
 from torch_modal.modes.basis import ModalBasis
 from torch_modal.motion.path import Path as MotionPath
-from torch_modal.solve.implicit import ConvergenceWarning
-from torch_modal.solve.minimise import Status
 from torch_modal.version import __version__
 
 FORMAT = "torch_modal.between"

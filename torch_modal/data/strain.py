@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from torch_modal.energy.bend import dihedral_gradient
+from torch_modal.elastic.bend import dihedral_gradient
 from torch_modal.geometry.canonical import size
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.vectors import cross, norm, pick

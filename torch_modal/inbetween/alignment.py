@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from torch_modal.autograd import plain
-from torch_modal.backends.torch.backend import TorchBackend
+from torch_modal.elastic.backend import TorchBackend
 from torch_modal.errors import MeshWarning
 from torch_modal.geometry.canonical import CANONICAL_SIZE, size
 from torch_modal.geometry.connectivity import Connectivity, vertex_areas

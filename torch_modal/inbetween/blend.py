@@ -2,7 +2,7 @@
 
 from torch import Tensor, nn
 
-from torch_modal.backends.torch.backend import TorchBackend
+from torch_modal.elastic.backend import TorchBackend
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.local_rotations import weights_per_length
 

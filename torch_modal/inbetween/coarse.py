@@ -8,8 +8,8 @@ from torch import Tensor, nn
 
 from torch_modal.arrays import IntArray
 from torch_modal.autograd import applied
-from torch_modal.energy.stretch import MIN_RELATIVE_LENGTH
-from torch_modal.energy.term import Mesh
+from torch_modal.elastic.stretch import MIN_RELATIVE_LENGTH
+from torch_modal.elastic.term import Mesh
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.inspect import is_flat
 from torch_modal.geometry.vectors import inverse

@@ -3,7 +3,7 @@
 A minimisation on a coarse mesh, in a space of modes, can end in a shape that is wrong on the fine mesh: modes of loose
 pieces, limbs that the coarse mesh does not see. The energy of Eq. 5 cannot judge that, because a few degenerate faces
 dominate it. What is compared here is bounded for each element, and evaluated on a part of the elements
-(:class:`torch_modal.backends.torch.distortion.Distortion`).
+(:class:`torch_modal.elastic.distortion.Distortion`).
 """
 
 from collections.abc import Sequence
@@ -12,9 +12,9 @@ import torch
 from torch import Tensor
 
 from torch_modal.autograd import plain
-from torch_modal.backends.torch.distortion import Distortion
-from torch_modal.energy.energy import RestShapes
-from torch_modal.solve.minimise import Solution, Status
+from torch_modal.elastic.distortion import Distortion
+from torch_modal.elastic.energy import RestShapes
+from torch_modal.elastic.minimise import Solution, Status
 
 # A shape has at most this many times the distortion of its starts. Below, the volume error, which is not measured and
 # which the starts have more of, and the choice of elements decide more than the shapes do.

@@ -9,10 +9,10 @@ from torch import Tensor, nn
 
 from torch_modal import trees
 from torch_modal.autograd import lasting, made_outside, outlasting, recorded
-from torch_modal.energy.energy import Energy, Linearised, OnMesh, Reference, energy_rounding
+from torch_modal.elastic.energy import Energy, Linearised, OnMesh, Reference, energy_rounding
+from torch_modal.elastic.minimise import Solution, Status
 from torch_modal.geometry.canonical import CANONICAL_SIZE
 from torch_modal.geometry.sparse import Solve, factorize, solve_by
-from torch_modal.solve.minimise import Solution, Status
 
 # Stiffness towards the start, relative to that of the mean edge: a vertex in a flat fan has none along its normal, and
 # a loose piece none against rigid motions.
@@ -36,7 +36,7 @@ Placement = tuple[Tensor, Reference]
 class FreeVertices(nn.Module):
     """The energy in the displacements of some vertices, with the others fixed, in float64.
 
-    It is an :class:`~torch_modal.solve.minimise.AmplitudeEnergy`; instead of a dense Hessian it has :meth:`inverse`.
+    It is an :class:`~torch_modal.elastic.minimise.AmplitudeEnergy`; instead of a dense Hessian it has :meth:`inverse`.
 
     Args:
         energy: The energy.
@@ -84,7 +84,7 @@ class FreeVertices(nn.Module):
     # ------------------------------------------------------------------------------------------------ Newton's method
     @lasting
     def minimise(self, a: Tensor, placement: Placement, max_steps: int, tolerance: float) -> Solution:
-        """Newton steps of each sample alone; arguments as for :func:`~torch_modal.solve.minimise.minimise`.
+        """Newton steps of each sample alone; arguments as for :func:`~torch_modal.elastic.minimise.minimise`.
 
         A sample has converged where a step is below :data:`SMALL_STEP`; the tolerance plays no part.
         """

@@ -7,11 +7,11 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from torch_modal.backends.torch.backend import TorchBackend
-from torch_modal.backends.torch.fine_steps import FineEnergy
-from torch_modal.energy.energy import Energy, OnMesh, RestShapes
-from torch_modal.energy.modal_energy import Derivatives, ModalEnergy, Placement
-from torch_modal.energy.shell import N_SHELL_TERMS
+from torch_modal.elastic.backend import TorchBackend
+from torch_modal.elastic.energy import Energy, OnMesh, RestShapes
+from torch_modal.elastic.modal import Derivatives, ModalEnergy, Placement
+from torch_modal.elastic.shell import N_SHELL_TERMS
+from torch_modal.elastic.steps import FineEnergy
 from torch_modal.inbetween.coarse import CoarseMesh
 from torch_modal.inbetween.subspace import SubspaceBasis
 

@@ -6,11 +6,11 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from torch_modal.energy.energy import RestShapes
-from torch_modal.energy.modal_energy import Derivatives, Placement
+from torch_modal.elastic.energy import RestShapes
+from torch_modal.elastic.gauss_newton import GaussNewtonStep
+from torch_modal.elastic.minimise import AmplitudeEnergy, Solution, Status
+from torch_modal.elastic.modal import Derivatives, Placement
 from torch_modal.inbetween.joint import JointSpace
-from torch_modal.solve.gauss_newton import GaussNewtonStep
-from torch_modal.solve.minimise import AmplitudeEnergy, Solution, Status
 
 
 class PairedPlacement(NamedTuple):
@@ -130,9 +130,9 @@ def _block_diagonal(first: Any, second: Any) -> Tensor:
 def newton(
     energy: AmplitudeEnergy, a: Tensor, placement: Any, max_steps: int = 10, tolerance: float = 3e-7
 ) -> Solution:
-    """Minimise by :class:`~torch_modal.solve.gauss_newton.GaussNewtonStep`: ten of them, as many as the paper takes.
+    """Minimise by :class:`~torch_modal.elastic.gauss_newton.GaussNewtonStep`: ten of them, as many as the paper takes.
 
-    They reach its relative decrease of 1e-10 in 6 or 7. Arguments as for :func:`torch_modal.solve.minimise.minimise`.
+    They reach its relative decrease of 1e-10 in 6 or 7. Arguments as for :func:`torch_modal.elastic.minimise.minimise`.
     """
     step, n_steps, start = GaussNewtonStep(energy), torch.zeros(len(a), dtype=torch.int64, device=a.device), None
     moving = torch.ones_like(n_steps, dtype=torch.bool)

@@ -19,17 +19,17 @@ import torch
 from torch import Tensor, nn
 
 from torch_modal.arrays import FloatArray, IntArray
-from torch_modal.energy.bend import NEEDLE, Bend, fullness
-from torch_modal.energy.energy import Energy, Rest, RestShapes
-from torch_modal.energy.stretch import Stretch
-from torch_modal.energy.term import Mesh
-from torch_modal.energy.volume import Volume
+from torch_modal.elastic.bend import NEEDLE, Bend, fullness
+from torch_modal.elastic.energy import Energy, Rest, RestShapes
+from torch_modal.elastic.implicit import solve_implicit
+from torch_modal.elastic.minimise import Status
+from torch_modal.elastic.stretch import Stretch
+from torch_modal.elastic.term import Mesh
+from torch_modal.elastic.volume import Volume
 from torch_modal.geometry.canonical import CANONICAL_SIZE
 from torch_modal.inbetween.coarse import stretching
 from torch_modal.inbetween.free_vertices import FreeVertices
 from torch_modal.inbetween.paired import PairedSpace
-from torch_modal.solve.implicit import solve_implicit
-from torch_modal.solve.minimise import Status
 
 N_SEGMENTS = 24
 
@@ -182,7 +182,7 @@ class LocalInterpolation(nn.Module):
             usable: False for samples that are left out. *Shape:* ``(B,)``.
 
         Returns:
-            The shapes, and the worse :class:`~torch_modal.solve.minimise.Status` of both, *shape* ``(B,)``.
+            The shapes, and the worse :class:`~torch_modal.elastic.minimise.Status` of both, *shape* ``(B,)``.
         """
         energy, shapes = self.problem.energy, rests.shapes[:, :, self.used].double()
         rest = energy.rest_of(shapes)

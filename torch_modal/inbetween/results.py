@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from torch_modal.autograd import made_outside, plain, traced, transformed
+from torch_modal.elastic.implicit import ConvergenceWarning
+from torch_modal.elastic.minimise import Solution, Status
 from torch_modal.inbetween.settings import Solver
-from torch_modal.solve.implicit import ConvergenceWarning
-from torch_modal.solve.minimise import Solution, Status
 
 
 class ConvergenceError(RuntimeError):

@@ -6,12 +6,12 @@ from typing import Literal, NamedTuple
 
 from torch import Tensor
 
-from torch_modal.backends.choice import names
-from torch_modal.energy.bend import Bend, SquaredBend
-from torch_modal.energy.shell import ALPHA, BETA, GAMMA
-from torch_modal.energy.stretch import Stretch
-from torch_modal.energy.term import Term
-from torch_modal.energy.volume import Volume
+from torch_modal.elastic.bend import Bend, SquaredBend
+from torch_modal.elastic.choice import names
+from torch_modal.elastic.shell import ALPHA, BETA, GAMMA
+from torch_modal.elastic.stretch import Stretch
+from torch_modal.elastic.term import Term
+from torch_modal.elastic.volume import Volume
 
 
 def _choice(name: str, value: str, choices: tuple[str, ...]) -> None:

@@ -8,11 +8,13 @@ import torch
 from torch import Tensor, nn
 
 from torch_modal.autograd import plain
-from torch_modal.backends.choice import choose
-from torch_modal.backends.torch.backend import TorchBackend
-from torch_modal.energy.energy import Energy, RestShapes
-from torch_modal.energy.shell import N_SHELL_TERMS
-from torch_modal.energy.term import Mesh, Term
+from torch_modal.elastic.backend import TorchBackend
+from torch_modal.elastic.choice import choose
+from torch_modal.elastic.energy import Energy, RestShapes
+from torch_modal.elastic.implicit import solve_implicit, solve_unrolled
+from torch_modal.elastic.minimise import Solution, Status
+from torch_modal.elastic.shell import N_SHELL_TERMS
+from torch_modal.elastic.term import Mesh, Term
 from torch_modal.inbetween.alignment import KeyframeAlignment, Pose
 from torch_modal.inbetween.blend import RotationBlend
 from torch_modal.inbetween.coarse import CoarseMesh
@@ -23,8 +25,6 @@ from torch_modal.inbetween.regions import LocalInterpolation, worst_regions
 from torch_modal.inbetween.results import InBetweenResult, Samples, unminimised
 from torch_modal.inbetween.settings import Objective, Solver
 from torch_modal.inbetween.subspace import elastic_subspace
-from torch_modal.solve.implicit import solve_implicit, solve_unrolled
-from torch_modal.solve.minimise import Solution, Status
 
 # Products with the Hessian in each local step, and in each step of the polish: with two local steps, what closes 97 %
 # of the gap in energy between linear interpolation and the optimum over all vertices, and often 99 % (docs/quality.md).

@@ -9,8 +9,8 @@ from torch import Tensor, nn
 from torch_modal.arrays import FloatArray
 from torch_modal.autograd import full_precision, lasting, outlasting, plain, require_numbers
 from torch_modal.contact.in_between import ContactSolver
-from torch_modal.energy.term import Mesh
-from torch_modal.energy.volume import Volume, encloses
+from torch_modal.elastic.term import Mesh
+from torch_modal.elastic.volume import Volume, encloses
 from torch_modal.geometry.bodies import bodies
 from torch_modal.geometry.canonical import own_order
 from torch_modal.inbetween.results import InBetweenResult, Samples, of_bodies

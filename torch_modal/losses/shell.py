@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 
 from torch_modal.autograd import lasting
-from torch_modal.energy.energy import Rest
-from torch_modal.energy.shell import ShellEnergy
+from torch_modal.elastic.energy import Rest
+from torch_modal.elastic.shell import ShellEnergy
 from torch_modal.geometry.canonical import CANONICAL_SIZE
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.vectors import cross, inverse, norm, pick

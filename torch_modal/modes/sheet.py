@@ -10,8 +10,8 @@ import scipy.sparse as sp
 from scipy.spatial import cKDTree
 
 from torch_modal.arrays import FloatArray, IntArray
-from torch_modal.energy.rest_hessian import rest_hessian
-from torch_modal.energy.shell import BETA
+from torch_modal.elastic.rest_hessian import rest_hessian
+from torch_modal.elastic.shell import BETA
 from torch_modal.geometry.canonical import CANONICAL_SIZE
 from torch_modal.geometry.connectivity import Connectivity, double_areas, vertex_areas
 from torch_modal.modes.coarsening import collapsed, joined

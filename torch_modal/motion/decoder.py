@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from torch_modal.autograd import broadcast_shapes, full_precision, lasting, require_numbers, traced, untraced
-from torch_modal.backends.torch.backend import TorchBackend
+from torch_modal.elastic.backend import TorchBackend
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.local_rotations import Trajectory
 from torch_modal.geometry.rotations import exp

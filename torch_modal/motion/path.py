@@ -8,12 +8,13 @@ import torch
 from torch import Tensor, nn
 
 from torch_modal.autograd import broadcast_shapes, full_precision, lasting, require_numbers, untraced
-from torch_modal.backends.choice import choose
 from torch_modal.contact.active import refuse_transforms
 from torch_modal.contact.in_between import push_apart
-from torch_modal.energy.energy import RestShapes
-from torch_modal.energy.shell import ALPHA, BETA
-from torch_modal.energy.term import Mesh
+from torch_modal.elastic.choice import choose
+from torch_modal.elastic.energy import RestShapes
+from torch_modal.elastic.minimise import Solution
+from torch_modal.elastic.shell import ALPHA, BETA
+from torch_modal.elastic.term import Mesh
 from torch_modal.geometry.bodies import bodies
 from torch_modal.geometry.crossings import require_contact
 from torch_modal.inbetween.alignment import Pose
@@ -27,7 +28,6 @@ from torch_modal.layers.blend import Blend
 from torch_modal.layers.in_between import InBetween
 from torch_modal.motion.cubics import Scheme, by_interval, located, wrapped
 from torch_modal.motion.spline import Knots, Spline
-from torch_modal.solve.minimise import Solution
 
 # Even times between two key-frames at which a path looks for contacts.
 N_SEARCHED = 31

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from torch_modal.autograd import full_precision
-from torch_modal.backends.torch.backend import TorchBackend
+from torch_modal.elastic.backend import TorchBackend
 from torch_modal.geometry.canonical import own_order
 from torch_modal.geometry.clusters import beyond_a_turn
 from torch_modal.geometry.connectivity import Connectivity

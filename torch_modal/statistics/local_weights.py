@@ -7,10 +7,10 @@ import torch
 from torch import Tensor
 
 from torch_modal.autograd import recorded
-from torch_modal.backends.torch.fine_steps import conjugate_gradients
+from torch_modal.elastic.steps import conjugate_gradients
 from torch_modal.geometry.rigid import RigidMotion, best_fit, centroid, infinitesimal_motions
 from torch_modal.geometry.triangle_frames import edge_means
-from torch_modal.solve.fitting import levenberg_marquardt
+from torch_modal.statistics.fitting import levenberg_marquardt
 from torch_modal.statistics.variation import Variation
 
 # Standard deviation of observed points, in sizes of the shape, beside local weights of a standard deviation of one; and

@@ -10,13 +10,13 @@ from torch import Tensor
 from torch.nn.functional import one_hot
 
 from torch_modal import trees
-from torch_modal.backends.choice import choose
-from torch_modal.backends.torch.fine_steps import FurtherEnergy
-from torch_modal.energy.bend import Bend
-from torch_modal.energy.shell import ALPHA, BETA, GAMMA
-from torch_modal.energy.stretch import Stretch
-from torch_modal.energy.term import Mesh
-from torch_modal.energy.volume import Volume, encloses
+from torch_modal.elastic.bend import Bend
+from torch_modal.elastic.choice import choose
+from torch_modal.elastic.shell import ALPHA, BETA, GAMMA
+from torch_modal.elastic.steps import FurtherEnergy
+from torch_modal.elastic.stretch import Stretch
+from torch_modal.elastic.term import Mesh
+from torch_modal.elastic.volume import Volume, encloses
 from torch_modal.geometry.canonical import CANONICAL_SIZE
 from torch_modal.geometry.poisson import Reconstruction
 from torch_modal.geometry.rigid import best_rotation

@@ -1,0 +1,509 @@
+"""Kernels against the torch code that they stand in for: values, gradients, vmap, and where they are not used."""
+
+import importlib.util
+import subprocess
+import sys
+import warnings
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from bodies import sheet_surface
+from conftest import Shapes
+from terms import Area, Spring
+from torch import Tensor
+from torch.func import functional_call, grad, vmap
+from torch_modal.elastic.warp import shell as fused_shell
+
+import torch_modal as tm
+from torch_modal import trees
+from torch_modal.elastic import warp_backend as backend
+from torch_modal.elastic import warp_modal_energy as fused_modal
+from torch_modal.elastic.backend import TorchBackend
+from torch_modal.elastic.bend import Bend
+from torch_modal.elastic.choice import choose
+from torch_modal.elastic.distortion import Distortion
+from torch_modal.elastic.energy import Energy, RestShapes
+from torch_modal.elastic.kernels import launch
+from torch_modal.elastic.kernels.function import fused as fused_operation
+from torch_modal.elastic.modal import ModalEnergy, Placement
+from torch_modal.elastic.steps import FineEnergy, relax
+from torch_modal.elastic.stretch import Stretch
+from torch_modal.elastic.term import Mesh
+from torch_modal.elastic.volume import Volume
+from torch_modal.elastic.volumes import Volumes
+from torch_modal.elastic.warp_distortion import WarpDistortion
+from torch_modal.elastic.warp_fine_steps import WarpFineEnergy, WarpSteps
+from torch_modal.elastic.warp_modal_energy import WarpModalEnergy
+from torch_modal.elastic.warp_procrustes import mean_pose
+from torch_modal.elastic.warp_rotations import WarpRotations
+from torch_modal.elastic.warp_shell import ShellReference, WarpShell
+from torch_modal.elastic.warp_volumes import WarpVolumes
+from torch_modal.errors import MissingPackageError
+from torch_modal.geometry import procrustes
+from torch_modal.geometry.canonical import CANONICAL_SIZE
+from torch_modal.geometry.connectivity import Connectivity
+from torch_modal.geometry.local_rotations import LocalRotations, Trajectory
+from torch_modal.geometry.poisson import Poisson
+from torch_modal.geometry.rotations import exp
+from torch_modal.geometry.triangle_frames import frames_of
+from torch_modal.inbetween.settings import PRESETS
+from torch_modal.motion.cubics import cubics
+
+pytest.importorskip("warp", reason="warp-lang is not installed")
+
+DOUBLE = torch.float64
+
+
+class Case:
+    """Two samples between two shapes each, with stiffnesses of each element."""
+
+    def __init__(self, shapes: Shapes, faces: Tensor, roughness: float) -> None:
+        generator = torch.Generator().manual_seed(0)
+        mesh = self.mesh = Mesh.of(faces, shapes.keyframes.shape[1])
+        self.energy = Energy(mesh, [Stretch(), Bend(), Volume()])
+        self.fused = WarpSteps(self.energy, mesh)
+        x = shapes.keyframes * (CANONICAL_SIZE / (shapes.keyframes[0].amax(0) - shapes.keyframes[0].amin(0)).norm())
+        n_edges, n_hinges = len(mesh.edges), len(mesh.hinges)
+        stiffness = [
+            500 + 100 * torch.rand(2, n_edges, generator=generator, dtype=DOUBLE),
+            10 + torch.rand(2, n_hinges, generator=generator, dtype=DOUBLE),
+            torch.full((2, 1), 1e3, dtype=DOUBLE),
+        ]
+        t = torch.tensor([0.3, 0.6], dtype=DOUBLE)
+        start = torch.lerp(x[:2], x[1:3], 0.5)
+        start = start + roughness * torch.randn(start.shape, dtype=DOUBLE, generator=generator)
+        self.given = [start, x[:2].clone(), x[1:3].clone(), t, *stiffness]
+
+    @staticmethod
+    def rests(first: Tensor, second: Tensor, t: Tensor, *stiffness: Tensor) -> RestShapes:
+        return RestShapes(torch.stack([first, second], 1), torch.stack([1 - t, t], -1), stiffness)
+
+    def by_torch(self, x: Tensor, *rests: Tensor) -> Tensor:
+        return relax(self.energy, x, self.rests(*rests).reference(self.energy), 2, 4)
+
+    def by_warp(self, x: Tensor, *rests: Tensor) -> Tensor:
+        return self.fused(x, self.fused.reference(self.rests(*rests)), 2, 4)
+
+
+@pytest.fixture(params=["closed", "open", "flat"])
+def case(request: pytest.FixtureRequest, small_bars: Shapes) -> Case:
+    if request.param == "flat":  # no volume: its weight is bounded by the area
+        grid, faces = map(torch.from_numpy, sheet_surface((5, 5), (1.0, 1.0)))
+        bent = grid + 0.3 * torch.stack([0 * grid[:, 0], grid[:, 0] ** 2, 0 * grid[:, 0]], -1)
+        return Case(Shapes(torch.stack([grid, bent, 1.1 * bent]), faces, []), faces, 0.1)
+    faces = small_bars.faces[6:] if request.param == "open" else small_bars.faces
+    return Case(small_bars, faces, 0.3)
+
+
+def gradients(run, given: list[Tensor], create: bool = False) -> tuple[Tensor, ...]:
+    leaves = [value.clone().requires_grad_() for value in given]
+    out = run(*leaves)
+    weights = torch.randn(out.shape, dtype=out.dtype, generator=torch.Generator().manual_seed(1))
+    found = torch.autograd.grad((out * weights).sum(), leaves, create_graph=create)
+    if not create:
+        return found
+    return torch.autograd.grad(sum(g.square().sum() for g in found), leaves)
+
+
+def assert_alike(found: tuple[Tensor, ...], truth: tuple[Tensor, ...], to: float) -> None:
+    for got, wanted in zip(found, truth, strict=True):
+        torch.testing.assert_close(got, wanted, rtol=0, atol=to * max(float(wanted.abs().max()), 0.01))
+
+
+def assert_kernels(run: Any, truth: Any, given: list[Tensor], atol: float, to: float, second: bool = True) -> None:
+    """Kernels have the values of torch, its gradients and its second ones."""
+    torch.testing.assert_close(run(*given), truth(*given), rtol=0, atol=atol)
+    assert_alike(gradients(run, given), gradients(truth, given), to)
+    if second:
+        assert_alike(gradients(run, given, True), gradients(truth, given, True), 1e-7)
+
+
+def test_local_steps(case: Case) -> None:
+    assert float((case.by_torch(*case.given) - case.given[0]).abs().max()) > 1e-2
+    assert_kernels(case.by_warp, case.by_torch, case.given, 1e-8 * CANONICAL_SIZE, 1e-6, case.fused.closed)
+
+
+@torch.no_grad()
+def test_distortion(case: Case) -> None:
+    """Also of needles, whose weights are bounded."""
+    i, j, *tips = case.mesh.hinges[0].tolist()
+    for x in case.given[1:3]:
+        middle = 0.5 * (x[:, [i]] + x[:, [j]])
+        x[:, tips] = middle + 0.05 * (x[:, tips] - middle)
+    shapes, rests = case.given[:3], case.rests(*case.given[1:])
+    found, wanted = (kind(case.mesh, None)(shapes, rests) for kind in (WarpDistortion, Distortion))
+    torch.testing.assert_close(found, wanted, rtol=1e-12, atol=0)
+
+
+def test_edges_that_are_points_at_rest_weigh_nothing(small_bars: Shapes) -> None:
+    case = Case(small_bars, small_bars.faces, 0.3)
+    one, other = case.mesh.edges[0].tolist()
+    case.given[1][:, other] = case.given[1][:, one] + 1e-7
+    rests = case.rests(*case.given[1:])
+    found, truth = case.fused.reference(rests), case.fused.packed(rests.reference(case.energy))
+    for got, wanted in zip(found, truth, strict=True):
+        torch.testing.assert_close(got, wanted, rtol=1e-9, atol=1e-9)
+    assert_alike(gradients(case.by_warp, case.given), gradients(case.by_torch, case.given), 1e-6)
+
+
+def test_steps_that_would_go_uphill_are_shortened(small_bars: Shapes) -> None:
+    case = Case(small_bars, small_bars.faces, 10.0)
+    case.given[5] *= 1e5
+    to, taken = case.fused.reference(case.rests(*case.given[1:])), []
+    found = case.fused.steps(case.given[0].contiguous(), to, 2, 4, taken)
+    lengths = torch.stack([step.length for step in taken])
+    assert float(lengths.min()) < 0.5 < float(lengths.max()), "no step is shortened, or all are"
+    torch.testing.assert_close(found, case.by_torch(*case.given), rtol=0, atol=1e-8 * CANONICAL_SIZE)
+    assert_alike(gradients(case.by_warp, case.given), gradients(case.by_torch, case.given), 1e-6)
+
+
+def test_gradient_where_the_steps_start(small_bars: Shapes) -> None:
+    # Steps from rounding have no derivative of their own there; no kink may make large numbers of it.
+    case = Case(small_bars, small_bars.faces, 0.0)
+    start = case.given[1].clone()
+    given = [start, case.given[1], case.given[1].clone(), *case.given[3:]]
+    for run in (case.by_warp, case.by_torch):
+        assert all(float(own.abs().max()) < 10 for own in gradients(run, given))
+
+
+class TestModal:
+    """The energy in the amplitudes of a space."""
+
+    @staticmethod
+    def both(case: Case) -> list[tuple[ModalEnergy, Placement]]:
+        start, generator = case.given[0], torch.Generator().manual_seed(2)
+        columns = torch.randn(5, *start.shape[1:], dtype=DOUBLE, generator=generator)
+        shell = WarpShell(case.energy, case.mesh)
+        modals = WarpModalEnergy(case.energy, case.mesh, columns), ModalEnergy(case.energy, columns)
+        rests = case.rests(*case.given[1:])
+        return [
+            (modals[0], modals[0].place(start, shell.reference(rests))),
+            (modals[1], modals[1].place(start, rests.reference(case.energy))),
+        ]
+
+    @torch.no_grad()
+    def test_values_and_derivatives(self, case: Case) -> None:
+        a = 0.1 * torch.randn(2, 5, dtype=DOUBLE, generator=torch.Generator().manual_seed(3))
+        (fused, own), (plain, truth) = self.both(case)
+        several = torch.stack([a, 2 * a, -a])
+        torch.testing.assert_close(fused.value(several, own), plain.value(several, truth), rtol=1e-12, atol=0)
+        torch.testing.assert_close(fused.rows(a, own), plain.rows(a, truth), rtol=0, atol=1e-11)
+        found, wanted = fused.derivatives(a, own), plain.derivatives(a, truth)
+        assert float(wanted.second_order.abs().max()) > 1e-3 * float(wanted.gauss_newton.abs().max())
+        assert_alike(found, wanted, 1e-9)
+        value, gradient = fused.value_and_gradient(a, own)
+        torch.testing.assert_close(value, plain.value(a, truth), rtol=1e-12, atol=0)
+        torch.testing.assert_close(plain.value_and_gradient(a, truth)[0], plain.value(a, truth), rtol=1e-12, atol=0)
+        assert_alike((gradient, plain.value_and_gradient(a, truth)[1]), (wanted.gradient,) * 2, 1e-9)
+
+    def test_gradients_are_differentiated(self, case: Case) -> None:
+        generator = torch.Generator().manual_seed(4)
+        a, direction = torch.randn(2, 2, 5, dtype=DOUBLE, generator=generator).mul(0.1)
+        (fused, own), (plain, truth) = self.both(case)
+        given = [a, *trees.leaves(own)]
+
+        def by_kernels(a: Tensor, *leaves: Tensor) -> Tensor:
+            return fused.gradient(a, trees.filled(own, leaves))
+
+        def by_torch(a: Tensor, *leaves: Tensor) -> Tensor:
+            return plain.gradient(a, fused.unpacked(trees.filled(own, leaves)))
+
+        assert_alike([by_kernels(*given)], [plain.derivatives(a, truth).gradient], 1e-10)
+        found, wanted = (torch.func.vjp(each, *given)[1](direction) for each in (by_kernels, by_torch))
+        assert_alike(found, wanted, 1e-10)
+
+    @pytest.mark.parametrize("relative", [False, True])
+    def test_softer_at_needles(self, case: Case, relative: bool) -> None:
+        """Shapes with needles, along either side of their triangles; rest shapes with some, too."""
+        (fused, own), _ = self.both(case)
+        shapes = own.base * torch.tensor([0.02, 1.0, 3.0], dtype=DOUBLE)
+        operation, given = fused_shell._Softened(fused.shell), [shapes, own.reference.elements]
+        if relative:
+            rests, weights = case.rests(*case.given[1:])[:2]
+            rests = torch.cat([rests[:, :1] * torch.tensor([1.0, 0.04, 1.0], dtype=DOUBLE), rests[:, 1:]], 1)
+            alone = torch.tensor([[1.0, 0.0]] * 2, dtype=DOUBLE)
+            torch.testing.assert_close(operation.by_torch(rests[:, 1], given[1], rests.flip(1), alone)[0], given[1])
+            given += [rests, weights]
+        softened, hard = operation.by_torch(*given)[0][..., 2], own.reference.elements[..., 2]
+        assert float((softened / hard)[hard > 0].min()) < 0.1
+        run, truth = lambda *x: fused_operation(operation, *x)[0], lambda *x: operation.by_torch(*x)[0]
+        assert_kernels(run, truth, given, 1e-12 * float(hard.max()), 1e-11)
+
+    @torch.no_grad()
+    def test_samples_that_are_too_many_at_a_time(self, case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
+        """No array of all samples outgrows what kernels count: they are taken in chunks."""
+        a = 0.1 * torch.randn(2, 5, dtype=DOUBLE, generator=torch.Generator().manual_seed(3))
+        (fused, own), _ = self.both(case)
+        several, many = torch.cat([a, -a, 2 * a])[:5], trees.rows(own, torch.tensor([0, 1, 0, 1, 0]))
+        truth = fused.derivatives(several, many)
+        largest = len(fused.blocks) * fused.blocks.shape[1] * 8
+        monkeypatch.setattr(fused_modal, "MOST_NUMBERS", largest)
+        sizes: list[int] = []
+
+        def watched(kernel: Any, dim: tuple[int, ...], given: list[Any]) -> None:
+            sizes.extend(x.numel() for x in given if isinstance(x, Tensor))
+            launch.launch(kernel, dim, given)
+
+        monkeypatch.setattr(fused_modal, "launch", watched)
+        found = fused.derivatives(several, many)
+        assert max(sizes) <= largest
+        assert_alike(found, truth, 1e-13)
+        assert fused.derivatives(several, many, second_order=False).second_order is None
+
+    @pytest.mark.parametrize("n_shapes", [1, 2, 4])
+    def test_references(self, case: Case, n_shapes: int) -> None:
+        shell, (_, first, second, _, *stiffness) = WarpShell(case.energy, case.mesh), case.given
+        shapes = torch.stack([first, second, 0.5 * (first + second), 1.1 * second], 1)[:, :n_shapes]
+        weights = torch.tensor([[0.4, 0.7, 0.2, -0.3], [0.1, 0.2, 0.3, 0.4]], dtype=DOUBLE)[:, :n_shapes]
+
+        def by_kernels(*given: Tensor) -> ShellReference:
+            return shell.reference(RestShapes(*given[:2], given[2:]))
+
+        def by_torch(*given: Tensor) -> ShellReference:
+            return shell.packed(RestShapes(*given[:2], given[2:]).reference(case.energy))
+
+        def flat(run: Any) -> Any:
+            return lambda *given: torch.cat([part.flatten() for part in run(*given)[:-1]])
+
+        given = [shapes.clone(), weights.clone(), *stiffness]
+        for found, wanted in zip(by_kernels(*given), by_torch(*given), strict=True):
+            torch.testing.assert_close(found, wanted, rtol=1e-11, atol=1e-9)
+        assert_kernels(flat(by_kernels), flat(by_torch), given, 1e-6, 1e-9)
+        there, back = by_torch(*given), shell.packed(shell.unpacked(by_kernels(*given)))
+        for found, wanted in zip(back, there, strict=True):
+            torch.testing.assert_close(found, wanted, rtol=1e-11, atol=1e-9)
+
+
+def turned(rotations: WarpRotations, kind: type[LocalRotations] = WarpRotations) -> Any:
+    """Pulls of the edge vectors of pairs at times, with stiffnesses of their own."""
+    mesh = Connectivity(rotations.faces.numpy())
+    poisson = Poisson(mesh, torch.linspace(1, 2, len(mesh.edges), dtype=DOUBLE))
+
+    def run(first: Tensor, second: Tensor, t: Tensor) -> Tensor:
+        return kind.pulls(rotations, torch.stack([first, second], 1), torch.stack([1 - t, t], -1), poisson)
+
+    return run
+
+
+class TestAlignment:
+    """Covariances of a reference with pairs of shapes, and of these."""
+
+    @staticmethod
+    def given(*, flat: float = 1.0) -> list[Tensor]:
+        generator = torch.Generator().manual_seed(5)
+        noise = torch.randn(6, 2, 20, 3, dtype=DOUBLE, generator=generator)
+        x = noise[0, 0] * torch.tensor([3.0, flat, flat**2], dtype=DOUBLE) + 0.3 * flat**2 * noise
+        x = x @ exp(2 * noise[:, :, 0]).mT
+        t = torch.linspace(0, 1, 6, dtype=DOUBLE)
+        return [x[0, 0].mT @ x, x[:, :, None].mT @ x[:, None], torch.stack([1 - t, t], 1)]
+
+    @pytest.mark.parametrize("index", [0, 1], ids=["turns", "pose"])
+    def test_of_two_shapes(self, index: int) -> None:
+        for given in (self.given(), [0.01 * x for x in self.given()[:2]] + self.given()[2:]):
+            run, truth = lambda *x: mean_pose(*x)[index], lambda *x: procrustes.mean_pose(*x)[index]
+            assert_kernels(run, truth, given, 1e-12, 1e-10)
+
+    def test_of_shapes_on_a_line(self) -> None:
+        """Nothing determines the turn about it: it is a rotation all the same, and gradients are finite."""
+        given = self.given(flat=0.0)
+        for found in mean_pose(*given):
+            torch.testing.assert_close(found @ found.mT, torch.eye(3, dtype=DOUBLE).expand_as(found))
+            assert (torch.linalg.det(found) > 0).all()
+        assert all(x.isfinite().all() for x in gradients(lambda *x: mean_pose(*x)[1], given))
+
+    def test_volumes(self, small_bars: Shapes) -> None:
+        mesh = Connectivity(small_bars.faces.numpy())
+        found, truth = (kind(mesh)(small_bars.keyframes[None]) for kind in (WarpVolumes, Volumes))
+        torch.testing.assert_close(found, truth, rtol=1e-12, atol=0)
+
+
+class TestRotations:
+    @pytest.fixture
+    def rotations(self, small_bars: Shapes) -> WarpRotations:
+        mesh = Mesh.of(small_bars.faces, small_bars.keyframes.shape[1])
+        return WarpRotations(mesh.connectivity, small_bars.keyframes[:2])
+
+    @staticmethod
+    def oracle(rotations: WarpRotations) -> Any:
+        """The same by torch."""
+        return turned(rotations, LocalRotations)
+
+    def test_between_two(self, rotations: WarpRotations, small_bars: Shapes) -> None:
+        x = small_bars.keyframes
+        given = [x[:2].clone(), x[1:3].clone(), torch.tensor([0.3, 0.8], dtype=DOUBLE)]
+        assert_kernels(turned(rotations), self.oracle(rotations), given, 1e-12, 1e-9)
+        found = vmap(lambda t: turned(rotations)(*given[:2], t.expand(2)))(given[2])
+        torch.testing.assert_close(found[1], turned(rotations)(*given[:2], given[2][1].expand(2)), rtol=0, atol=1e-12)
+
+    def test_the_same_shape(self, rotations: WarpRotations, small_bars: Shapes) -> None:
+        x = small_bars.keyframes[:1]
+        given = [x.clone(), x.clone(), torch.tensor([0.3], dtype=DOUBLE)]
+        assert_alike(gradients(turned(rotations), given)[:2], gradients(self.oracle(rotations), given)[:2], 1e-7)
+
+    def test_on_a_course(self, rotations: WarpRotations, small_bars: Shapes) -> None:
+        x = small_bars.keyframes
+        which, t = torch.zeros(3, dtype=torch.int64), torch.tensor([0.0, 0.3, 0.8], dtype=DOUBLE)
+
+        def by(kind: type, first: Tensor, second: Tensor, t: Tensor) -> Tensor:
+            before, own, after = (frames_of(shape, rotations.faces) for shape in (x[2:3], first, second))
+            found = cubics(torch.stack([rotations.step(before, own), rotations.step(own, after)]), t.new_ones(2), False)
+            size = torch.stack(own[3:])
+            trajectory = Trajectory(own.e1, own.e2, own.normal, size, *(part[1] for part in found))
+            return kind.along(rotations, trajectory, which, t)
+
+        def by_warp(*given: Tensor) -> Tensor:
+            return by(WarpRotations, *given)
+
+        def by_torch(*given: Tensor) -> Tensor:
+            return by(WarpRotations.__base__, *given)
+
+        given = [x[:1].clone(), x[1:2].clone(), t]
+        assert_kernels(by_warp, by_torch, given, 1e-12, 1e-9)
+        found = vmap(lambda t: by_warp(*given[:2], t))(torch.stack([t, 0.5 * t]))
+        torch.testing.assert_close(found[1], by_warp(*given[:2], 0.5 * t), rtol=0, atol=1e-12)
+
+
+class TestLayers:
+    @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+    def test_in_between_and_path(self, bars: Shapes, dtype: torch.dtype) -> None:
+        x, t = bars.keyframes.to(dtype), torch.tensor([0.3, 0.5], dtype=dtype)
+        found = []
+        for kind, fine in (("warp", WarpFineEnergy), ("torch", FineEnergy)):
+            solver = tm.Solver(backend=kind)  # type: ignore[arg-type]
+            layer = tm.InBetween(bars.bases[:2], bars.faces, solver=solver).to(dtype)
+            assert type(layer.core.fine) is fine
+            path = tm.Path(bars.bases, bars.faces, solver=solver).to(dtype)
+            found.append(torch.cat([layer(*x[:2], t), path(x, 3 * t)]))
+        assert found[0].dtype == dtype
+        torch.testing.assert_close(*found, rtol=0, atol=1e-7 if dtype == torch.float64 else 1e-4)
+
+    @pytest.mark.parametrize("over", ["t", "terms.0.stiffness", "terms.2.stiffness"])
+    @pytest.mark.parametrize("preset", ["accurate", "fast"])
+    def test_vmap(self, small_bars: Shapes, preset: Any, over: str) -> None:
+        """Over what not every tensor of a solve depends on; with its gradients, with and without recording."""
+        stiffness = {"alpha": torch.tensor(500.0), "beta": torch.tensor(10.0), "gamma": torch.tensor(1e3)}
+        objective = replace(PRESETS[preset].objective, **stiffness)
+        layer = tm.InBetween(small_bars.bases[:2], small_bars.faces, preset, objective=objective).double()
+        ends = small_bars.keyframes[:2]
+        given = torch.tensor([0.3, 0.5, 0.8] if over == "t" else [100.0, 500.0, 900.0], dtype=DOUBLE)
+
+        def at(value: Tensor) -> Tensor:
+            return layer(*ends, value) if over == "t" else functional_call(layer, {over: value}, (*ends, 0.5))
+
+        def slope(value: Tensor) -> Tensor:
+            return grad(lambda value: at(value).square().sum())(value)
+
+        for recorded in (True, False):
+            with torch.set_grad_enabled(recorded):
+                truth = torch.stack([at(value) for value in given])
+                assert float((truth[0] - truth[1]).abs().max()) > 1e-7
+                torch.testing.assert_close(vmap(at)(given), truth, rtol=0, atol=1e-9)
+        slopes = torch.stack([slope(value) for value in given])
+        torch.testing.assert_close(vmap(slope)(given), slopes, rtol=1e-7, atol=1e-9 * float(slopes.abs().max()))
+
+    @pytest.mark.parametrize("smooth", [False, True], ids=["pair", "path"])
+    def test_a_term_of_ones_own_is_beside_the_kernels(self, bars: Shapes, smooth: bool) -> None:
+        """The same with kernels and without, with a gradient and without."""
+
+        spring = Spring([5], bars.keyframes[0, :1] + 0.3, 1e-3)
+        objective = tm.Objective(terms=(Area(0.3), Volume(1.0), spring))
+        n, t = (3, 1.3) if smooth else (2, 0.3)
+        found = []
+        for kind in ("warp", "torch"):
+            solver = tm.Solver(backend=kind, polish=1)  # type: ignore[arg-type]
+            path = tm.Path(bars.bases[:n], bars.faces, objective=objective, solver=solver)
+            assert isinstance(path.layers[0].core.fine, WarpFineEnergy) == (kind == "warp")
+            keyframes = bars.keyframes[:n].clone().requires_grad_()
+            shape = path(keyframes, t)
+            with torch.no_grad():
+                torch.testing.assert_close(path(keyframes, t), shape.detach(), rtol=0, atol=1e-9)
+            found.append((shape.detach(), torch.autograd.grad(shape.square().sum(), keyframes)[0]))
+        torch.testing.assert_close(found[0][0], found[1][0], rtol=0, atol=1e-7)
+        torch.testing.assert_close(found[0][1], found[1][1], rtol=1e-4, atol=1e-5)
+
+    def test_what_has_no_numbers_is_torchs(self, small_bars: Shapes) -> None:
+        from torch._subclasses import FakeTensorMode
+
+        layer = tm.InBetween(small_bars.bases[:2], small_bars.faces)
+        with FakeTensorMode(allow_non_fake_inputs=True) as mode, torch.no_grad():
+            x = mode.from_tensor(small_bars.keyframes[:1])
+            weights = mode.from_tensor(torch.zeros(1, 2, dtype=DOUBLE))
+            assert layer.core.blend.rotations(torch.stack([x, x], 1), weights).shape[0] == 3
+
+
+def test_what_a_kernel_would_read_wrongly_is_refused() -> None:
+    """Indices have 32 bits: beyond, they would wrap."""
+    x, kernel = torch.zeros(4, 3, dtype=DOUBLE), launch.kernels("steps").inner
+    for wrong in (x.float(), torch.zeros(3, 2, 4, dtype=DOUBLE).mT):
+        with pytest.raises(RuntimeError, match=r"contiguous tensor of torch\.float64"):
+            launch.launch(kernel, (1, 2), [wrong, x, 4, torch.zeros(1, 3, dtype=DOUBLE)])
+    huge = torch.empty(2**31, 3, dtype=DOUBLE, device="meta")
+    with pytest.raises(ValueError, match=r"2147483648 entries.* fewer samples"):
+        launch.launch(kernel, (1, 2), [x, huge, 4, x[:1]])
+
+
+class TestBackend:
+    def test_not_installed(self, monkeypatch: pytest.MonkeyPatch, small_bars: Shapes) -> None:
+        there = importlib.util.find_spec
+        monkeypatch.setattr("importlib.util.find_spec", lambda name: None if name == "warp" else there(name))
+        backend.WarpBackend.works.cache_clear()
+        try:
+            assert type(tm.InBetween(small_bars.bases[:2], small_bars.faces).core.fine) is FineEnergy
+            with pytest.raises(MissingPackageError, match="pip install warp-lang"):
+                tm.InBetween(small_bars.bases[:2], small_bars.faces, solver=tm.Solver(backend="warp"))
+        finally:
+            backend.WarpBackend.works.cache_clear()
+
+    def test_not_usable(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        def broken(name: str) -> None:
+            raise OSError("the cache folder is not writable")
+
+        monkeypatch.setattr(backend, "kernels", broken)
+        backend.WarpBackend.works.cache_clear()
+        try:
+            with pytest.warns(UserWarning, match="the cache folder is not writable"):
+                assert type(choose("auto")) is TorchBackend
+        finally:
+            backend.WarpBackend.works.cache_clear()
+
+    def test_one_module_is_loaded_without_the_others_and_without_a_word(self) -> None:
+        code = (
+            "import sys; from torch_modal.elastic.kernels.launch import kernels; kernels('rotations'); "
+            "sys.exit(any(f'torch_modal.elastic.kernels.{name}' in sys.modules "
+            "for name in ('shell', 'modal', 'steps')))"
+        )
+        folder = Path(tm.__file__).parents[1]
+        result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, cwd=folder)
+        assert (result.returncode, result.stdout, result.stderr) == (0, "", "")
+
+    def test_all_else_on_standard_error_is_passed_on(self) -> None:
+        """In order, of Python and of native code, with a line that has no end; and without standard error."""
+        code = (
+            "import os, sys; from torch_modal.elastic.kernels.launch import _without_line\n"
+            "def say(text): os.write(2, text)\n"
+            "say(b'before\\n')\n"
+            "try:\n"
+            "    with _without_line(b'a line'):\n"
+            "        print('during', file=sys.stderr); say(b'a line too many\\nnative\\n'); say(b'no end'); 1 / 0\n"
+            "except ZeroDivisionError: say(b', after\\n')\n"
+            "print('python', file=sys.stderr, flush=True); os.close(2)\n"
+            "with _without_line(b'a line'): print('out')\n"
+        )
+        folder = Path(tm.__file__).parents[1]
+        result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, cwd=folder)
+        assert (result.returncode, result.stdout) == (0, "out\n")
+        assert result.stderr == "before\nduring\nnative\nno end, after\npython\n"
+
+
+def test_what_warp_says_of_itself_is_left_alone() -> None:
+    import warp
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        before = warp.config.log_level
+        launch.kernels.cache_clear()
+        launch.kernels("shell")
+        assert warp.config.log_level == before

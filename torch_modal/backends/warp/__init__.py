@@ -1,1 +1,0 @@
-"""The fast path: kernels of NVIDIA Warp."""

@@ -1,0 +1,115 @@
+"""Distortion of shapes against their rest shapes, with a bounded contribution of each element."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from torch_modal.elastic.bend import collapsed, dihedral_angle
+from torch_modal.elastic.energy import Energy, RestShapes
+from torch_modal.elastic.steps import FurtherTerms
+from torch_modal.elastic.term import Mesh, periodic_square
+from torch_modal.geometry.vectors import cross, inverse, norm, pick
+
+# Elements of each kind that are looked at, spread evenly: the sum is then known to a few percent.
+MOST_ELEMENTS = 1024
+
+# Strain of an edge from which on its contribution is linear: of edges that have no length at rest it means nothing.
+LARGEST_STRAIN = 4.0
+
+# Bound on the weight l^2 / A of a hinge with a needle; an equilateral hinge has 1.15.
+LARGEST_WEIGHT = 8.0
+
+# Strain of all edges below which hardly anybody sees a difference.
+SLIGHT = 0.02
+
+
+class Distortion(nn.Module):
+    r"""Stretching and bending of Eq. 5 against K rest shapes, with a bounded contribution of each element.
+
+    .. math:: \sum_e \alpha\, |l_e - \bar l_e| \min(|l_e - \bar l_e| / \bar l_e,\, 4)
+        + \sum_h \beta \min(\bar l_h^2 / \bar A_h,\, 8)\, f(\theta_h - \bar\theta_h)
+
+    The sum over the rest shapes is weighted. Further terms of the energy count in full.
+
+    Args:
+        mesh: The mesh.
+        further: Terms beyond Eq. 5.
+    """
+
+    vertices: Tensor
+    edge: Tensor
+    edges: Tensor
+    hinge: Tensor
+    hinges: Tensor
+
+    def __init__(self, mesh: Mesh, further: Energy | None) -> None:
+        super().__init__()
+        interior = torch.tensor(mesh.connectivity.counts == 2)
+        n_edges, n_hinges = len(interior), int(interior.sum())
+        edge = torch.linspace(0, n_edges - 1, min(n_edges, MOST_ELEMENTS), dtype=torch.float64).round().long()
+        hinge = (interior.cumsum(0) - 1)[edge[interior[edge]]]
+        edges, hinges = mesh.edges[edge], mesh.hinges[hinge]
+        vertices, places = torch.cat([edges.flatten(), hinges.flatten()]).unique(return_inverse=True)
+        own_edges, own_hinges = places.split([edges.numel(), hinges.numel()])
+        buffers = {
+            "vertices": vertices,
+            "edge": edge,
+            "edges": own_edges.view_as(edges).T.contiguous(),
+            "hinge": hinge,
+            "hinges": own_hinges.view_as(hinges).T.contiguous(),
+        }
+        for name, values in buffers.items():
+            self.register_buffer(name, values, persistent=False)
+        #: How many elements each one stands for.
+        self.shares = n_edges / len(edge), n_hinges / max(len(self.hinge), 1)
+        self.further = further
+
+    def forward(self, shapes: Sequence[Tensor], rests: RestShapes) -> Tensor:
+        """The distortion of S shapes of each sample. *Shape of each:* ``(B, V, 3) -> (S, B)``."""
+        total = self.of_shell(shapes, rests)
+        if self.further is not None:
+            terms = FurtherTerms(self.further, rests)
+            total = total + torch.stack([terms.value(x) for x in shapes])
+        return total
+
+    def of_shell(self, shapes: Sequence[Tensor], rests: RestShapes) -> Tensor:
+        """Stretching and bending. *Shape of each:* ``(B, V, 3) -> (S, B)``."""
+        # All shapes at once: the cost of so few elements is that of the number of operations.
+        rows = self._rows(*shapes, *rests.shapes.unbind(1))
+        hinges = _edge_vectors(rows, self.hinges)
+        n, lengths, angles = len(shapes), norm(_edge_vectors(rows, self.edges)[0]), dihedral_angle(hinges)
+        alpha, beta = self.on_elements(rests.stiffness)
+        off = (lengths[:n, None] - lengths[n:]).abs()
+        stretching = (alpha * off * (off / lengths[n:]).clamp_max(LARGEST_STRAIN)).sum(-1)
+        bending = (beta * _weights(hinges[:, :, n:]) * periodic_square(angles[:n, None] - angles[n:])).sum(-1)
+        return (rests.weights.mT * (self.shares[0] * stretching + self.shares[1] * bending)).sum(1)
+
+    def on_elements(self, stiffness: Sequence[Tensor]) -> list[Tensor]:
+        """Stiffnesses of the edges and hinges that are looked at. *Shape of each:* ``(B, M)`` or ``(B, 1)``."""
+        pairs = zip(stiffness, (self.edge, self.hinge), strict=False)
+        return [values if values.shape[-1] == 1 else values[:, own] for values, own in pairs]
+
+    def slight(self, stiffness: Sequence[Tensor], like: Tensor) -> Tensor:
+        """The distortion of a shape whose edges are all strained by :data:`SLIGHT`. *Shape:* ``(B,)``."""
+        lengths = norm(_edge_vectors(self._rows(like.detach()), self.edges)[0]).sum((0, -1))
+        return self.shares[0] * stiffness[0].detach().mean(-1) * lengths * SLIGHT**2
+
+    def _rows(self, *shapes: Tensor) -> Tensor:
+        """The vertices of the elements, components first. *Shape of each:* ``(B, V, 3) -> (3, S, B, n)``."""
+        picked = torch.stack([x.index_select(-2, self.vertices) for x in shapes])
+        return picked.movedim(-1, 0).contiguous()
+
+
+def _edge_vectors(rows: Tensor, corners: Tensor) -> Tensor:
+    """Vectors from the first vertex of each element to the others. *Shape:* ``(3, ..., V) -> (n-1, 3, ..., M)``."""
+    first, *others = (pick(rows, corner) for corner in corners)
+    return torch.stack([other - first for other in others])
+
+
+def _weights(edge_vectors: Tensor) -> Tensor:
+    """The bounded weights of hinges; 0 where a triangle has collapsed. *Shape:* ``(3, 3, ..., H) -> (..., H)``."""
+    e, a, b = edge_vectors
+    n1, n2 = cross(e, a), cross(b, e)
+    weight = 2 * (e * e).sum(0) * inverse(norm(n1) + norm(n2), collapsed(e, n1) | collapsed(e, n2))
+    return weight.clamp_max(LARGEST_WEIGHT)

@@ -1,0 +1,336 @@
+"""An energy of several terms on one mesh: values, gradients, and products with a convex Hessian.
+
+Components come first, ``(3, ..., V)``. Shapes are *extended* by the vertices that elements may have beside those of
+the mesh: its centre, and the anchors of the terms.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from torch_modal.autograd import lasting
+from torch_modal.elastic.bend import Bend, softening
+from torch_modal.elastic.term import Mesh, Term
+from torch_modal.geometry.vectors import pick
+
+
+def energy_rounding(dtype: torch.dtype) -> float:
+    """Difference of energies, relative to them, that says nothing about a step."""
+    return 64.0 * torch.finfo(dtype).eps
+
+
+class Rest(NamedTuple):
+    """Measures of a rest shape and their weights, term by term."""
+
+    measures: tuple[Tensor, ...]
+    """*Shape of each:* ``(..., M)``."""
+    weights: tuple[Tensor, ...]
+    """Without the stiffness. *Shape of each:* ``(..., M)``."""
+
+
+class Reference(NamedTuple):
+    r"""The reference of an energy, :math:`\sum_m W_m (q_m - Q_m)^2 + c`; angles have five rows ``Q``."""
+
+    measures: tuple[Tensor, ...]
+    """``Q``, of :meth:`torch_modal.elastic.term.Term.merged`. *Shape of each:* ``(..., R, M)``."""
+    weights: tuple[Tensor, ...]
+    """``W``, the stiffness included. *Shape of each:* ``(..., M)``."""
+    constant: Tensor
+    """``c``. *Shape:* ``(...)``."""
+
+
+class Linearised(NamedTuple):
+    """One term at given shapes."""
+
+    edge_vectors: Tensor
+    """*Shape:* ``(n-1, 3, B, M)``."""
+    measures: Tensor
+    """*Shape:* ``(B, M)``; M is 1 of a total, here and below."""
+    gradients: Tensor
+    """Of the measures in the edge vectors, *shape* ``(n-1, 3, B, M)``; of a total in the vertices, ``(3, B, V)``."""
+    slope: Tensor
+    """First derivative of the energy in each measure. *Shape:* ``(B, M)``."""
+    curvature: Tensor
+    """Second derivative, or a bound that is never negative. *Shape:* ``(B, M)``."""
+    beyond: Tensor | None
+    """The second derivative beyond that, if any. *Shape:* ``(B, M)``."""
+
+
+def _outlasting_buffers(module: nn.Module) -> None:
+    """Terms may have been made in inference mode, or of tensors that were."""
+    for part in module.modules():
+        for name, buffer in part.named_buffers(recurse=False):
+            if buffer.is_inference():
+                setattr(part, name, lasting(buffer.clone)())
+
+
+class OnMesh(nn.Module):
+    """A term on a mesh.
+
+    Args:
+        term: The term. It is not registered here: terms serve several meshes, and belong to who made them.
+        elements: Numbers of the vertices of each element. *Shape:* ``(M, n)``.
+    """
+
+    term: Term
+    corners: Tensor
+
+    def __init__(self, term: Term, elements: Tensor) -> None:
+        super().__init__()
+        self.__dict__["term"] = term
+        self.register_buffer("corners", elements.T.contiguous(), persistent=False)
+
+    def edge_vectors(self, rows: Tensor) -> Tensor:
+        """Vectors from the first vertex of each element to the others. *Shape:* ``(3, ..., V) -> (n-1, 3, ..., M)``."""
+        first, *others = (pick(rows, corner) for corner in self.corners)
+        return torch.stack([other - first for other in others])
+
+    def measures(self, edge_vectors: Tensor) -> Tensor:
+        """The measures, or their sum for a total. *Shape:* ``(n-1, 3, ..., M) -> (..., M or 1)``."""
+        measures = self.term.measures(edge_vectors)
+        return measures.sum(-1, keepdim=True) if self.term.total else measures
+
+    def on_elements(self, weights: Tensor) -> Tensor:
+        """Weights of vertices on the elements: means of their corners. *Shape:* ``(..., V) -> (..., M or 1)``."""
+        return weights.mean(-1, keepdim=True) if self.term.total else weights[..., self.corners].mean(-2)
+
+    def on_corners(self, on_edge_vectors: Tensor) -> list[Tensor]:
+        """From the edge vectors to each vertex of the elements. *Shape:* ``(n-1, 3, ..., M)``; ``(3, ..., M)`` each."""
+        return [-on_edge_vectors.sum(0), *on_edge_vectors]
+
+    def scattered(self, out: Tensor, on_edge_vectors: Tensor) -> Tensor:
+        """Values of the vertices, and what the edge vectors give to them. *Shape:* ``(3, ..., V)``."""
+        for corner, own in zip(self.corners, self.on_corners(on_edge_vectors), strict=True):
+            out = out.index_add(-1, corner, own)
+        return out
+
+
+class Energy(nn.Module):
+    """The sum of terms on one mesh.
+
+    Args:
+        mesh: The mesh.
+        terms: The terms.
+        sampled: Whether shapes consist of the :attr:`vertices` that elements have, and of no others. Terms then have
+            no centre.
+    """
+
+    parts: Any
+    used: Tensor
+    vertices: Tensor
+
+    def __init__(self, mesh: Mesh, terms: Sequence[Term], sampled: bool = False) -> None:
+        super().__init__()
+        n, elements = mesh.n_vertices, []
+        n_anchors = [0 if term.anchors is None else len(term.anchors) for term in terms]
+        for term, more in zip(terms, n_anchors, strict=True):
+            _outlasting_buffers(term)
+            own, last = term.elements(mesh), n + more
+            if own.dim() != 2 or own.shape[1] < 2 or own.is_floating_point():
+                raise ValueError(
+                    f"{type(term).__name__}.elements gave {tuple(own.shape)} of {own.dtype}; they are rows of two "
+                    "vertex indices or more, (M, n)"
+                )
+            if own.numel() and not 0 <= int(own.min()) <= int(own.max()) <= last:
+                raise ValueError(
+                    f"{type(term).__name__}.elements gave vertices from {int(own.min())} to {int(own.max())}; they are "
+                    f"0 to {last}: those of the mesh, its centre, and the anchors of the term"
+                )
+            elements.append(own)
+        vertices = torch.arange(n)
+        if sampled:
+            vertices = torch.cat([own.flatten() for own in elements]).unique()
+            vertices = vertices[vertices < n]
+        self.n_vertices = len(vertices)
+        # The numbers that the mesh's vertices and its centre have here; each term's anchors follow those before.
+        numbers = torch.full((n + 1,), -1).index_copy(0, vertices, torch.arange(self.n_vertices))
+        numbers[n] = -1 if sampled else n
+        parts, self.n_extended = [], self.n_vertices + 1
+        for term, own, more in zip(terms, elements, n_anchors, strict=True):
+            anchors = torch.arange(self.n_extended, self.n_extended + more)
+            parts.append(OnMesh(term, torch.cat([numbers, anchors])[own]))
+            self.n_extended += more
+        self.parts = nn.ModuleList(parts)
+        self.sampled = sampled
+        self.register_buffer("vertices", vertices, persistent=False)
+        used = torch.arange(self.n_vertices) if sampled else torch.tensor(mesh.connectivity.used)
+        self.register_buffer("used", used, persistent=False)
+
+    @property
+    def anchors(self) -> Tensor | None:
+        """Those of all terms, in the caller's coordinates; None where there are none. *Shape:* ``(P, 3)``."""
+        points = [part.term.anchors for part in self.parts if part.term.anchors is not None]
+        return torch.cat(points) if points else None
+
+    # ------------------------------------------------------------------------------------------------------- vertices
+    def extend(self, rows: Tensor, anchors: Tensor | None = None) -> Tensor:
+        """The vertices, their centre and the anchors.
+
+        Args:
+            rows: *Shape:* ``(3, ..., V)``.
+            anchors: Zeros where None, for displacements. *Shape:* ``(3, ..., P)``.
+        """
+        centre = pick(rows, self.used).mean(-1, keepdim=True)
+        n_anchors = self.n_extended - self.n_vertices - 1
+        if not n_anchors:
+            return torch.cat([rows, centre], -1)
+        fixed = rows.new_zeros(*rows.shape[:-1], n_anchors) if anchors is None else anchors
+        return torch.cat([rows, centre, fixed.expand(*rows.shape[:-1], n_anchors)], -1)
+
+    def fold(self, extended: Tensor) -> Tensor:
+        """The adjoint of :meth:`extend`: distributes the centre's value to the vertices. *Shape:* ``(3, ..., V)``."""
+        share = extended[..., self.n_vertices, None] / len(self.used)
+        own = extended[..., : self.n_vertices].contiguous()
+        return own.index_add(-1, self.used, share.expand(*share.shape[:-1], len(self.used)).contiguous())
+
+    # ---------------------------------------------------------------------------------------------------- references
+    def rest(self, extended: Tensor) -> Rest:
+        """Measures and weights of rest shapes. *Shape:* ``(3, ..., V)``, extended."""
+        measures, weights = [], []
+        for part in self.parts:
+            edge_vectors = part.edge_vectors(extended)
+            found = part.measures(edge_vectors)
+            measures.append(part.term.at_rest(found))
+            weights.append(part.term.weights(edge_vectors, found))
+        return Rest(tuple(measures), tuple(weights))
+
+    def rest_of(self, x: Tensor) -> Rest:
+        """The rest shape from vertices alone. *Shape:* ``(B, V, 3)``."""
+        return self.rest(self.extend(x.movedim(-1, 0).contiguous()))
+
+    def among(self, rests: Sequence[Rest], weights: Tensor, stiffness: Sequence[float | Tensor]) -> Reference:
+        r"""K rest shapes as one: :math:`\sum_k s_k \sum w_k (q - q_k)^2`, by Eq. 8 for any number of them.
+
+        Args:
+            rests: The rest shapes.
+            weights: ``s``. *Shape:* ``(..., K)``.
+            stiffness: Of each term: a number, or *shape* ``(..., M)`` or ``(..., 1)``.
+        """
+        measures, wholes, constant = [], [], torch.zeros_like(weights[..., 0])
+        for i, (part, factor) in enumerate(zip(self.parts, stiffness, strict=True)):
+            values = torch.stack([rest.measures[i] for rest in rests], -2)
+            pulls = weights[..., None] * torch.stack([rest.weights[i] for rest in rests], -2).expand_as(values)
+            value, whole, left = part.term.merged(values, pulls)
+            measures.append(value)
+            wholes.append(factor * whole)
+            constant = constant + (factor * left).sum(-1)
+        return Reference(tuple(measures), tuple(wholes), constant)
+
+    def mixed(self, rest: Rest, weights: Tensor) -> Rest:
+        """One rest shape whose measures are weighted sums of those of K shapes.
+
+        Where weights differ from vertex to vertex, or are far below zero, :meth:`among` asks for harmonic means.
+
+        Args:
+            rest: Of K shapes.
+            weights: They add up to one. *Shape:* ``(K, V)``.
+        """
+        measures, stiffness = [], []
+        for part, values, pulls in zip(self.parts, rest.measures, rest.weights, strict=True):
+            own, pulls = part.on_elements(weights), pulls.expand_as(values)
+            measures.append((own * part.term.on_one_branch(values, pulls)).sum(-2))
+            stiffness.append((own * pulls).sum(-2).clamp_min(0))
+        return Rest(tuple(measures), tuple(stiffness))
+
+    def against(self, rest: Rest, stiffness: Sequence[float | Tensor]) -> Reference:
+        """One rest shape as the reference."""
+        return self.among([rest], torch.ones_like(rest.measures[0][..., :1]), stiffness)
+
+    # --------------------------------------------------------------------------------------------------------- values
+    def value(self, extended: Tensor, reference: Reference) -> Tensor:
+        """The energy of shapes. *Shape:* ``(3, ..., V) -> (...)``."""
+        total: Any = reference.constant
+        for part, rest, weight in zip(self.parts, reference.measures, reference.weights, strict=True):
+            total = total + part.term.energies(part.measures(part.edge_vectors(extended)), rest, weight).sum(-1)
+        return total
+
+    # ---------------------------------------------------------------------------------------------------- derivatives
+    def linearise(self, extended: Tensor, reference: Reference) -> list[Linearised]:
+        """All terms at given shapes. *Shape:* ``(3, B, V)``, extended."""
+        found = []
+        for part, rest, weight in zip(self.parts, reference.measures, reference.weights, strict=True):
+            edge_vectors = part.edge_vectors(extended)
+            measures, gradients = part.term.linearised(edge_vectors)
+            if part.term.total:
+                measures = measures.sum(-1, keepdim=True)
+                gradients = part.scattered(torch.zeros_like(extended), gradients)
+            slope = part.term.slopes(measures, rest, weight)
+            curvatures = part.term.curvatures(measures, rest, weight)
+            found.append(Linearised(edge_vectors, measures, gradients, slope, *curvatures))
+        return found
+
+    def value_at(self, at: Sequence[Linearised], reference: Reference) -> Tensor:
+        """The energy of shapes that were linearised. *Shape:* ``(B,)``."""
+        found: Any = reference.constant
+        for part, one, rest, weight in zip(self.parts, at, reference.measures, reference.weights, strict=True):
+            found = found + part.term.energies(one.measures, rest, weight).sum(-1)
+        return found
+
+    def rates(self, at: Sequence[Linearised], field: Tensor) -> list[Tensor]:
+        """First change of the measures with a displacement. *Shape:* ``(3, B, V)``, extended; ``(B, M)`` of each."""
+        return [
+            (one.gradients * field).sum((0, -1))[:, None]
+            if part.term.total
+            else (one.gradients * part.edge_vectors(field)).sum((0, 1))
+            for part, one in zip(self.parts, at, strict=True)
+        ]
+
+    def scatter(self, at: Sequence[Linearised], on_elements: Sequence[Tensor]) -> Tensor:
+        """From the elements to the vertices.
+
+        Args:
+            at: Gives the gradients of totals.
+            on_elements: Of each term what its edge vectors receive, *shape* ``(n-1, 3, B, M)``; of a total, the factor
+                of its gradient, *shape* ``(B, 1)``.
+
+        Returns:
+            *Shape:* ``(3, B, V)``, extended.
+        """
+        out = on_elements[0].new_zeros(*at[0].gradients.shape[-3:-1], self.n_extended)
+        for part, one, received in zip(self.parts, at, on_elements, strict=True):
+            out = out + received * one.gradients if part.term.total else part.scattered(out, received)
+        return out
+
+    def gradient(self, at: Sequence[Linearised]) -> Tensor:
+        """Gradient of the energy. *Shape:* ``(3, B, V)``, extended."""
+        parts = zip(self.parts, at, strict=True)
+        return self.scatter(at, [one.slope if part.term.total else one.slope * one.gradients for part, one in parts])
+
+
+class RestShapes(NamedTuple):
+    """K rest shapes of each sample with their weights, and the stiffnesses of the terms."""
+
+    shapes: Tensor
+    """*Shape:* ``(B, K, V, 3)``."""
+    weights: Tensor
+    """*Shape:* ``(B, K)``."""
+    stiffness: Sequence[Tensor]
+    """One of each term. *Shape of each:* ``(B, M)`` or ``(B, 1)``."""
+    anchors: Tensor | None = None
+    """Fixed points of the terms, where they have some. *Shape:* ``(B, P, 3)``."""
+
+    def rows(self, some: slice | Tensor) -> "RestShapes":
+        """Rest shapes of some of the samples."""
+        anchors = None if self.anchors is None else self.anchors[some]
+        return RestShapes(self.shapes[some], self.weights[some], [each[some] for each in self.stiffness], anchors)
+
+    def reference(self, energy: Energy, start: Tensor | None = None, relative: bool = False) -> Reference:
+        """Merge the rest shapes into one reference of an energy, of the terms that the stiffnesses belong to.
+
+        Args:
+            energy: The energy.
+            start: Where a minimisation starts. Hinges with a needle there have less bending stiffness: their gradient
+                has no bound, and the minimiser would turn their normals over. *Shape:* ``(B, V, 3)``.
+            relative: Hinges with a needle in the rest shapes, too, keep their stiffness.
+        """
+        found = energy.among([energy.rest_of(x) for x in self.shapes.unbind(1)], self.weights, self.stiffness)
+        if start is None:
+            return found
+        compared = (self.shapes, self.weights) if relative else ()
+        rows, weights = torch.cat([start[:, None], *compared[:1]], 1).movedim(-1, 0), list(found.weights)
+        for i, part in enumerate(energy.parts):
+            if isinstance(part.term, Bend):
+                weights[i] = softening(part.edge_vectors(rows), *compared[1:]) * weights[i]
+        return found._replace(weights=tuple(weights))

@@ -1,0 +1,164 @@
+"""Gradients of a minimiser: by the implicit function theorem, or through a fixed number of steps."""
+
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torch_modal import trees
+from torch_modal.autograd import applied, flattened, recorded, transposed
+from torch_modal.elastic.gauss_newton import GaussNewtonStep
+from torch_modal.elastic.minimise import AmplitudeEnergy, Solution, Status, minimise, ridged
+
+Inverse = Callable[[Any, Tensor, Any, Tensor], Callable[[Tensor], Tensor]]
+
+
+class ConvergenceWarning(UserWarning):
+    """A minimisation stopped before its gradient vanished, or has no gradient where it stopped."""
+
+
+class _ArgMin(torch.autograd.Function):
+    r"""Amplitudes :math:`a^*(\theta)` at which :math:`\partial E / \partial a = 0`, for placements :math:`\theta`.
+
+    Backward solves with the full Hessian: :math:`\bar\theta = -(\partial_\theta \partial_a E)^T H^{-1} \bar a`. Forward
+    mode is its transpose. With ``2 J^T J`` in its place the gradient is wrong wherever a residual remains at the
+    optimum, and here much of it does. Only the solution is kept: memory does not grow with the number of steps. Samples
+    that did not converge have no such gradient; theirs is zero.
+    """
+
+    @staticmethod
+    def forward(
+        energy: AmplitudeEnergy, limits: tuple[Any, ...], tree: Any, usable: Tensor, *tensors: Tensor
+    ) -> tuple[Tensor, ...]:
+        method, max_steps, tolerance, _ = limits
+        start = usable.new_zeros(len(usable), energy.n_amplitudes, dtype=tensors[0].dtype)
+        solution = method(energy, start, trees.filled(tree, tensors), max_steps, tolerance)
+        solution = solution._replace(status=torch.where(usable, solution.status, Status.INVALID))
+        return tuple(value for value in solution if value is not None)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
+        ctx.energy, (*_, ctx.inverse), ctx.tree, _, *tensors = inputs
+        amplitudes, *diagnostics = output
+        ctx.mark_non_differentiable(*diagnostics)
+        ctx.n_diagnostics = len(diagnostics)
+        ctx.save_for_backward(amplitudes, diagnostics[-1], *tensors)
+        ctx.save_for_forward(amplitudes, diagnostics[-1], *tensors)
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Tensor | None) -> tuple[Tensor | None, ...]:
+        amplitudes, _, *tensors = ctx.saved_tensors
+        pull_back = _adjoint(ctx.energy, ctx.inverse, ctx.tree, *ctx.saved_tensors)
+        moved = transposed(pull_back, torch.zeros_like(amplitudes), tensors, tangents[4:])
+        return moved, *(None,) * ctx.n_diagnostics
+
+    @staticmethod
+    def backward(ctx: Any, to_amplitudes: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:
+        pull_back = _adjoint(ctx.energy, ctx.inverse, ctx.tree, *ctx.saved_tensors)
+        return (None,) * 4 + pull_back(to_amplitudes)
+
+    @staticmethod
+    def vmap(
+        info: Any, in_dims: tuple[Any, ...], energy: AmplitudeEnergy, limits: Any, tree: Any, *given: Tensor
+    ) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
+        output = _ArgMin.apply(energy, limits, tree, *flattened(info.batch_size, in_dims[3:], given))
+        return tuple(value.unflatten(0, (info.batch_size, -1)) for value in output), (0,) * len(output)
+
+
+def _adjoint(
+    energy: AmplitudeEnergy, inverse: Inverse, tree: Any, amplitudes: Tensor, status: Tensor, *tensors: Tensor
+) -> Callable[[Tensor], tuple[Tensor, ...]]:
+    """From gradients in the amplitudes, ``(B, n)``, to those in the tensors of the placement: linear."""
+    solve = inverse(energy, amplitudes, trees.filled(tree, tensors), status == Status.CONVERGED)
+
+    def slope(*tensors: Tensor) -> Tensor:
+        return energy.gradient(amplitudes, trees.filled(tree, tensors))
+
+    def pull_back(to_amplitudes: Tensor) -> tuple[Tensor, ...]:
+        adjoint = solve(to_amplitudes)
+        if recorded(adjoint, *tensors):
+            return tuple(torch.func.vjp(slope, *tensors)[1](-adjoint))
+        with torch.enable_grad():  # by kernels, which the tensors of a transform would not reach
+            leaves = [x.detach().requires_grad_() for x in tensors]
+            return torch.autograd.grad(slope(*leaves), leaves, -adjoint, allow_unused=True, materialize_grads=True)
+
+    return pull_back
+
+
+def dense_inverse(
+    energy: AmplitudeEnergy, amplitudes: Tensor, placement: Any, converged: Tensor
+) -> Callable[[Tensor], Tensor]:
+    """Products with the inverse of the full Hessian; zero for samples that did not converge. *Shape:* ``(B, n)``."""
+    hessian = ridged(energy.derivatives(amplitudes, placement).hessian)
+    eye = torch.eye(hessian.shape[-1], dtype=hessian.dtype, device=hessian.device)
+    matrix = torch.where(converged[:, None, None], hessian, eye)
+
+    def solve(right: Tensor) -> Tensor:
+        found, info = torch.linalg.solve_ex(matrix, right)
+        singular = (info != 0)[:, None]
+        _warn_of_singular(singular)
+        return torch.where(converged[:, None] & ~singular, found, 0)
+
+    return solve
+
+
+def _warn_of_singular(singular: Tensor) -> None:
+    try:
+        number = int(singular.sum())
+    except RuntimeError:  # under vmap there is no number to see
+        return
+    if number:
+        warnings.warn(
+            f"the Hessian of {number} in-betweens is singular: no gradient flows through their amplitudes",
+            ConvergenceWarning,
+            stacklevel=2,
+        )
+
+
+def solve_implicit(
+    energy: Any,
+    placement: Any,
+    usable: Tensor,
+    max_steps: int,
+    tolerance: float,
+    method: Callable[..., Solution] = minimise,
+    inverse: Inverse = dense_inverse,
+) -> Solution:
+    """Minimise from zeros; gradients of the amplitudes by the implicit function theorem.
+
+    Args:
+        energy: The energy of the amplitudes, as the method and the inverse need it.
+        placement: What the energy depends on: nested tuples of tensors. *Shape of each:* ``(B, ...)``.
+        usable: False for samples whose status is ``INVALID`` whatever comes out. *Shape:* ``(B,)``.
+        max_steps: Of :func:`~torch_modal.elastic.minimise.minimise`.
+        tolerance: Likewise.
+        method: Minimises, with the arguments of :func:`~torch_modal.elastic.minimise.minimise`.
+        inverse: Gives products with the inverse of the Hessian, with the arguments of :func:`dense_inverse`.
+    """
+    given = energy, (method, max_steps, tolerance, inverse), trees.skeleton(placement), usable, *trees.leaves(placement)
+    return Solution(*applied(_ArgMin, *given))
+
+
+def solve_unrolled(
+    energy: AmplitudeEnergy, placement: Any, usable: Tensor, max_steps: int, tolerance: float
+) -> Solution:
+    """Take exactly ``max_steps`` steps from zeros; gradients flow back through all of them.
+
+    Nothing here depends on data but what is computed: no early end. Arguments as for :func:`solve_implicit`.
+    """
+    step, a = GaussNewtonStep(energy), trees.leaves(placement)[0].new_zeros(len(usable), energy.n_amplitudes)
+    first = None
+    for _ in range(max_steps):
+        taken = step(a, placement)
+        first = taken.gradient_norm if first is None else first
+        a = taken.amplitudes
+    derivatives = energy.derivatives(a, placement, second_order=False)
+    norm = derivatives.gradient.norm(dim=-1)
+    first = norm if first is None else first
+    found = norm <= torch.maximum(tolerance * first, derivatives.floor)
+    status = torch.where(found, Status.CONVERGED, Status.OUT_OF_STEPS)
+    status = torch.where(usable & norm.isfinite(), status, Status.INVALID)
+    relative = norm / first.clamp_min(torch.finfo(first.dtype).tiny)
+    return Solution(a, derivatives.value, relative.detach(), torch.full_like(status, max_steps), status)

@@ -1,0 +1,194 @@
+"""An energy of a shape that moves in an affine space: value, gradient and both Hessians in the amplitudes.
+
+First derivatives are local (3 numbers of an edge, 9 of a hinge) and are gathered through the columns of the space,
+which are the same for a whole batch.
+"""
+
+from functools import reduce
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from torch_modal.elastic.energy import Energy, Linearised, Reference, RestShapes
+from torch_modal.elastic.shell import ShellEnergy
+from torch_modal.elastic.term import Term
+
+# The second-order term of a batch passes through an array of this many bytes at a time.
+MOST_BYTES = 2**26
+
+
+class Derivatives(NamedTuple):
+    """An energy and its derivatives in the amplitudes ``a``."""
+
+    value: Tensor
+    """*Shape:* ``(B,)``."""
+    gradient: Tensor
+    """*Shape:* ``(B, n)``."""
+    gauss_newton: Tensor
+    """``2 J^T J``, positive semi-definite but for rounding: that of single precision without the second-order term,
+    where a metric is wanted. *Shape:* ``(B, n, n)``."""
+    second_order: Tensor | None
+    """The second-order term of the full Hessian. *Shape:* ``(B, n, n)``."""
+    resolution: Tensor
+    """Gradient norm that the rounding of the positions alone explains. *Shape:* ``(B,)``."""
+
+    @property
+    def floor(self) -> Tensor:
+        """Gradient norm below which there is only rounding, which adds up along sums of elements. *Shape:* ``(B,)``."""
+        return 4 * self.resolution
+
+    @property
+    def hessian(self) -> Tensor:
+        """The full Hessian. *Shape:* ``(B, n, n)``."""
+        assert self.second_order is not None
+        return self.gauss_newton + self.second_order
+
+
+class Placement(NamedTuple):
+    """The affine space of each sample, ``x(a) = base + columns a``, and its reference."""
+
+    base: Tensor
+    """Components before vertices, extended. *Shape:* ``(B, 3, V)``."""
+    reference: Reference
+
+
+class ModalEnergy(nn.Module):
+    """An energy in the amplitudes of an affine space.
+
+    This is what :class:`torch_modal.GaussNewtonStep` steps on; see there for an example.
+
+    Args:
+        energy: The energy on the mesh that the columns live on.
+        columns: Directions of the space, for example vibration modes. *Shape:* ``(n, V, 3)``.
+    """
+
+    columns: Tensor
+    tabulated = True
+    """Whether the edge vectors of elements along all columns are kept, or computed at each use."""
+
+    def __init__(self, energy: Energy | ShellEnergy, columns: Tensor) -> None:
+        super().__init__()
+        #: Whether the shapes are in the caller's coordinates, as the anchors of terms are.
+        self.unscaled = isinstance(energy, ShellEnergy)
+        self.energy = energy.energy if isinstance(energy, ShellEnergy) else energy
+        rows = self.energy.extend(columns.movedim(-1, 0))
+        self.register_buffer("columns", rows.transpose(0, 1).contiguous(), persistent=False)
+        for i in range(len(self.energy.parts)):
+            table = self._edge_vectors(i) if self.tabulated else None
+            self.register_buffer(f"edge_vectors_{i}", table, persistent=False)
+
+    def _edge_vectors(self, i: int) -> Tensor:
+        """Edge vectors of the elements of a term along each column. *Shape:* ``(M, 3 (c-1), n)``."""
+        corners = self.energy.parts[i].corners
+        values = self.columns.permute(2, 1, 0).contiguous()  # rows that lie together in memory
+        first, *others = (values.index_select(0, corner) for corner in corners)
+        return torch.cat([other - first for other in others], 1)
+
+    @property
+    def n_amplitudes(self) -> int:
+        """Number of amplitudes, n."""
+        return len(self.columns)
+
+    def reference(self, rests: RestShapes, base: Tensor | None = None) -> Any:
+        """Merge rest shapes into the reference of a :class:`Placement`; arguments as :meth:`RestShapes.reference`."""
+        return rests.reference(self.energy, base)
+
+    def place(self, base: Tensor, reference: Reference, anchors: Tensor | None = None) -> Placement:
+        """The space of each sample.
+
+        Args:
+            base: The shape at amplitudes of zero. *Shape:* ``(B, V, 3)``.
+            reference: What is compared with, for example of :meth:`torch_modal.ShellEnergy.against`.
+            anchors: Of the energy's terms, where there are some; by default those of a
+                :class:`torch_modal.ShellEnergy` as they are. *Shape:* ``(B, P, 3)``.
+        """
+        if anchors is None and self.unscaled and self.energy.anchors is not None:
+            anchors = self.energy.anchors.to(base)[None]
+        fixed = None if anchors is None else anchors.movedim(-1, 0)
+        return Placement(self.energy.extend(base.movedim(-1, 0), fixed).movedim(0, -2), reference)
+
+    def rows(self, a: Tensor, placement: Placement) -> Tensor:
+        """The shape ``x(a)``, components first. *Shape:* ``(..., B, n) -> (3, ..., B, V)``."""
+        x = placement.base + (a @ self.columns.flatten(1)).unflatten(-1, (3, -1))
+        return x.movedim(-2, 0).contiguous()
+
+    def value(self, a: Tensor, placement: Placement) -> Tensor:
+        """Energy at ``a``. *Shape:* ``(..., B, n) -> (..., B)``."""
+        return self.energy.value(self.rows(a, placement), placement.reference)
+
+    def derivatives(self, a: Tensor, placement: Placement, second_order: bool = True) -> Derivatives:
+        """Energy, gradient and Hessians at ``a``.
+
+        Args:
+            a: Amplitudes. *Shape:* ``(B, n)``.
+            placement: The space of each sample and its reference.
+            second_order: Whether the term beyond Gauss-Newton is wanted.
+        """
+        x = self.rows(a, placement)
+        at = self.energy.linearise(x, placement.reference)
+        gradients, inner, curved = [], [], []
+        for i, (part, one) in enumerate(zip(self.energy.parts, at, strict=True)):
+            columns = getattr(self, f"edge_vectors_{i}") if self.tabulated else self._edge_vectors(i)
+            if part.term.total:
+                row = self._along_columns(one.gradients)
+                gradient, own = one.slope * row, one.curvature[..., None] * row[:, :, None] * row[:, None, :]
+            else:
+                gradient, own = _normal_equations(one, columns, second_order)
+            gradients.append(gradient)
+            inner.append(own)
+            if second_order:
+                curved.append(_second_order(part.term, one, columns))
+        gauss_newton = reduce(torch.add, inner)
+        stiffness = sum(one.curvature.sum(-1) for one in at)
+        stiffest = gauss_newton.diagonal(dim1=-2, dim2=-1).amax(-1)
+        rounding = torch.finfo(x.dtype).eps * x.abs().amax((0, -1))
+        resolution = rounding * (stiffest * stiffness).sqrt()
+        beyond = reduce(torch.add, curved) if second_order else None
+        value = self.energy.value_at(at, placement.reference)
+        return Derivatives(value, reduce(torch.add, gradients), gauss_newton, beyond, resolution)
+
+    def value_and_gradient(self, a: Tensor, placement: Placement) -> tuple[Tensor, Tensor]:
+        """Energy and gradient at ``a``. *Shape:* ``(B, n) -> (B,), (B, n)``."""
+        at = self.energy.linearise(self.rows(a, placement), placement.reference)
+        return self.energy.value_at(at, placement.reference), self._along_columns(self.energy.gradient(at))
+
+    def gradient(self, a: Tensor, placement: Placement) -> Tensor:
+        """Gradient at ``a``, to be differentiated in all that the placement holds. *Shape:* ``(B, n) -> (B, n)``."""
+        at = self.energy.linearise(self.rows(a, placement), placement.reference)
+        return self._along_columns(self.energy.gradient(at))
+
+    def _along_columns(self, extended: Tensor) -> Tensor:
+        """From gradients in the vertices to those in the amplitudes. *Shape:* ``(3, B, V) -> (B, n)``."""
+        return extended.transpose(0, 1).flatten(1) @ self.columns.flatten(1).mT
+
+
+def gram(rows: Tensor, exact: bool) -> Tensor:
+    """``J^T J``, or the same of single precision in half of the time. *Shape:* ``(B, m, n) -> (B, n, n)``."""
+    rows, like = rows if exact else rows.float(), rows
+    return (rows.mT @ rows).to(like)
+
+
+def _normal_equations(one: Linearised, columns: Tensor, exact: bool) -> tuple[Tensor, Tensor]:
+    """Contribution of one term to the gradient and to Gauss-Newton's Hessian, by edge vectors along the columns.
+
+    *Shape:* ``(M, c, n) -> (B, n), (B, n, n)``, with ``c`` three times the number of edge vectors.
+    """
+    # Rows of the Jacobian are scaled before they pass through the columns, where they are few numbers.
+    root = one.curvature.clamp_min(torch.finfo(one.curvature.dtype).tiny).sqrt()
+    local = root * one.gradients.flatten(0, 1)
+    # Products of tiny matrices are fast in one dense block only: any other layout is copied matrix by matrix.
+    jacobian = (local.permute(2, 1, 0).contiguous() @ columns).transpose(0, 1)
+    return (jacobian.mT @ (one.slope / root)[..., None]).squeeze(-1), gram(jacobian, exact)
+
+
+def _second_order(term: Term, one: Linearised, columns: Tensor) -> Tensor:
+    """Contribution of one term to the second-order term of the Hessian. Arguments as above. *Shape:* ``(B, n, n)``."""
+    curved = one.slope * term.hessians(one.edge_vectors).flatten(2, 3).flatten(0, 1)
+    if one.beyond is not None:
+        gradients = one.gradients.flatten(0, 1)
+        curved = curved + (one.beyond * gradients)[:, None] * gradients
+    most = max(1, MOST_BYTES // max(1, columns.numel() * columns.element_size()))
+    # (b, M, c, c) by (M, c, n), of some samples at a time.
+    parts = (own.contiguous() @ columns for own in curved.permute(2, 3, 0, 1).split(most))
+    return torch.cat([columns.flatten(0, 1).mT @ pushed.flatten(1, 2) for pushed in parts])

@@ -1,0 +1,41 @@
+"""The poses of pairs of shapes by kernels, which do what hundreds of small operations do in torch."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torch_modal.elastic.kernels.function import fused
+from torch_modal.elastic.kernels.launch import kernels, launch
+from torch_modal.geometry import procrustes
+
+
+def mean_pose(to_reference: Tensor, among: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+    """:func:`torch_modal.geometry.procrustes.mean_pose`; of two shapes by a kernel, in float64."""
+    if weights.shape[1] != 2:
+        return procrustes.mean_pose(to_reference, among, weights)
+    turns, pose = fused(_MeanPose(), to_reference, among, weights)
+    return turns.to(among), pose.to(among)
+
+
+class _MeanPose:
+    """*Shape:* ``(B, 2, 3, 3), (B, 2, 2, 3, 3), (B, 2) -> (B, 2, 3, 3), (B, 3, 3)``."""
+
+    n_results = n_differentiable = 2
+    by_torch = staticmethod(procrustes.mean_pose)
+
+    @staticmethod
+    def run(kept: list[Any] | None, *given: Tensor) -> tuple[Tensor, ...]:
+        """See :class:`~torch_modal.elastic.kernels.function.Operation`."""
+        turns, pose = torch.empty_like(given[0]), torch.empty_like(given[0][:, 0])
+        launch(kernels("procrustes").mean_pose, (len(pose),), [*given, turns, pose])
+        return turns, pose
+
+    @staticmethod
+    def back(kept: list[Any], grads: Sequence[Tensor], *given: Tensor) -> tuple[Tensor | None, ...]:
+        """See :class:`~torch_modal.elastic.kernels.function.Operation`."""
+        found = [torch.zeros_like(x) for x in given]
+        both = _MeanPose.run(None, *given)
+        launch(kernels("rotations_adjoint").mean_pose, (len(given[0]),), [*given, *both, *grads, *found])
+        return tuple(found)

@@ -1,1 +1,0 @@
-"""Minimisation in modal amplitudes, and the gradient of its solution."""
