@@ -16,14 +16,18 @@ from terms import Area, Spring
 from torch import Tensor
 from torch.func import functional_call, grad, vmap
 from torch_modal.elastic.warp import shell as fused_shell
+from torch_modal.elastic.warp_distortion import WarpDistortion
+from torch_modal.elastic.warp_fine_steps import WarpFineEnergy, WarpSteps
+from torch_modal.elastic.warp_modal_energy import WarpModalEnergy
+from torch_modal.elastic.warp_shell import ShellReference, WarpShell
+from torch_modal.elastic.warp_volumes import WarpVolumes
 
 import torch_modal as tm
 from torch_modal import trees
 from torch_modal.elastic import warp_backend as backend
 from torch_modal.elastic import warp_modal_energy as fused_modal
-from torch_modal.elastic.backend import TorchBackend
+from torch_modal.elastic.backend import TorchBackend, choose
 from torch_modal.elastic.bend import Bend
-from torch_modal.elastic.choice import choose
 from torch_modal.elastic.distortion import Distortion
 from torch_modal.elastic.energy import Energy, RestShapes
 from torch_modal.elastic.kernels import launch
@@ -34,13 +38,8 @@ from torch_modal.elastic.stretch import Stretch
 from torch_modal.elastic.term import Mesh
 from torch_modal.elastic.volume import Volume
 from torch_modal.elastic.volumes import Volumes
-from torch_modal.elastic.warp_distortion import WarpDistortion
-from torch_modal.elastic.warp_fine_steps import WarpFineEnergy, WarpSteps
-from torch_modal.elastic.warp_modal_energy import WarpModalEnergy
 from torch_modal.elastic.warp_procrustes import mean_pose
 from torch_modal.elastic.warp_rotations import WarpRotations
-from torch_modal.elastic.warp_shell import ShellReference, WarpShell
-from torch_modal.elastic.warp_volumes import WarpVolumes
 from torch_modal.errors import MissingPackageError
 from torch_modal.geometry import procrustes
 from torch_modal.geometry.canonical import CANONICAL_SIZE

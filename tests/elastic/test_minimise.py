@@ -10,6 +10,7 @@ from scipy.optimize import least_squares
 from test_gauss_newton import LeastSquares, Rosenbrock, Uphill, start
 from torch import Tensor
 from torch.func import jacfwd
+from torch_modal.elastic.warp_backend import WarpBackend
 
 from torch_modal.elastic import minimise as minimisation
 from torch_modal.elastic.gauss_newton import GaussNewtonStep
@@ -17,7 +18,6 @@ from torch_modal.elastic.minimise import Solution, Status, minimise
 from torch_modal.elastic.modal import Derivatives
 from torch_modal.elastic.shell import ShellEnergy
 from torch_modal.elastic.term import periodic_square
-from torch_modal.elastic.warp_backend import WarpBackend
 from torch_modal.inbetween.results import ConvergenceError, report
 from torch_modal.inbetween.settings import Solver
 from torch_modal.layers.mid_shape import MidShape

@@ -13,8 +13,7 @@ from torch import Tensor
 
 import torch_modal as tm
 from torch_modal.data.samples import load_sample
-from torch_modal.elastic.backend import TorchBackend
-from torch_modal.elastic.choice import choose
+from torch_modal.elastic.backend import TorchBackend, choose
 from torch_modal.elastic.warp_rotations import WarpRotations
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.local_rotations import LocalRotations

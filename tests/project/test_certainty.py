@@ -8,6 +8,7 @@ import pytest
 import torch
 from conftest import Shapes
 from torch import Tensor
+from torch_modal.elastic.warp_backend import WarpBackend
 
 import torch_modal as tm
 from torch_modal.elastic.distortion import Distortion, _weights
@@ -15,7 +16,6 @@ from torch_modal.elastic.energy import RestShapes
 from torch_modal.elastic.implicit import ConvergenceWarning
 from torch_modal.elastic.minimise import Status
 from torch_modal.elastic.term import Mesh
-from torch_modal.elastic.warp_backend import WarpBackend
 from torch_modal.inbetween.settings import PRESETS
 
 BACKENDS = [pytest.param("warp", marks=pytest.mark.skipif(not WarpBackend.works(), reason="no Warp")), "torch"]

@@ -16,7 +16,7 @@ from snippets import COMMAND, LANGUAGES, NOT_RUN, PAGES, ROOT, Block, blocks, co
 from test_examples import load_example
 
 from torch_modal.cli import main as cli
-from torch_modal.elastic.choice import BACKENDS
+from torch_modal.elastic.backend import BACKENDS
 from torch_modal.io.formats import ANIMATION_FORMATS, MESH_FORMATS
 
 QUICK = {"layer", "viewing"}

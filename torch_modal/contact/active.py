@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torch_modal.autograd import transformed
 from torch_modal.contact.detect import Search
-from torch_modal.elastic.steps import FurtherDerivatives
+from torch_modal.elastic.steps import Point
 from torch_modal.elastic.term import Mesh
 from torch_modal.geometry.crossings import Crossings, FloatArray, IntArray
 from torch_modal.geometry.vectors import cross, inverse, norm, pick
@@ -154,7 +154,7 @@ class ContactEnergy:
         """Energy of each shape. *Shape:* ``(B, V, 3) -> (B,)``."""
         return self._summed(x, self.weights * self.missing(x)[0] ** 2)
 
-    def at(self, x: Tensor) -> FurtherDerivatives:
+    def at(self, x: Tensor) -> Point:
         """Derivatives, of which the contacts that keep the gap have none. *Shape:* ``(B, V, 3)``."""
         missing = self.missing(x)[0]
         near = torch.nonzero(missing).flatten()
@@ -172,7 +172,7 @@ class ContactEnergy:
             _rows(out).index_add_(1, corners, stiffness * rate.repeat(4) * on_corners)
             return out
 
-        return FurtherDerivatives(self._summed(x, self.weights * missing**2), gradient, diagonal, product)
+        return Point(self._summed(x, self.weights * missing**2), gradient, diagonal, product)
 
     def _summed(self, x: Tensor, each: Tensor) -> Tensor:
         """*Shape:* ``(B, V, 3), (N,) -> (B,)``."""
@@ -189,11 +189,11 @@ class Pull(NamedTuple):
         """Energy of each shape. *Shape:* ``(B, V, 3) -> (B,)``."""
         return (self.weights * ((x - self.to) ** 2).sum(-1)).sum(-1)
 
-    def at(self, x: Tensor) -> FurtherDerivatives:
+    def at(self, x: Tensor) -> Point:
         """*Shape:* ``(B, V, 3)``."""
         twice = 2 * self.weights[:, None]
         diagonal = (twice * twice.new_tensor([1.0, 0.0, 0.0, 1.0, 0.0, 1.0])).expand(len(x), -1, -1)
-        return FurtherDerivatives(self.value(x), twice * (x - self.to), diagonal, lambda field: twice * field)
+        return Point(self.value(x), twice * (x - self.to), diagonal, lambda field: twice * field)
 
 
 def _rows(x: Tensor) -> Tensor:

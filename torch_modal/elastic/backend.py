@@ -1,17 +1,33 @@
-"""The parts of an in-between in torch."""
+"""What in-betweens are computed with: torch, the reference, and kernels of NVIDIA Warp, the fast path.
 
+A backend makes each part of an in-between. It is chosen once, when a layer is made (:func:`choose`); no other room
+knows which one it is.
+"""
+
+import importlib.util
+import warnings
 from collections.abc import Callable, Sequence
+from functools import cache
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from torch_modal.arrays import FloatArray, IntArray
-from torch_modal.elastic.distortion import Distortion
+from torch_modal.elastic.distortion import Distortion, KernelDistortion
 from torch_modal.elastic.energy import Energy
-from torch_modal.elastic.modal import ModalEnergy
+from torch_modal.elastic.kernel_energy import KernelEnergy
+from torch_modal.elastic.kernel_steps import KernelFineEnergy
+from torch_modal.elastic.kernels.launch import kernels, launch, load_kernels
+from torch_modal.elastic.modal import KernelModalEnergy, ModalEnergy
 from torch_modal.elastic.steps import FineEnergy
 from torch_modal.elastic.term import Mesh, Term
-from torch_modal.elastic.volumes import Volumes
+from torch_modal.elastic.volumes import KernelVolumes, Volumes
+from torch_modal.elastic.warp_crossings import WarpPairs
+from torch_modal.elastic.warp_procrustes import mean_pose as mean_pose_by_kernel
+from torch_modal.elastic.warp_quasi_newton import update
+from torch_modal.elastic.warp_rotations import WarpRotations
+from torch_modal.errors import MissingPackageError
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.local_rotations import LocalRotations
 from torch_modal.geometry.poisson import Poisson
@@ -60,3 +76,92 @@ class TorchBackend:
     def crossings(self, mesh: Connectivity, shape: FloatArray) -> Callable[[FloatArray], IntArray] | None:
         """A search for pairs of triangles that cross, near a shape; None: that of ``geometry/crossings.py``."""
         return None
+
+
+class WarpBackend(TorchBackend):
+    """Parts that do in one pass over the elements what torch does in dozens, in float64.
+
+    Raises:
+        MissingPackageError: Warp is not installed.
+    """
+
+    quasi_newton, mean_pose = staticmethod(update), staticmethod(mean_pose_by_kernel)
+
+    def __init__(self) -> None:
+        if importlib.util.find_spec("warp") is None:
+            raise MissingPackageError("backend='warp' needs warp-lang, which is not installed: pip install warp-lang")
+
+    @staticmethod
+    @cache
+    def works() -> bool:
+        """Whether Warp is installed, compiles, and computes."""
+        if importlib.util.find_spec("warp") is None:
+            return False
+        try:
+            one, found = torch.ones(1, 3, dtype=torch.float64), torch.zeros(1, 3, dtype=torch.float64)
+            launch(kernels("steps").inner, (1, 1), [one, one, 1, found])
+            if found[0, 0] != 3:
+                raise RuntimeError(f"a kernel gave {float(found[0, 0])} for 3")
+        except Exception as error:  # whatever keeps Warp from compiling: torch does the same, only slower
+            warnings.warn(f"Warp is installed, but its kernels cannot be used, so torch is: {error}", stacklevel=2)
+            return False
+        return True
+
+    def load(self) -> None:
+        """As in the base class: the kernels of in-betweens."""
+        load_kernels()
+
+    def rotations(self, mesh: Connectivity, references: Tensor) -> WarpRotations:
+        """Overrides the base class."""
+        return WarpRotations(mesh, references)
+
+    def modal_energy(self, energy: Energy, mesh: Mesh, columns: Tensor) -> ModalEnergy:
+        """Overrides the base class."""
+        found = KernelEnergy.of(energy, mesh)
+        exact = found is not None and found.exact
+        return KernelModalEnergy(found, columns) if exact else super().modal_energy(energy, mesh, columns)
+
+    def fine_energy(self, mesh: Mesh, terms: Sequence[Term]) -> FineEnergy:
+        """Overrides the base class."""
+        return KernelFineEnergy(mesh, terms)
+
+    def volumes(self, mesh: Connectivity) -> KernelVolumes:
+        """Overrides the base class."""
+        return KernelVolumes(mesh)
+
+    def distortion(self, mesh: Mesh, further: Energy | None) -> Distortion:
+        """Overrides the base class."""
+        return KernelDistortion(mesh, further)
+
+    def crossings(self, mesh: Connectivity, shape: FloatArray) -> Callable[[FloatArray], IntArray]:
+        """Overrides the base class."""
+        return WarpPairs(mesh, shape[None])
+
+
+BACKENDS: dict[str, Callable[[], TorchBackend]] = {"torch": TorchBackend, "warp": WarpBackend}
+
+
+def register_backend(name: str, make: Callable[[], TorchBackend]) -> None:
+    """Register a backend, for ``Solver(backend=name)``.
+
+    Args:
+        name: Its name. One that is known already is replaced.
+        make: Called with no arguments for each layer that is made.
+    """
+    BACKENDS[name] = make
+
+
+def names() -> tuple[str, ...]:
+    """What :func:`choose` takes."""
+    return ("auto", *BACKENDS)
+
+
+def choose(name: str) -> TorchBackend:
+    """The backend of a name; ``"auto"`` is the kernels where they work, otherwise torch.
+
+    Raises:
+        MissingPackageError: ``"warp"`` is requested and not installed.
+    """
+    if name == "auto":
+        name = "warp" if WarpBackend.works() else "torch"
+    return BACKENDS[name]()

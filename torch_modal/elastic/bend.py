@@ -1,11 +1,11 @@
 """Dihedral angles, the second term of Eq. 5."""
 
-from functools import reduce
+from functools import cache, reduce
 
 import torch
 from torch import Tensor
 
-from torch_modal.elastic.term import Mesh, PeriodicTerm, Term, wrap_angle
+from torch_modal.elastic.term import KernelFunctions, Mesh, PeriodicTerm, Term, periodic, wrap_angle
 from torch_modal.geometry.vectors import cross, inverse, norm, tiny
 
 # Eq. 5 divides by rest areas: l^2 / A has this bound, for needles; an equilateral hinge has 1.15.
@@ -68,6 +68,21 @@ class Bend(PeriodicTerm, SquaredBend):
 
     :class:`~torch_modal.elastic.term.PeriodicTerm` has the function ``f``, which is the square of Eq. 5 below a radian.
     """
+
+    def softening(self, start: Tensor, rest: Tensor, weights: Tensor | None) -> Tensor:
+        """Less stiffness at needles: their gradient has no bound, and minimisers would turn their normals over.
+
+        By :func:`fullness`, or by its ratio to that of rest shapes. Arguments as in the base class.
+        """
+        if weights is None:
+            return fullness(start, NEEDLE)
+        usual = (weights[..., None] * fullness(rest, NEEDLE_OF_STEPS)).sum(1).clamp_min(LEAST_FULLNESS)
+        part = (fullness(start, NEEDLE_OF_STEPS) / usual).clamp_max(1)
+        return part * part * (3 - 2 * part)
+
+    def kernel_functions(self, n: int) -> KernelFunctions | None:
+        """Of hinges; of a class that inherits from this one, those of its own."""
+        return kernel_functions() if type(self) is Bend else super().kernel_functions(n)
 
 
 def normals(edge_vectors: Tensor) -> tuple[Tensor, ...]:
@@ -157,26 +172,103 @@ def fullness(edge_vectors: Tensor, needle: float) -> Tensor:
     return (squared * inverse(squared + (needle * longest).square(), longest <= 0)).prod(0)
 
 
-def softening(edge_vectors: Tensor, weights: Tensor | None = None) -> Tensor:
-    """Factors of bending stiffness where steps start: by :func:`fullness`, or by its ratio to that of rest shapes.
-
-    Args:
-        edge_vectors: Of the start alone, or of the start and K rest shapes. *Shape:* ``(3, 3, B, 1 or 1 + K, H)``.
-        weights: Of the rest shapes. *Shape:* ``(B, K)``.
-
-    Returns:
-        *Shape:* ``(B, H)``.
-    """
-    if weights is None:
-        return fullness(edge_vectors, NEEDLE)[:, 0]
-    own, usual = fullness(edge_vectors, NEEDLE_OF_STEPS).split([1, weights.shape[1]], 1)
-    usual = (weights[..., None] * usual).sum(1).clamp_min(LEAST_FULLNESS)
-    part = (own[:, 0] / usual).clamp_max(1)
-    return part * part * (3 - 2 * part)
-
-
 def collapsed(edge: Tensor, normal: Tensor) -> Tensor:
     """True for triangles without an altitude on this edge. *Shape:* ``(3, ...), (3, ...) -> (...)``."""
     bound = max(COLLAPSED, 100 * torch.finfo(edge.dtype).eps)
     base = (edge * edge).sum(0)
     return (normal * normal).sum(0) <= (bound * base) ** 2 + tiny(edge)
+
+
+@cache
+def kernel_functions() -> KernelFunctions:
+    """Hinges as above, by cosine and sine of the angle, for kernels."""
+    import warp as wp
+
+    real, vec2, vec3, mat33 = wp.float64, wp.vec2d, wp.vec3d, wp.mat33d
+    flatness, ratio = wp.constant(real(COLLAPSED)), wp.constant(real(MAX_BENDING_RATIO))
+    tiny_square, tiniest = wp.constant(real(tiny(torch.empty(0, dtype=torch.float64)))), wp.constant(real(2.0**-1022))
+
+    @wp.struct
+    class Hinge:
+        n1: vec3
+        n2: vec3
+        length: real
+        per_both: real
+        """One over the lengths of both normals."""
+        per1: real
+        """One over the square of a normal."""
+        per2: real
+        flat: bool
+
+    @wp.func
+    def length_of(e: vec3):
+        return wp.sqrt(wp.max(wp.dot(e, e), tiny_square))
+
+    @wp.func
+    def hinge_of(x: mat33):
+        h = Hinge()
+        e = x[0]
+        h.n1 = wp.cross(e, x[1])
+        h.n2 = wp.cross(x[2], e)
+        base = wp.dot(e, e)
+        square1 = wp.dot(h.n1, h.n1)
+        square2 = wp.dot(h.n2, h.n2)
+        h.length = wp.sqrt(wp.max(base, tiny_square))
+        h.per_both = real(1.0) / wp.sqrt(wp.max(square1 * square2, tiniest))
+        h.per1 = h.per_both * h.per_both * square2
+        h.per2 = h.per_both * h.per_both * square1
+        bound = flatness * base
+        h.flat = wp.min(square1, square2) <= bound * bound + tiny_square
+        return h
+
+    @wp.func
+    def phase(h: Hinge, x: mat33):
+        return h.per_both * vec2(wp.dot(h.n1, h.n2), -h.length * wp.dot(h.n1, x[2]))
+
+    @wp.func
+    def measure(x: mat33):
+        h = hinge_of(x)
+        found = vec2(real(1.0), real(0.0))
+        if not h.flat:
+            found = phase(h, x)
+        return found
+
+    @wp.func
+    def linearised(x: mat33):
+        h = hinge_of(x)
+        found = vec2(real(1.0), real(0.0))
+        gradient = mat33()
+        if not h.flat:
+            found = phase(h, x)
+            e = x[0]
+            to_a = (-h.length * h.per1) * h.n1
+            to_b = (-h.length * h.per2) * h.n2
+            per = real(1.0) / h.length
+            to_e = (-per * per) * (wp.dot(x[1], e) * to_a + wp.dot(x[2], e) * to_b)
+            gradient = wp.matrix_from_rows(to_e, to_a, to_b)
+        return found, gradient
+
+    @wp.func
+    def weight(x: mat33, q: vec2, mean: real):
+        h = hinge_of(x)
+        found = real(0.0)
+        if not h.flat:
+            area = real(0.5) * (length_of(h.n1) + length_of(h.n2))
+            found = wp.min(wp.dot(x[0], x[0]) / area, ratio)
+        return found
+
+    @wp.func
+    def full(e: vec3, tip: vec3, altitude: real):
+        longest = wp.max(wp.dot(e, e), wp.max(wp.dot(tip, tip), wp.dot(tip - e, tip - e)))
+        normal = wp.cross(e, tip)
+        squared = wp.dot(normal, normal)
+        found = real(0.0)
+        if longest > real(0.0):
+            found = squared / (squared + altitude * longest * longest)
+        return found
+
+    @wp.func
+    def fullness(x: mat33, altitude: real):
+        return full(x[0], x[1], altitude) * full(x[0], x[2], altitude)
+
+    return KernelFunctions("bend", 3, periodic(), measure, linearised, weight=weight, fullness=fullness)

@@ -1,13 +1,19 @@
 """Distortion of shapes against their rest shapes, with a bounded contribution of each element."""
 
 from collections.abc import Sequence
+from functools import cache
+from types import SimpleNamespace
 
 import torch
 from torch import Tensor, nn
 
+from torch_modal.autograd import plain
+from torch_modal.elastic import bend, stretch
 from torch_modal.elastic.bend import collapsed, dihedral_angle
 from torch_modal.elastic.energy import Energy, RestShapes
-from torch_modal.elastic.steps import FurtherTerms
+from torch_modal.elastic.kernels.launch import launch, made
+from torch_modal.elastic.shell import N_SHELL_TERMS
+from torch_modal.elastic.steps import TermsTowards
 from torch_modal.elastic.term import Mesh, periodic_square
 from torch_modal.geometry.vectors import cross, inverse, norm, pick
 
@@ -69,7 +75,7 @@ class Distortion(nn.Module):
         """The distortion of S shapes of each sample. *Shape of each:* ``(B, V, 3) -> (S, B)``."""
         total = self.of_shell(shapes, rests)
         if self.further is not None:
-            terms = FurtherTerms(self.further, rests)
+            terms = TermsTowards.among(self.further, range(N_SHELL_TERMS, len(rests.stiffness)), rests)
             total = total + torch.stack([terms.value(x) for x in shapes])
         return total
 
@@ -99,6 +105,91 @@ class Distortion(nn.Module):
         """The vertices of the elements, components first. *Shape of each:* ``(B, V, 3) -> (3, S, B, n)``."""
         picked = torch.stack([x.index_select(-2, self.vertices) for x in shapes])
         return picked.movedim(-1, 0).contiguous()
+
+
+class KernelDistortion(Distortion):
+    """:class:`Distortion` without gradients in one kernel, in float64; with them it is the base class."""
+
+    def of_shell(self, shapes: Sequence[Tensor], rests: RestShapes) -> Tensor:
+        """Overrides the base class."""
+        values = *shapes, rests.shapes, rests.weights, *rests.stiffness[:2]
+        if torch.is_grad_enabled() or not plain(*values):
+            return super().of_shell(shapes, rests)
+        elements = [self.vertices[own].T.int().contiguous() for own in (self.edges, self.hinges)]
+        given = [x.double().contiguous() for x in (torch.stack([*shapes]), rests.shapes, rests.weights)]
+        stiffness = [x.double().contiguous() for x in self.on_elements(rests.stiffness)]
+        (n_samples, n_rests), n_vertices = rests.weights.shape, shapes[0].shape[1]
+        found = given[0].new_zeros(len(shapes), n_samples, 2)
+        sizes = [len(shapes), n_samples, n_rests, n_vertices, *(x.shape[-1] for x in stiffness)]
+        dim = n_samples, max(map(len, elements))
+        launch(made(kernels).distortion, dim, [*elements, *given, *stiffness, *sizes, found])
+        return (found @ found.new_tensor(self.shares)).to(rests.weights)
+
+
+@cache
+def kernels() -> SimpleNamespace:
+    """The same elements, for kernels."""
+    import warp as wp
+
+    from torch_modal.elastic.kernels.elements import place
+
+    real, vec2, vec3, module = wp.float64, wp.vec2d, wp.vec3d, wp.get_module("torch_modal.elastic.kernels.distortion")
+    largest_strain, largest_weight = wp.constant(real(LARGEST_STRAIN)), wp.constant(real(LARGEST_WEIGHT))
+    edge, hinge = stretch.kernel_functions(), bend.kernel_functions()
+
+    @wp.func
+    def length_of(x: wp.array(dtype=vec3), at: int, q: wp.vec2i):
+        return edge.measure(wp.matrix_from_rows(x[place(at, q[1])] - x[place(at, q[0])]))
+
+    @wp.func
+    def hinge_of(x: wp.array(dtype=vec3), at: int, q: wp.vec4i):
+        o = x[place(at, q[0])]
+        return wp.matrix_from_rows(x[place(at, q[1])] - o, x[place(at, q[2])] - o, x[place(at, q[3])] - o)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def distortion(
+        edges: wp.array(dtype=wp.vec2i),
+        hinges: wp.array(dtype=wp.vec4i),
+        x: wp.array(dtype=vec3),
+        rests: wp.array(dtype=vec3),
+        weights: wp.array(dtype=real),
+        alpha: wp.array(dtype=real),
+        beta: wp.array(dtype=real),
+        n_shapes: int,
+        n_samples: int,
+        n_rests: int,
+        n_vertices: int,
+        n_alpha: int,
+        n_beta: int,
+        out: wp.array(dtype=vec2),
+        threads: int,
+    ):
+        """Bounded stretching and bending of several shapes of each sample against its rest shapes."""
+        i = wp.tid()
+        s = i // threads
+        for k in range(i - s * threads, edges.shape[0], threads):
+            q = edges[place(k, 0)]
+            for r in range(s * n_rests, (s + 1) * n_rests):
+                rest = length_of(rests, r * n_vertices, q)
+                factor = weights[r] * alpha[place(s * n_alpha, wp.min(k, n_alpha - 1))]
+                for j in range(n_shapes):
+                    off = wp.abs(length_of(x, (j * n_samples + s) * n_vertices, q) - rest)
+                    found = factor * off * wp.min(off / rest, largest_strain)
+                    wp.atomic_add(out, place(j * n_samples, s), vec2(found, real(0.0)))
+        for k in range(i - s * threads, hinges.shape[0], threads):
+            q4 = hinges[place(k, 0)]
+            for r in range(s * n_rests, (s + 1) * n_rests):
+                e = hinge_of(rests, r * n_vertices, q4)
+                phase = hinge.measure(e)
+                factor = weights[r] * beta[place(s * n_beta, wp.min(k, n_beta - 1))]
+                factor *= wp.min(hinge.weight(e, phase, real(0.0)), largest_weight)
+                for j in range(n_shapes):
+                    turn = hinge.measure(hinge_of(x, (j * n_samples + s) * n_vertices, q4)) - phase
+                    versine = real(0.5) * wp.dot(turn, turn)
+                    found = factor * versine * (real(2.0) + versine / real(3.0))
+                    wp.atomic_add(out, place(j * n_samples, s), vec2(real(0.0), found))
+
+    return SimpleNamespace(module=module, distortion=distortion)
 
 
 def _edge_vectors(rows: Tensor, corners: Tensor) -> Tensor:

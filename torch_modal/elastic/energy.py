@@ -11,7 +11,6 @@ import torch
 from torch import Tensor, nn
 
 from torch_modal.autograd import lasting
-from torch_modal.elastic.bend import Bend, softening
 from torch_modal.elastic.term import Mesh, Term
 from torch_modal.geometry.vectors import pick
 
@@ -31,14 +30,17 @@ class Rest(NamedTuple):
 
 
 class Reference(NamedTuple):
-    r"""The reference of an energy, :math:`\sum_m W_m (q_m - Q_m)^2 + c`; angles have five rows ``Q``."""
+    """K rest shapes of each sample as one: what the terms compare their measures with."""
 
-    measures: tuple[Tensor, ...]
-    """``Q``, of :meth:`torch_modal.elastic.term.Term.merged`. *Shape of each:* ``(..., R, M)``."""
-    weights: tuple[Tensor, ...]
-    """``W``, the stiffness included. *Shape of each:* ``(..., M)``."""
+    records: tuple[Tensor, ...]
+    """Of each term the rows of :meth:`torch_modal.elastic.term.Term.merged`, the stiffness included; the first is that
+    of the weights. *Shape of each:* ``(..., R, M)``; for kernels ``(B, M, R)``."""
     constant: Tensor
-    """``c``. *Shape:* ``(...)``."""
+    """The energy that remains, whatever the shape. *Shape:* ``(...)``."""
+
+    def turned(self) -> "Reference":
+        """The records of torch as those of kernels, or the other way round."""
+        return Reference(tuple(record.mT.contiguous() for record in self.records), self.constant)
 
 
 class Linearised(NamedTuple):
@@ -91,6 +93,23 @@ class OnMesh(nn.Module):
         """The measures, or their sum for a total. *Shape:* ``(n-1, 3, ..., M) -> (..., M or 1)``."""
         measures = self.term.measures(edge_vectors)
         return measures.sum(-1, keepdim=True) if self.term.total else measures
+
+    def merged(
+        self,
+        rows: Tensor,
+        weights: Tensor,
+        stiffness: float | Tensor,
+        start: Tensor | None = None,
+        relative: bool = False,
+    ) -> tuple[Tensor, Tensor]:
+        """The record of K rest shapes and the energy that remains. *Shape:* ``(3, B, K, V) -> (B, R, M), (B, M)``."""
+        edge_vectors = self.edge_vectors(rows)
+        measures = self.measures(edge_vectors)
+        if start is not None:
+            own = self.term.softening(self.edge_vectors(start), edge_vectors, weights if relative else None)
+            stiffness = stiffness if own is None else own * stiffness
+        pulls = weights[..., None] * self.term.weights(edge_vectors, measures).expand_as(measures)
+        return self.term.merged(self.term.at_rest(measures), pulls, stiffness)
 
     def on_elements(self, weights: Tensor) -> Tensor:
         """Weights of vertices on the elements: means of their corners. *Shape:* ``(..., V) -> (..., M or 1)``."""
@@ -200,28 +219,25 @@ class Energy(nn.Module):
         """The rest shape from vertices alone. *Shape:* ``(B, V, 3)``."""
         return self.rest(self.extend(x.movedim(-1, 0).contiguous()))
 
-    def among(self, rests: Sequence[Rest], weights: Tensor, stiffness: Sequence[float | Tensor]) -> Reference:
+    def merged(self, rest: Rest, weights: Tensor, stiffness: Sequence[float | Tensor]) -> Reference:
         r"""K rest shapes as one: :math:`\sum_k s_k \sum w_k (q - q_k)^2`, by Eq. 8 for any number of them.
 
         Args:
-            rests: The rest shapes.
+            rest: Of the rest shapes. *Shape of each:* ``(..., K, M)``.
             weights: ``s``. *Shape:* ``(..., K)``.
             stiffness: Of each term: a number, or *shape* ``(..., M)`` or ``(..., 1)``.
         """
-        measures, wholes, constant = [], [], torch.zeros_like(weights[..., 0])
-        for i, (part, factor) in enumerate(zip(self.parts, stiffness, strict=True)):
-            values = torch.stack([rest.measures[i] for rest in rests], -2)
-            pulls = weights[..., None] * torch.stack([rest.weights[i] for rest in rests], -2).expand_as(values)
-            value, whole, left = part.term.merged(values, pulls)
-            measures.append(value)
-            wholes.append(factor * whole)
-            constant = constant + (factor * left).sum(-1)
-        return Reference(tuple(measures), tuple(wholes), constant)
+        records, constant = [], torch.zeros_like(weights[..., 0])
+        for part, measures, own, factor in zip(self.parts, rest.measures, rest.weights, stiffness, strict=True):
+            record, left = part.term.merged(measures, weights[..., None] * own.expand_as(measures), factor)
+            records.append(record)
+            constant = constant + left.sum(-1)
+        return Reference(tuple(records), constant)
 
     def mixed(self, rest: Rest, weights: Tensor) -> Rest:
         """One rest shape whose measures are weighted sums of those of K shapes.
 
-        Where weights differ from vertex to vertex, or are far below zero, :meth:`among` asks for harmonic means.
+        Where weights differ from vertex to vertex, or are far below zero, :meth:`merged` asks for harmonic means.
 
         Args:
             rest: Of K shapes.
@@ -236,36 +252,36 @@ class Energy(nn.Module):
 
     def against(self, rest: Rest, stiffness: Sequence[float | Tensor]) -> Reference:
         """One rest shape as the reference."""
-        return self.among([rest], torch.ones_like(rest.measures[0][..., :1]), stiffness)
+        alone = Rest(*(tuple(values.unsqueeze(-2) for values in each) for each in rest))
+        return self.merged(alone, torch.ones_like(rest.measures[0][..., :1]), stiffness)
 
     # --------------------------------------------------------------------------------------------------------- values
     def value(self, extended: Tensor, reference: Reference) -> Tensor:
         """The energy of shapes. *Shape:* ``(3, ..., V) -> (...)``."""
         total: Any = reference.constant
-        for part, rest, weight in zip(self.parts, reference.measures, reference.weights, strict=True):
-            total = total + part.term.energies(part.measures(part.edge_vectors(extended)), rest, weight).sum(-1)
+        for part, record in zip(self.parts, reference.records, strict=True):
+            total = total + part.term.energies(part.measures(part.edge_vectors(extended)), record).sum(-1)
         return total
 
     # ---------------------------------------------------------------------------------------------------- derivatives
     def linearise(self, extended: Tensor, reference: Reference) -> list[Linearised]:
         """All terms at given shapes. *Shape:* ``(3, B, V)``, extended."""
         found = []
-        for part, rest, weight in zip(self.parts, reference.measures, reference.weights, strict=True):
+        for part, record in zip(self.parts, reference.records, strict=True):
             edge_vectors = part.edge_vectors(extended)
             measures, gradients = part.term.linearised(edge_vectors)
             if part.term.total:
                 measures = measures.sum(-1, keepdim=True)
                 gradients = part.scattered(torch.zeros_like(extended), gradients)
-            slope = part.term.slopes(measures, rest, weight)
-            curvatures = part.term.curvatures(measures, rest, weight)
+            slope, curvatures = part.term.slopes(measures, record), part.term.curvatures(measures, record)
             found.append(Linearised(edge_vectors, measures, gradients, slope, *curvatures))
         return found
 
     def value_at(self, at: Sequence[Linearised], reference: Reference) -> Tensor:
         """The energy of shapes that were linearised. *Shape:* ``(B,)``."""
         found: Any = reference.constant
-        for part, one, rest, weight in zip(self.parts, at, reference.measures, reference.weights, strict=True):
-            found = found + part.term.energies(one.measures, rest, weight).sum(-1)
+        for part, one, record in zip(self.parts, at, reference.records, strict=True):
+            found = found + part.term.energies(one.measures, record).sum(-1)
         return found
 
     def rates(self, at: Sequence[Linearised], field: Tensor) -> list[Tensor]:
@@ -321,16 +337,14 @@ class RestShapes(NamedTuple):
 
         Args:
             energy: The energy.
-            start: Where a minimisation starts. Hinges with a needle there have less bending stiffness: their gradient
-                has no bound, and the minimiser would turn their normals over. *Shape:* ``(B, V, 3)``.
-            relative: Hinges with a needle in the rest shapes, too, keep their stiffness.
+            start: Where a minimisation starts, for :meth:`torch_modal.elastic.term.Term.softening`. *Shape:* ``(B, V,
+                3)``.
+            relative: Elements keep as much of their stiffness as the rest shapes have of it.
         """
-        found = energy.among([energy.rest_of(x) for x in self.shapes.unbind(1)], self.weights, self.stiffness)
-        if start is None:
-            return found
-        compared = (self.shapes, self.weights) if relative else ()
-        rows, weights = torch.cat([start[:, None], *compared[:1]], 1).movedim(-1, 0), list(found.weights)
-        for i, part in enumerate(energy.parts):
-            if isinstance(part.term, Bend):
-                weights[i] = softening(part.edge_vectors(rows), *compared[1:]) * weights[i]
-        return found._replace(weights=tuple(weights))
+        rows, begin = energy.extend(self.shapes.movedim(-1, 0)), None
+        if start is not None:
+            begin = energy.extend(start.movedim(-1, 0))
+        pairs = zip(energy.parts, self.stiffness, strict=True)
+        found = [part.merged(rows, self.weights, own, begin, relative) for part, own in pairs]
+        records, left = zip(*found, strict=True)
+        return Reference(records, sum((own.sum(-1) for own in left), start=torch.zeros_like(self.weights[:, 0])))

@@ -4,18 +4,31 @@ First derivatives are local (3 numbers of an edge, 9 of a hinge) and are gathere
 which are the same for a whole batch.
 """
 
+import itertools
+from collections.abc import Sequence
 from functools import reduce
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
+from torch_modal import trees
+from torch_modal.autograd import plain
 from torch_modal.elastic.energy import Energy, Linearised, Reference, RestShapes
+from torch_modal.elastic.kernel_energy import KernelEnergy
+from torch_modal.elastic.kernels.function import fused
+from torch_modal.elastic.kernels.launch import launch, of_elements
 from torch_modal.elastic.shell import ShellEnergy
 from torch_modal.elastic.term import Term
 
 # The second-order term of a batch passes through an array of this many bytes at a time.
 MOST_BYTES = 2**26
+
+# Columns that a kernel takes at a time.
+_BLOCK = 8
+
+MOST_NUMBERS = 2**27
+"""Of an array that all samples of a batch have at a time (1 GiB): kernels index with 32 bits, and memory is finite."""
 
 
 class Derivatives(NamedTuple):
@@ -192,3 +205,176 @@ def _second_order(term: Term, one: Linearised, columns: Tensor) -> Tensor:
     # (b, M, c, c) by (M, c, n), of some samples at a time.
     parts = (own.contiguous() @ columns for own in curved.permute(2, 3, 0, 1).split(most))
     return torch.cat([columns.flatten(0, 1).mT @ pushed.flatten(1, 2) for pushed in parts])
+
+
+class KernelModalEnergy(ModalEnergy):
+    """:class:`ModalEnergy` whose values and derivatives come from kernels, in float64.
+
+    What is differentiated once more is torch's, and what has no numbers. Shapes are not extended, and the records of
+    references are those of kernels.
+
+    Args:
+        kernels: The terms.
+        columns: Directions of the space. *Shape:* ``(n, V, 3)``.
+    """
+
+    flat: Tensor
+    blocks: Tensor
+    tabulated = False  # kernels have their own tables
+
+    def __init__(self, kernels: KernelEnergy, columns: Tensor) -> None:
+        super().__init__(kernels.energy, columns)
+        self.kernels = kernels
+        self.register_buffer("flat", columns.flatten(1).contiguous(), persistent=False)
+        rows = self.columns.permute(2, 1, 0).flatten(0, 1)
+        blocks = nn.functional.pad(rows, (0, -(len(columns) + 2) % _BLOCK + 2)).contiguous()
+        #: Columns of each component of each vertex and of the centre, with room for two more, and zeros.
+        self.register_buffer("blocks", blocks, persistent=False)
+
+    def reference(self, rests: RestShapes, base: Tensor | None = None) -> Reference:
+        """As in the base class."""
+        return self.kernels.reference(rests, base)
+
+    def place(self, base: Tensor, reference: Reference, anchors: Tensor | None = None) -> Placement:
+        """As in the base class."""
+        return Placement(base.double(), reference)
+
+    def by_torch(self, placement: Placement) -> Placement:
+        """A placement for torch."""
+        base, reference = trees.mapped(placement, lambda value: value.to(self.columns.dtype))
+        return super().place(base, reference.turned())
+
+    def _plain(self, placement: Placement) -> Placement | None:
+        """The placement for torch; None where it is for kernels."""
+        serves = not torch.is_grad_enabled() and plain(placement.base, *trees.leaves(placement.reference))
+        return None if serves else self.by_torch(placement)
+
+    def _shapes(self, a: Tensor, base: Tensor) -> Tensor:
+        """*Shape:* ``(..., B, n) -> (D * B, V, 3)``."""
+        a, flat = a.double(), self.flat.double()
+        if a.dim() == 2:
+            return torch.addmm(base.flatten(1), a, flat).view_as(base)
+        return ((a @ flat).unflatten(-1, (-1, 3)) + base).flatten(0, -3)
+
+    def value(self, a: Tensor, placement: Placement) -> Tensor:
+        """As in the base class."""
+        own = self._plain(placement)
+        if own is not None:
+            return super().value(a.to(own.base), own).to(placement.base)
+        found = self.kernels.value(self._shapes(a, placement.base), placement.reference)
+        return found.unflatten(0, a.shape[:-1]) + placement.reference.constant
+
+    def derivatives(self, a: Tensor, placement: Placement, second_order: bool = True) -> Derivatives:
+        """As in the base class."""
+        own = self._plain(placement)
+        if own is not None:
+            found = super().derivatives(a.to(own.base), own, second_order)
+            return trees.mapped(found, lambda value: value.to(placement.base))
+        terms = [self.kernels.parts[i] for i in self.kernels.terms]
+        rows = max(sum(len(part.elements) for part in terms) + 1, len(self.blocks))
+        local = [len(part.elements) * (3 * part.functions.n) ** 2 for part in terms]
+        most = max(1, MOST_NUMBERS // max(self.blocks.shape[1] * rows, *local))
+        parts = [
+            self._derivatives(a[i : i + most], trees.rows(placement, slice(i, i + most)), second_order)
+            for i in range(0, len(a), most)
+        ]
+        joined = [None if each[0] is None else torch.cat(each) for each in zip(*parts, strict=True)]
+        return parts[0] if len(parts) == 1 else Derivatives(*joined)  # type: ignore[arg-type]
+
+    def _derivatives(self, a: Tensor, placement: Placement, second_order: bool) -> Derivatives:
+        x, to, kernels, blocks = (
+            self._shapes(a, placement.base),
+            placement.reference,
+            self.kernels,
+            self.blocks.double(),
+        )
+        (b, n_vertices, _), n, n_blocks = x.shape, len(self.columns), self.blocks.shape[1] // _BLOCK
+        terms = [(kernels.parts[i], to.records[i]) for i in kernels.terms]
+        starts = [0, *itertools.accumulate(len(part.elements) for part, _ in terms)]
+        n_rows, totals = starts[-1] + len(kernels.volumes), x.new_zeros(b, 2)
+        # One row for each measure, the last for the volume; the residuals are a column like the others.
+        jacobian = x.new_empty(b, n_rows, blocks.shape[1])
+        for (part, record), first in zip(terms, starts, strict=False):
+            given = n_vertices, x, record, blocks, n, n_blocks, first, n_rows, jacobian, jacobian, totals
+            part.launch("jacobian", b, *given)
+        stiffness, value = totals.unbind(1)
+        for i in kernels.volumes:
+            normal = torch.zeros_like(x)
+            off = kernels.parts[i].at(x, normal) - to.records[i][:, 0, 1]
+            weight = to.records[i][:, 0, 0]
+            last = jacobian[:, -1]
+            last[:, :n], last[:, n] = normal.flatten(1) @ self.flat.double().mT, off
+            last *= (2 * weight).sqrt()[:, None]
+            last[:, n + 1 :] = 0
+            stiffness, value, moment = stiffness + 2 * weight, value + weight * off**2, 2 * weight * off
+        gradient = (jacobian.mT @ jacobian[..., n : n + 1])[:, :n, 0]
+        inner = gram(jacobian, second_order)[:, :n, :n]
+        stiffest = inner.diagonal(dim1=-2, dim2=-1).amax(-1)
+        rounding = torch.finfo(x.dtype).eps * x.abs().amax((-1, -2))
+        curved = None
+        if second_order:
+            pushed = x.new_zeros(b, *blocks.shape)
+            for part, record in terms:
+                hessians = x.new_empty(b, len(part.elements), (3 * part.functions.n) ** 2)
+                part.launch("hessians", b, n_vertices, x, record, hessians, back=True)
+                self._curve(part.elements, hessians, blocks, pushed)
+            for i in kernels.volumes:
+                part = kernels.parts[i].part
+                local = part.term.hessians(part.edge_vectors(self.energy.extend(x.movedim(-1, 0)))) * moment[:, None]
+                hessians = local.permute(4, 5, 0, 1, 2, 3).flatten(2).contiguous()
+                self._curve(part.corners.T.int().contiguous(), hessians, blocks, pushed)
+            curved = (blocks.mT @ pushed)[:, :n, :n]
+        value = value + to.constant
+        return Derivatives(value, gradient, inner, curved, rounding * (stiffest * stiffness).sqrt())
+
+    @staticmethod
+    def _curve(elements: Tensor, hessians: Tensor, blocks: Tensor, pushed: Tensor) -> None:
+        """Second derivatives of elements on the columns are added. *Shape:* ``(M, n), (B, M, h)``."""
+        given = elements, hessians, len(blocks) // 3, blocks, blocks.shape[1] // _BLOCK, pushed
+        kernel = of_elements("curving", elements.shape[1] - 1).curved
+        launch(kernel, (len(hessians), len(elements)), given)
+
+    def value_and_gradient(self, a: Tensor, placement: Placement) -> tuple[Tensor, Tensor]:
+        """As in the base class."""
+        own = self._plain(placement)
+        if own is not None:
+            value, gradient = super().value_and_gradient(a.to(own.base), own)
+            return value.to(placement.base), gradient.to(placement.base)
+        to = placement.reference
+        value, x = self.kernels.value_and_gradient(self._shapes(a, placement.base), to)
+        return value + to.constant, x.flatten(1) @ self.flat.double().mT
+
+    def gradient(self, a: Tensor, placement: Placement) -> Tensor:
+        """As in the base class."""
+        return fused(_Gradient(self), a, placement.base, *placement.reference.records)[0].to(placement.base)
+
+
+class _Gradient:
+    """Gradient in the amplitudes, from these, the base, and the records of a reference."""
+
+    n_results = n_differentiable = 1
+
+    def __init__(self, modal: KernelModalEnergy) -> None:
+        self.modal = modal
+
+    def run(self, kept: list[Any] | None, a: Tensor, *place: Tensor) -> tuple[Tensor, ...]:
+        """See :class:`~torch_modal.elastic.kernels.function.Operation`."""
+        with torch.no_grad():
+            return (self.modal.value_and_gradient(a, self._placement(*place))[1],)
+
+    def back(self, kept: list[Any], grads: Sequence[Tensor], a: Tensor, *place: Tensor) -> tuple[Tensor | None, ...]:
+        """See :class:`~torch_modal.elastic.kernels.function.Operation`."""
+        modal, (base, to) = self.modal, self._placement(*place)
+        x, moved = modal._shapes(a, base), modal._shapes(grads[0], torch.zeros_like(base))
+        to_base, to_records = torch.zeros_like(x), [torch.zeros_like(record) for record in to.records]
+        modal.kernels.back(x, modal.kernels.at(x, to, hessian=False), to, moved, to_base, to_records)
+        return to_base.flatten(1) @ modal.flat.double().mT, to_base, *to_records
+
+    def by_torch(self, a: Tensor, *place: Tensor) -> tuple[Tensor, ...]:
+        """See :class:`~torch_modal.elastic.kernels.function.Operation`."""
+        own = self.modal.by_torch(self._placement(*place))
+        return (ModalEnergy.gradient(self.modal, a.to(own.base), own).to(a),)
+
+    @staticmethod
+    def _placement(base: Tensor, *records: Tensor) -> Placement:
+        return Placement(base, Reference(records, base.new_zeros(len(base))))

@@ -114,11 +114,10 @@ class ShellEnergy(nn.Module):
         Returns:
             *Shape:* ``(..., E + H + 1)``.
         """
-        rows = self._rows(x)
-        reference = self.against(x_rest)
+        rows, rest = self._rows(x), self.rest(x_rest)
         parts = [
-            weight.sqrt() * part.term.difference(part.measures(part.edge_vectors(rows)), rest.squeeze(-2))
-            for part, rest, weight in zip(self.energy.parts, reference.measures, reference.weights, strict=True)
+            (factor * weights).sqrt() * part.term.difference(part.measures(part.edge_vectors(rows)), measures)
+            for part, measures, weights, factor in zip(self.energy.parts, *rest, self.stiffness, strict=True)
         ]
         lead = broadcast_shapes(*(part.shape[:-1] for part in parts))
         return torch.cat([part.expand(*lead, -1) for part in parts], -1)

@@ -1,14 +1,14 @@
 """The energy on the caller's mesh with every vertex free: a convex Hessian, never assembled, and steps with it."""
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple, Protocol
+from functools import reduce
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor, nn
 
 from torch_modal.autograd import plain
 from torch_modal.elastic.energy import Energy, Linearised, Reference, RestShapes, energy_rounding
-from torch_modal.elastic.shell import N_SHELL_TERMS
 from torch_modal.elastic.term import Mesh, Term
 from torch_modal.geometry.canonical import CANONICAL_SIZE
 
@@ -27,26 +27,30 @@ CHUNK = 20_000
 CHUNK_OF_GPU = 1_000_000
 
 
-class FurtherDerivatives(NamedTuple):
-    """An energy beside Eq. 5 at given shapes."""
+class Point(NamedTuple):
+    """An energy at given shapes, with a convex Hessian."""
 
     value: Tensor
     """*Shape:* ``(B,)``."""
     gradient: Tensor
     """*Shape:* ``(B, V, 3)``."""
     diagonal: Tensor
-    """The blocks of its convex Hessian's diagonal, packed. *Shape:* ``(B, V, 6)``."""
+    """The blocks of the Hessian's diagonal, packed. *Shape:* ``(B, V, 6)``."""
     product: Callable[[Tensor], Tensor]
-    """With the convex Hessian. *Shape:* ``(B, V, 3) -> (B, V, 3)``."""
+    """With the Hessian. *Shape:* ``(B, V, 3) -> (B, V, 3)``."""
+
+    def slope(self, direction: Tensor) -> Tensor:
+        """Derivative of the energy along a direction. *Shape:* ``(B, V, 3) -> (B,)``."""
+        return (self.gradient * direction).sum((1, 2))
 
 
-class FurtherEnergy(Protocol):
-    """An energy that steps of all vertices take beside Eq. 5."""
+class FreeEnergy(Protocol):
+    """An energy of all vertices."""
 
     def value(self, x: Tensor) -> Tensor:
         """*Shape:* ``(B, V, 3) -> (B,)``."""
 
-    def at(self, x: Tensor) -> FurtherDerivatives:
+    def at(self, x: Tensor) -> Point:
         """*Shape:* ``(B, V, 3)``."""
 
 
@@ -111,54 +115,39 @@ def inverse_of_symmetric(blocks: Tensor) -> Tensor:
     return (cofactors / (determinant * trace)).unflatten(0, (3, 3))
 
 
-def relax(
-    energy: Energy,
-    x: Tensor,
-    reference: Reference,
-    n_steps: int,
-    n_products: int,
-    anchors: Tensor | None = None,
-    beside: Sequence[FurtherEnergy] = (),
-) -> Tensor:
+def descend(problem: Any, x: Tensor, n_steps: int, n_products: int, taken: list[Any] | None = None) -> Tensor:
     """Steps of a truncated Newton method on all vertices, shortened where the energy would rise.
 
-    Each step solves with :class:`ConvexHessian` by conjugate gradients, preconditioned by its diagonal blocks and cut
-    short: what a modal space leaves to be done is local, and a few iterations see far enough. Every sample takes the
-    same number of both, so that the result is differentiable like any other expression.
+    Each step solves with a convex Hessian by conjugate gradients, preconditioned by its diagonal blocks and cut short:
+    what a modal space leaves to be done is local, and a few iterations see far enough. Every sample takes the same
+    number of both, so that the result is differentiable like any other expression.
 
     Args:
-        energy: The energy.
+        problem: A :class:`SumOfEnergies`, or one that kernels solve.
         x: Where to start. *Shape:* ``(B, V, 3)``.
-        reference: What is compared with.
         n_steps: Newton steps.
         n_products: Iterations of conjugate gradients in each.
-        anchors: Of the energy's terms, where there are some. *Shape:* ``(B, P, 3)``.
-        beside: Further energies.
+        taken: The steps are added: where they start, the energy there, whole step, length, and what the solver kept.
 
     Returns:
         *Shape:* ``(B, V, 3)``.
     """
-    fixed = None if anchors is None else anchors.movedim(-1, 0)
-    rows, at = x.movedim(-1, 0).contiguous(), None
+    at = None
     for k in range(n_steps):
-        at = energy.linearise(energy.extend(rows, fixed), reference) if at is None else at
-        more = [one.at(rows.movedim(0, -1).contiguous()) for one in beside]
-        right = -sum((one.gradient.movedim(-1, 0) for one in more), start=energy.fold(energy.gradient(at)))
-        direction = _solved(energy, ConvexHessian(energy, at), right, n_products, more)
-        reached = rows + direction
-        there = reached.movedim(0, -1).contiguous()
-        before = sum((one.value for one in more), start=energy.value_at(at, reference))
-        extended, at = energy.extend(reached, fixed), None
+        at = problem.at(x) if at is None else at
+        solution, *kept = problem.solved(at, n_products, taken is not None)
+        reached, there = x + solution, None
         if k < n_steps - 1 and plain(reached):  # the whole step is nearly always the one that is taken
-            at = energy.linearise(extended, reference)
-        after = energy.value(extended, reference) if at is None else energy.value_at(at, reference)
-        after = sum((one.value(there) for one in beside), start=after)
-        length = step_length(before, -(right * direction).sum((0, -1)), after, direction.abs().amax((0, -1)))
-        if at is not None and bool((length == 1).all()):
-            rows = reached
+            there = problem.at(reached)
+        after = problem.value(reached) if there is None else there.value
+        length = step_length(at.value, at.slope(solution), after, solution.abs().amax((1, 2)))
+        if taken is not None:
+            taken.append((x, at, solution, length, *kept))
+        if there is not None and bool((length == 1).all()):
+            x, at = reached, there
         else:
-            rows, at = rows + length[:, None] * direction, None
-    return rows.movedim(0, -1)
+            x, at = x + length[:, None, None] * solution, None
+    return x
 
 
 def step_length(before: Tensor, slope: Tensor, after: Tensor, largest: Tensor) -> Tensor:
@@ -186,30 +175,43 @@ def step_length(before: Tensor, slope: Tensor, after: Tensor, largest: Tensor) -
     return torch.where(finite, length, 0)
 
 
-def _solved(
-    energy: Energy,
-    hessian: ConvexHessian,
-    right: Tensor,
-    n_products: int,
-    more: Sequence[FurtherDerivatives],
-) -> Tensor:
-    """An approximate solution. *Shape:* ``(3, B, V)``."""
-    blocks = hessian.diagonal()[..., : right.shape[-1]]
-    for one in more:
-        blocks = blocks + one.diagonal.movedim(-1, 0)
-    inverse = inverse_of_symmetric(blocks)
+class SumOfEnergies:
+    """Several energies as one, and the solution with its Hessian by torch.
 
-    def product(field: Tensor) -> Tensor:
-        own = energy.fold(hessian(energy.extend(field)))
-        return sum((one.product(field.movedim(0, -1).contiguous()).movedim(-1, 0) for one in more), start=own)
+    Args:
+        energies: The energies.
+    """
 
-    def precondition(residual: Tensor) -> Tensor:
-        return (inverse * residual).sum(1)
+    def __init__(self, energies: Sequence[FreeEnergy]) -> None:
+        self.energies = energies
 
-    def dot(a: Tensor, b: Tensor) -> Tensor:
-        return (a * b).sum((0, -1))[:, None]
+    def value(self, x: Tensor) -> Tensor:
+        """*Shape:* ``(B, V, 3) -> (B,)``."""
+        return reduce(torch.add, [one.value(x) for one in self.energies])
 
-    return conjugate_gradients(product, precondition, dot, right, n_products)
+    def at(self, x: Tensor) -> Point:
+        """*Shape:* ``(B, V, 3)``."""
+        each = [one.at(x) for one in self.energies]
+        values, gradients, diagonals, products = zip(*each, strict=True)
+        sums = (reduce(torch.add, own) for own in (values, gradients, diagonals))
+        return Point(*sums, lambda field: reduce(torch.add, [product(field) for product in products]))
+
+    @staticmethod
+    def solved(at: Point, n_products: int, keep: bool = False) -> tuple[Tensor]:
+        """An approximate solution with the Hessian for the opposite of the gradient. *Shape:* ``(B, V, 3)``."""
+        inverse = inverse_of_symmetric(at.diagonal.movedim(-1, 0))
+
+        def product(field: Tensor) -> Tensor:
+            return at.product(field.movedim(0, -1)).movedim(-1, 0)
+
+        def precondition(residual: Tensor) -> Tensor:
+            return (inverse * residual).sum(1)
+
+        def dot(a: Tensor, b: Tensor) -> Tensor:
+            return (a * b).sum((0, -1))[:, None]
+
+        right = -at.gradient.movedim(-1, 0)
+        return (conjugate_gradients(product, precondition, dot, right, n_products).movedim(0, -1),)
 
 
 def conjugate_gradients(
@@ -250,42 +252,47 @@ def conjugate_gradients(
     return solution
 
 
-class FurtherTerms(FurtherEnergy):
-    """The terms beyond Eq. 5 as an energy beside it.
+class TermsTowards(FreeEnergy):
+    """Terms towards a reference.
 
     Args:
-        energy: Their energy.
-        rests: The rest shapes of all terms.
+        energy: The terms.
+        reference: What they are compared with.
+        anchors: Their fixed points, where there are some. *Shape:* ``(B, P, 3)``.
     """
 
-    def __init__(self, energy: Energy, rests: RestShapes) -> None:
-        own = rests._replace(stiffness=rests.stiffness[N_SHELL_TERMS:])
-        self.energy, self.reference = energy, own.reference(energy)
-        self.anchors = None if rests.anchors is None else rests.anchors.movedim(-1, 0)
+    def __init__(self, energy: Energy, reference: Reference, anchors: Tensor | None = None) -> None:
+        self.energy, self.reference = energy, reference
+        self.anchors = None if anchors is None else anchors.movedim(-1, 0)
+
+    @classmethod
+    def among(cls, energy: Energy, numbers: Sequence[int], rests: RestShapes) -> "TermsTowards":
+        """Some of the terms of rest shapes, by their numbers."""
+        own = rests._replace(stiffness=[rests.stiffness[i] for i in numbers])
+        return cls(energy, own.reference(energy), rests.anchors)
 
     def _extended(self, x: Tensor) -> Tensor:
-        return self.energy.extend(x.movedim(-1, 0).contiguous(), self.anchors)
+        return self.energy.extend(x.movedim(-1, 0), self.anchors)
 
     def value(self, x: Tensor) -> Tensor:
         """*Shape:* ``(B, V, 3) -> (B,)``."""
         return self.energy.value(self._extended(x), self.reference)
 
-    def at(self, x: Tensor) -> FurtherDerivatives:
+    def at(self, x: Tensor) -> Point:
         """*Shape:* ``(B, V, 3)``."""
         energy, n = self.energy, x.shape[1]
         at = energy.linearise(self._extended(x), self.reference)
         hessian = ConvexHessian(energy, at)
-        packed = hessian.diagonal()[..., :n].movedim(0, -1)
 
         def product(field: Tensor) -> Tensor:
-            rows = energy.extend(field.movedim(-1, 0).contiguous())
-            return energy.fold(hessian(rows)).movedim(0, -1)
+            return energy.fold(hessian(energy.extend(field.movedim(-1, 0)))).movedim(0, -1)
 
-        gradient = energy.fold(energy.gradient(at)).movedim(0, -1)
-        return FurtherDerivatives(energy.value_at(at, self.reference), gradient, packed, product)
+        gradient, diagonal = energy.fold(energy.gradient(at)), hessian.diagonal()[..., :n]
+        value = energy.value_at(at, self.reference)
+        return Point(value, gradient.movedim(0, -1), diagonal.movedim(0, -1), product)
 
 
-Beside = Callable[[slice, Tensor], Sequence[FurtherEnergy]]
+Beside = Callable[[slice, Tensor], Sequence[FreeEnergy]]
 """Makes energies beside that of the terms, for some of the samples, in the dtype of a tensor."""
 
 
@@ -305,7 +312,7 @@ class FineEnergy(nn.Module):
     def relax(
         self, x: Tensor, rests: RestShapes, stages: Sequence[tuple[int, int]], beside: Beside | None = None
     ) -> Tensor:
-        """Steps of all vertices, never uphill: stages of :func:`relax` by numbers of steps and products.
+        """Steps of all vertices, never uphill: stages of :func:`descend` by numbers of steps and products.
 
         *Shape:* ``(B, V, 3)``.
         """
@@ -317,19 +324,24 @@ class FineEnergy(nn.Module):
         return torch.cat(parts)
 
     def relax_chunk(
-        self, x: Tensor, rests: RestShapes, stages: Sequence[tuple[int, int]], beside: Sequence[FurtherEnergy]
+        self, x: Tensor, rests: RestShapes, stages: Sequence[tuple[int, int]], beside: Sequence[FreeEnergy]
     ) -> Tensor:
         """:meth:`relax` of samples that fit into the caches, with their own further energies."""
-        reference = rests.reference(self.energy, x, relative=True)
-        for n_steps, n_products in stages:
-            x = relax(self.energy, x, reference, n_steps, n_products, rests.anchors, beside)
-        return x
+        own = TermsTowards(self.energy, rests.reference(self.energy, x, relative=True), rests.anchors)
+        return descended(SumOfEnergies([own, *beside]), x, stages)
 
     def towards(
-        self, x: Tensor, reference: Reference, n_steps: int, n_products: int, beside: Sequence[FurtherEnergy] = ()
+        self, x: Tensor, reference: Reference, n_steps: int, n_products: int, beside: Sequence[FreeEnergy] = ()
     ) -> Tensor:
         """Steps of all vertices towards a reference that is known. *Shape:* ``(B, V, 3)``."""
-        return relax(self.energy, x, reference, n_steps, n_products, None, beside)
+        return descend(SumOfEnergies([TermsTowards(self.energy, reference), *beside]), x, n_steps, n_products)
+
+
+def descended(problem: Any, x: Tensor, stages: Sequence[tuple[int, int]]) -> Tensor:
+    """:func:`descend` in stages."""
+    for n_steps, n_products in stages:
+        x = descend(problem, x, n_steps, n_products)
+    return x
 
 
 def chunk_of(n_vertices: int, device: torch.device) -> int:

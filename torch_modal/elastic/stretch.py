@@ -1,9 +1,11 @@
 """Edge lengths, the first term of Eq. 5."""
 
+from functools import cache
+
 import torch
 from torch import Tensor
 
-from torch_modal.elastic.term import Mesh, Term
+from torch_modal.elastic.term import KernelFunctions, Mesh, Term, square
 from torch_modal.geometry.vectors import inverse, norm, tiny
 
 # Eq. 5 divides by rest lengths: edges without one, as a part of the mean, have no say.
@@ -49,3 +51,42 @@ class Stretch(Term):
         length = norm(edge_vectors[0])
         width = SLACK * curvature * length
         return 0.5 * (slope + (slope * slope + width * width + torch.finfo(slope.dtype).tiny).sqrt()) / length
+
+    def kernel_functions(self, n: int) -> KernelFunctions | None:
+        """Of edges; of a class that inherits from this one, those of its own."""
+        return kernel_functions() if type(self) is Stretch else super().kernel_functions(n)
+
+
+@cache
+def kernel_functions() -> KernelFunctions:
+    """Edges as above, for kernels."""
+    import warp as wp
+
+    real, edge = wp.float64, wp.types.matrix(shape=(1, 3), dtype=wp.float64)
+    slack, shortest = wp.constant(real(SLACK)), wp.constant(real(MIN_RELATIVE_LENGTH))
+    tiny_square, tiniest = wp.constant(real(tiny(torch.empty(0, dtype=torch.float64)))), wp.constant(real(2.0**-1022))
+
+    @wp.func
+    def measure(x: edge):
+        return wp.sqrt(wp.max(wp.dot(x[0], x[0]), tiny_square))
+
+    @wp.func
+    def linearised(x: edge):
+        length = measure(x)
+        return length, wp.matrix_from_rows((real(1.0) / length) * x[0])
+
+    @wp.func
+    def weight(x: edge, length: real, mean: real):
+        found = real(0.0)
+        if length > shortest * mean:
+            found = real(1.0) / length
+        return found
+
+    @wp.func
+    def across(length: real, slope: real, stiffness: real):
+        width = slack * stiffness * length
+        return real(0.5) / length * (slope + wp.sqrt(slope * slope + width * width + tiniest))
+
+    return KernelFunctions(
+        "stretch", 1, square(), measure, linearised, weight=weight, uses_mean=True, across=across, even=True
+    )

@@ -4,10 +4,14 @@ A term has the energy :math:`\sum_m k_m w_m (q_m - \bar q_m)^2` over its element
 its value at rest, weights ``w`` that depend on the rest shape, and the stiffness ``k``. All that a term must say is
 which elements it sees and what it measures on one of them: derivatives then come from ``torch.func``. The terms of
 Eq. 5 write theirs out. Angles take a smooth periodic function in the place of the square (:class:`PeriodicTerm`).
+
+Kernels of NVIDIA Warp are made from the same functions of one element, written once more for them
+(:class:`KernelFunctions`) beside those for torch, inside functions, as Warp is loaded only where it is used.
 """
 
 import math
-from typing import Any
+from functools import cache
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -49,6 +53,62 @@ class Mesh:
         return cls(Connectivity(faces.detach().cpu().numpy(), n_vertices))
 
 
+class Potential(NamedTuple):
+    """A function of measures and of a record of K rest shapes, as functions of Warp on one element."""
+
+    record: Any
+    """The struct of a row of :attr:`torch_modal.elastic.energy.Reference.records`."""
+    kind: Any
+    """The type of the measures."""
+    sums: Any
+    """The type of the sums over rest shapes."""
+    moments: Any
+    """Sums over rest shapes are of these: measure, pull -> vector."""
+    merged: Any
+    """From the sums, and a factor of the pulls, to the record."""
+    energy: Any
+    """Measure, record -> energy, but for what is left at the record."""
+    slope: Any
+    rate: Any
+    """Change with the measure, of what changes so with the argument for the measure: measure, gradient."""
+    left: Any
+    """Energy that is left: sums, factor, record."""
+    n_rows: int
+    """Numbers of a record."""
+    row: Any
+    """The type of a vector of them."""
+    packed: Any
+    """From the record to that."""
+
+
+class KernelFunctions(NamedTuple):
+    """What kernels of a term are made from, as functions of Warp on one element: a matrix of its edge vectors, by row.
+
+    A term of your own has them by :attr:`Term.kernel_measure`.
+    """
+
+    name: str
+    """Of the modules of the kernels."""
+    n: int
+    """Edge vectors of an element."""
+    potential: Potential
+    measure: Any
+    """Edge vectors -> measure."""
+    linearised: Any
+    """Edge vectors -> measure, gradient."""
+    exact: bool = True
+    """Whether the gradient is written out, so that it can be differentiated."""
+    weight: Any = None
+    """Weight at rest: edge vectors, measure, mean of the measures; None where torch merges the rest shapes."""
+    uses_mean: bool = False
+    fullness: Any = None
+    """Edge vectors, square of an altitude -> 0 to 1 by how far the element is from a needle."""
+    across: Any = None
+    """Stiffness across an element: measure, slope, twice the weight."""
+    even: bool = False
+    """Whether an edge may have either sense."""
+
+
 class Term(nn.Module):
     """One kind of measure on a mesh, as a term of an energy.
 
@@ -73,6 +133,10 @@ class Term(nn.Module):
     """Whether the measures of all elements add up to one, such as a volume."""
     sampled = False
     """Whether elements name vertices of the caller's mesh, for which a coarse mesh has no counterpart."""
+    kernel_measure: Any = None
+    """The measure as a ``wp.func`` of a matrix of the edge vectors, by row: then kernels compute the term."""
+    kernel_gradient: Any = None
+    """Its gradient likewise, a matrix: then they compute gradients of results, too; torch does so where it is None."""
     stiffness: Any
 
     def __init__(self, stiffness: float | Tensor = 1.0) -> None:
@@ -116,7 +180,7 @@ class Term(nn.Module):
         return measures - rest
 
     # ---------------------------------------------------------------- the square of the difference, and its derivatives
-    def merged(self, measures: Tensor, pulls: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def merged(self, measures: Tensor, pulls: Tensor, factor: float | Tensor = 1.0) -> tuple[Tensor, Tensor]:
         """K parabolas as one (Eq. 8).
 
         Weights below zero may outweigh the others: then there is no minimum, and no weight.
@@ -124,42 +188,67 @@ class Term(nn.Module):
         Args:
             measures: Of K rest shapes. *Shape:* ``(..., K, M)``.
             pulls: Their weights. *Shape:* ``(..., K, M)``.
+            factor: Of all pulls: the stiffness. *Shape:* ``(..., M)`` or ``(..., 1)``.
 
         Returns:
-            The reference that measures are compared with, *shape* ``(..., R, M)``; its weights, and the energy that
-            remains, *shape* ``(..., M)``.
+            The record of the rest shapes, weight and value, *shape* ``(..., 2, M)``; and the energy that remains,
+            *shape* ``(..., M)``.
         """
         whole = pulls.sum(-2)
         shares = pulls * inverse(whole, whole <= 0)[..., None, :]
-        first = measures[..., :1, :]
-        value = first + (shares * self.difference(measures, first)).sum(-2, keepdim=True)
-        constant = (pulls * self.difference(measures, value) ** 2).sum(-2)
-        return value, torch.where(whole > 0, whole, 0), constant
+        first = measures[..., 0, :]
+        value = first + (shares * self.difference(measures, first[..., None, :])).sum(-2)
+        left = (pulls * self.difference(measures, value[..., None, :]) ** 2).sum(-2)
+        record = torch.broadcast_tensors(factor * torch.where(whole > 0, whole, 0), value)
+        return torch.stack(record, -2), factor * left
 
-    def energies(self, measures: Tensor, rest: Tensor, weights: Tensor) -> Tensor:
-        """Energy of each element.
+    def energies(self, measures: Tensor, record: Tensor) -> Tensor:
+        """Energy of each element, but for what remains.
 
         Args:
             measures: *Shape:* ``(..., M)``.
-            rest: Of :meth:`merged`. *Shape:* ``(..., R, M)``.
-            weights: Of :meth:`merged`, with the stiffness. *Shape:* ``(..., M)``.
+            record: Of :meth:`merged`. *Shape:* ``(..., R, M)``.
 
         Returns:
             *Shape:* ``(..., M)``.
         """
-        return weights * self.difference(measures, rest.squeeze(-2)) ** 2
+        weight, value = record.unbind(-2)
+        return weight * self.difference(measures, value) ** 2
 
-    def slopes(self, measures: Tensor, rest: Tensor, weights: Tensor) -> Tensor:
+    def slopes(self, measures: Tensor, record: Tensor) -> Tensor:
         """First derivative of :meth:`energies` in the measures. *Shape:* ``(..., M)``."""
-        return 2 * weights * self.difference(measures, rest.squeeze(-2))
+        weight, value = record.unbind(-2)
+        return 2 * weight * self.difference(measures, value)
 
-    def curvatures(self, measures: Tensor, rest: Tensor, weights: Tensor) -> tuple[Tensor, Tensor | None]:
+    def curvatures(self, measures: Tensor, record: Tensor) -> tuple[Tensor, Tensor | None]:
         """A second derivative that is never negative, and what the true one has beyond it; None where nothing."""
-        return 2 * weights.expand_as(measures), None
+        return 2 * record[..., 0, :].expand_as(measures), None
 
     def on_one_branch(self, measures: Tensor, pulls: Tensor) -> Tensor:
         """The measures of K rest shapes, such that weighted sums make sense. *Shape:* ``(..., K, M)`` each."""
         return measures
+
+    def kernel_functions(self, n: int) -> KernelFunctions | None:
+        """What kernels are made from, for elements of ``n`` edge vectors; None for a term that torch computes."""
+        if self.kernel_measure is None or self.total or type(self).difference is not Term.difference:
+            return None
+        return _of_measure(self._name(), n, square(), self.kernel_measure, self.kernel_gradient)
+
+    def _name(self) -> str:
+        return f"{type(self).__module__}.{type(self).__qualname__}"
+
+    def softening(self, start: Tensor, rest: Tensor, weights: Tensor | None) -> Tensor | None:
+        """Factors of the stiffness where minimisations start; None for one.
+
+        Args:
+            start: Edge vectors there. *Shape:* ``(n-1, 3, B, M)``.
+            rest: Those of K rest shapes. *Shape:* ``(n-1, 3, B, K, M)``.
+            weights: Of the rest shapes, where the factors are relative to them. *Shape:* ``(B, K)``.
+
+        Returns:
+            *Shape:* ``(B, M)``.
+        """
+        return None
 
     # ---------------------------------------------- all elements at once; written out by the terms that have to be fast
     def measures(self, edge_vectors: Tensor) -> Tensor:
@@ -204,47 +293,55 @@ class Term(nn.Module):
 class PeriodicTerm(Term):
     r"""A term whose measures are angles, with a smooth periodic function in the place of the square.
 
-    .. math:: f(d) = 2 (1 - \cos d) + \tfrac{1}{3} (1 - \cos d)^2 = d^2 + O(d^6)
+    .. math:: f(d) = 2 (1 - \cos d) + \tfrac{1}{3} (1 - \cos d)^2 = \tfrac{5}{2} - \tfrac{8}{3} \cos d
+        + \tfrac{1}{6} \cos 2d = d^2 + O(d^6)
 
     It is 1.2 % below the square at 60 degrees, 5 % at 90, and has no pull at half a turn, where the square of the
     wrapped difference jumps from one side to the other. It is a trigonometric polynomial of second order, so that its
-    weighted mean over K rest angles follows exactly from five numbers, the rows of a reference: one of the angles and,
-    of the differences ``d`` from it, the weighted means of ``1 - cos d``, ``sin d``, ``1 - cos 2d`` and ``sin 2d``.
+    weighted sum over K rest angles follows exactly from six numbers, the rows of a record: the weight; cosine and sine
+    of the mean angle; and the sums of the phases along the mean, and of those of twice the angles along and across it.
     """
 
-    def merged(self, measures: Tensor, pulls: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def merged(self, measures: Tensor, pulls: Tensor, factor: float | Tensor = 1.0) -> tuple[Tensor, Tensor]:
         """K rest angles by their first two trigonometric moments; arguments as in the base class."""
-        whole = pulls.sum(-2)
-        shares = pulls * inverse(whole, whole <= 0)[..., None, :]
-        # From the heaviest, for the sake of rounding; elementwise, at a tenth of what argmax takes over few long rows.
-        first, heaviest = measures[..., 0, :], pulls[..., 0, :]
-        for own, pull in zip(measures.unbind(-2)[1:], pulls.unbind(-2)[1:], strict=True):
-            first, heaviest = torch.where(pull > heaviest, own, first), torch.maximum(pull, heaviest)
-        means = ((shares * part).sum(-2) for part in _turns(measures - first[..., None, :]))
-        rows = torch.stack([first, *means], -2)
-        return rows, torch.where(whole > 0, whole, 0), torch.zeros_like(whole)
+        c, s = measures.cos(), measures.sin()
+        weight, *sums = ((pulls * part).sum(-2) for part in (torch.ones_like(c), c, s, c * c - s * s, 2 * c * s))
+        some = weight > 0
+        weight, x, y, x2, y2 = (torch.where(some, part, 0) for part in (weight, *sums))
+        squared = x * x + y * y
+        none = squared <= torch.finfo(squared.dtype).tiny
+        size = torch.where(none, 1, squared).sqrt()
+        c, s = torch.where(none, 1, x / size), torch.where(none, 0, y / size)
+        once, c2, s2 = c * x + s * y, c * c - s * s, 2 * c * s
+        along, across = c2 * x2 + s2 * y2, c2 * y2 - s2 * x2
+        record = [factor * weight, c, s, factor * once, factor * along, factor * across]
+        left = factor * (5 / 2 * weight - 8 / 3 * once + 1 / 6 * along)
+        return torch.stack(torch.broadcast_tensors(*record), -2), left
 
-    def energies(self, measures: Tensor, rest: Tensor, weights: Tensor) -> Tensor:
+    def energies(self, measures: Tensor, record: Tensor) -> Tensor:
         """Overrides the square."""
-        angle, a, b, c, d = rest.unbind(-2)
-        v, s, v2, s2 = _turns(measures - angle)
-        first, second = a * (1 - v) - b * s, c * (1 - v2) - d * s2
-        return weights * (v * (2 + v / 3) + 8 / 3 * first - second / 6)
+        _, c, s, once, along, across = record.unbind(-2)
+        v, _, v2, s2 = _turns(measures, c, s)
+        return 8 / 3 * once * v - 1 / 6 * (along * v2 - across * s2)
 
-    def slopes(self, measures: Tensor, rest: Tensor, weights: Tensor) -> Tensor:
+    def slopes(self, measures: Tensor, record: Tensor) -> Tensor:
         """First derivative of :meth:`energies` in the measures. *Shape:* ``(..., M)``."""
-        angle, a, b, c, d = rest.unbind(-2)
-        v, s, v2, s2 = _turns(measures - angle)
-        first, second = a * s + b * (1 - v), c * s2 + d * (1 - v2)
-        return weights * (s * (2 + 2 / 3 * v) - 8 / 3 * first + second / 3)
+        _, c, s, once, along, across = record.unbind(-2)
+        _, sine, v2, s2 = _turns(measures, c, s)
+        return 8 / 3 * once * sine - 1 / 3 * (along * s2 - across * (1 - v2))
 
-    def curvatures(self, measures: Tensor, rest: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+    def curvatures(self, measures: Tensor, record: Tensor) -> tuple[Tensor, Tensor]:
         """The largest second derivative, which is that of the square, and what the true one lacks of it."""
-        angle, a, b, c, d = rest.unbind(-2)
-        v, s, v2, s2 = _turns(measures - angle)
-        first, second = a * (1 - v) - b * s, c * (1 - v2) - d * s2
-        lacking = weights * (-4 / 3 * v.square() - 8 / 3 * first + 2 / 3 * second)
-        return 2 * weights.expand_as(measures), lacking
+        weight, c, s, once, along, across = record.unbind(-2)
+        v, _, v2, s2 = _turns(measures, c, s)
+        true = 8 / 3 * once * (1 - v) - 2 / 3 * (along * (1 - v2) + across * s2)
+        return 2 * weight.expand_as(measures), true - 2 * weight
+
+    def kernel_functions(self, n: int) -> KernelFunctions | None:
+        """As in the base class; kernels know angles by cosine and sine."""
+        if self.kernel_measure is None or self.total:
+            return None
+        return _of_angle(self._name(), n, self.kernel_measure, self.kernel_gradient)
 
     def on_one_branch(self, measures: Tensor, pulls: Tensor) -> Tensor:
         """Bring angles within half a turn of their weighted mean. *Shape:* ``(..., K, M)`` each."""
@@ -255,18 +352,187 @@ class PeriodicTerm(Term):
 
 def periodic_square(difference: Tensor) -> Tensor:
     """The function of :class:`PeriodicTerm`."""
-    versine = _turns(difference)[0]
+    sine = (0.5 * difference).sin()
+    versine = 2 * sine * sine
     return versine * (2 + versine / 3)
 
 
-def _turns(angle: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """``1 - cos``, without cancellation, and ``sin`` of an angle, and those of twice the angle."""
-    half = 0.5 * angle
-    s, c = half.sin(), half.cos()
-    versine, sine = 2 * s * s, 2 * s * c
+def _turns(angle: Tensor, c: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """``1 - cos``, without cancellation, and ``sin`` of angles from one of this phase; those of twice the angles."""
+    x, y = angle.cos(), angle.sin()
+    off_x, off_y, sine = x - c, y - s, c * y - s * x
+    versine = 0.5 * (off_x * off_x + off_y * off_y)
     return versine, sine, 2 * sine * sine, 2 * sine * (1 - versine)
 
 
 def wrap_angle(angle: Tensor) -> Tensor:
     """Bring an angle into ``[-pi, pi)``, with derivative one."""
     return angle - 2 * math.pi * torch.floor(angle.detach() / (2 * math.pi) + 0.5)
+
+
+# --------------------------------------------------------------------------------------------------------- for kernels
+@cache
+def square() -> Potential:
+    """That of :class:`Term`."""
+    import warp as wp
+
+    real, vec3, row = wp.float64, wp.vec3d, wp.vec2d
+
+    @wp.struct
+    class Square:
+        weight: real
+        value: real
+
+    @wp.func
+    def moments(q: real, pull: real):
+        return pull * vec3(real(1.0), q, q * q)
+
+    @wp.func
+    def merged(m: vec3, factor: real):
+        to = Square()
+        if m[0] > real(0.0):
+            to.weight = factor * m[0]
+            to.value = m[1] / m[0]
+        return to
+
+    @wp.func
+    def energy(q: real, to: Square):
+        return to.weight * (q - to.value) * (q - to.value)
+
+    @wp.func
+    def slope(q: real, to: Square):
+        return real(2.0) * to.weight * (q - to.value)
+
+    @wp.func
+    def rate(q: real, gradient: real):
+        return gradient
+
+    @wp.func
+    def left(m: vec3, factor: real, to: Square):
+        found = real(0.0)
+        if m[0] > real(0.0):
+            found = factor * (m[2] - m[1] * to.value)
+        return found
+
+    @wp.func
+    def packed(to: Square):
+        return row(to.weight, to.value)
+
+    return Potential(Square, real, vec3, moments, merged, energy, slope, rate, left, 2, row, packed)
+
+
+@cache
+def periodic() -> Potential:
+    """That of :class:`PeriodicTerm`, of cosine and sine of the measure."""
+    import warp as wp
+
+    real, vec2 = wp.float64, wp.vec2d
+    vec5, row = (wp.types.vector(length=n, dtype=real) for n in (5, 6))
+    third = wp.constant(real(1 / 3))
+
+    @wp.struct
+    class Periodic:
+        weight: real
+        c: real
+        s: real
+        once: real
+        along: real
+        across: real
+
+    @wp.func
+    def moments(q: vec2, pull: real):
+        return pull * vec5(real(1.0), q[0], q[1], q[0] * q[0] - q[1] * q[1], real(2.0) * q[0] * q[1])
+
+    @wp.func
+    def merged(m: vec5, factor: real):
+        to = Periodic()
+        to.c = real(1.0)
+        if m[0] > real(0.0):
+            squared = m[1] * m[1] + m[2] * m[2]
+            if squared > real(2.2250738585072014e-308):
+                per = real(1.0) / wp.sqrt(squared)
+                to.c = per * m[1]
+                to.s = per * m[2]
+            c2 = to.c * to.c - to.s * to.s
+            s2 = real(2.0) * to.c * to.s
+            to.weight = factor * m[0]
+            to.once = factor * (to.c * m[1] + to.s * m[2])
+            to.along = factor * (c2 * m[3] + s2 * m[4])
+            to.across = factor * (c2 * m[4] - s2 * m[3])
+        return to
+
+    @wp.func
+    def versine(q: vec2, to: Periodic):
+        off = q - vec2(to.c, to.s)
+        return real(0.5) * wp.dot(off, off)
+
+    @wp.func
+    def sine(q: vec2, to: Periodic):
+        return to.c * q[1] - to.s * q[0]
+
+    @wp.func
+    def energy(q: vec2, to: Periodic):
+        v = versine(q, to)
+        s = sine(q, to)
+        twice = to.along * s - to.across * (real(1.0) - v)
+        return third * (real(8.0) * to.once * v - s * twice)
+
+    @wp.func
+    def slope(q: vec2, to: Periodic):
+        s = sine(q, to)
+        s2 = real(2.0) * s * (real(1.0) - versine(q, to))
+        return third * (real(8.0) * to.once * s - to.along * s2 + to.across * (real(1.0) - real(2.0) * s * s))
+
+    @wp.func
+    def rate(q: vec2, gradient: vec2):
+        return q[0] * gradient[1] - q[1] * gradient[0]
+
+    @wp.func
+    def left(m: vec5, factor: real, to: Periodic):
+        return real(2.5) * to.weight - third * (real(8.0) * to.once - real(0.5) * to.along)
+
+    @wp.func
+    def packed(to: Periodic):
+        return row(to.weight, to.c, to.s, to.once, to.along, to.across)
+
+    return Potential(Periodic, vec2, vec5, moments, merged, energy, slope, rate, left, 6, row, packed)
+
+
+@cache
+def _of_measure(name: str, n: int, potential: Potential, measure: Any, gradient: Any) -> KernelFunctions:
+    """Of a measure alone, or with its gradient."""
+    import warp as wp
+
+    if gradient is None:
+
+        @wp.func
+        def linearised(e: wp.types.matrix(shape=(n, 3), dtype=wp.float64)):
+            return measure(e), wp.grad(measure)(e)
+
+    else:
+
+        @wp.func
+        def linearised(e: wp.types.matrix(shape=(n, 3), dtype=wp.float64)):
+            return measure(e), gradient(e)
+
+    return KernelFunctions(name, n, potential, measure, linearised, gradient is not None)
+
+
+@cache
+def _of_angle(name: str, n: int, measure: Any, gradient: Any) -> KernelFunctions:
+    """Of an angle, by its cosine and sine."""
+    import warp as wp
+
+    whole = _of_measure(name, n, periodic(), measure, gradient).linearised
+
+    @wp.func
+    def phase(e: wp.types.matrix(shape=(n, 3), dtype=wp.float64)):
+        angle = measure(e)
+        return wp.vec2d(wp.cos(angle), wp.sin(angle))
+
+    @wp.func
+    def linearised(e: wp.types.matrix(shape=(n, 3), dtype=wp.float64)):
+        angle, found = whole(e)
+        return wp.vec2d(wp.cos(angle), wp.sin(angle)), found
+
+    return KernelFunctions(name, n, periodic(), phase, linearised, gradient is not None)

@@ -1,5 +1,8 @@
 """The enclosed volume, the third term of Eq. 5."""
 
+from functools import cache
+from types import SimpleNamespace
+
 import torch
 from torch import Tensor
 
@@ -22,11 +25,8 @@ class Volume(Term):
     total = True
 
     def elements(self, mesh: Mesh) -> Tensor:
-        """The centre and each face, of a surface that cones from its boundary to the centre have closed."""
-        chain = torch.tensor(mesh.connectivity.boundary_chain)
-        centre = torch.full_like(chain[:, :1], mesh.centre)
-        closed = torch.cat([mesh.faces, torch.cat([chain.flip(1), centre], 1)])
-        return torch.cat([torch.full_like(closed[:, :1], mesh.centre), closed], 1)
+        """The centre and each face."""
+        return torch.cat([torch.full_like(mesh.faces[:, :1], mesh.centre), mesh.faces], 1)
 
     def measure(self, edge_vectors: Tensor) -> Tensor:
         """Signed volume of a tetrahedron."""
@@ -65,3 +65,110 @@ def encloses(x: Tensor, mesh: Connectivity) -> bool:
     area = double_areas(points, mesh.faces).sum() / 2
     volume = signed_volume(points - points[mesh.used].mean(0), mesh.faces)
     return bool(abs(volume) > MIN_RELATIVE_VOLUME * area**1.5)
+
+
+@cache
+def kernels() -> SimpleNamespace:
+    """Volumes as above, with their gradients, and the adjoint."""
+    import warp as wp
+
+    from torch_modal.elastic.kernels.elements import length_of, place
+
+    real, vec3, module = wp.float64, wp.vec3d, wp.get_module("torch_modal.elastic.kernels.volume")
+    half, sixth = wp.constant(real(0.5)), wp.constant(real(1 / 6))
+
+    @wp.func
+    def middle_of(x: wp.array(dtype=vec3), v: int, centre: wp.array(dtype=vec3), s: int, first: int):
+        """The centre; any vertex where the surface is closed."""
+        found = x[place(v, first)]
+        if centre:
+            found = centre[s]
+        return found
+
+    @wp.kernel(module=module, enable_backward=False)
+    def sizes(
+        faces: wp.array(dtype=wp.vec3i),
+        n_vertices: int,
+        x: wp.array(dtype=vec3),
+        centre: wp.array(dtype=vec3),
+        volume: wp.array(dtype=real),
+        area: wp.array(dtype=real),
+        normal: wp.array(dtype=vec3),
+        threads: int,
+    ):
+        """The volume; the area, and the gradient of the volume with a fixed centre, where there are arrays for them."""
+        i = wp.tid()
+        s = i // threads
+        v = s * n_vertices
+        middle = middle_of(x, v, centre, s, faces[0][0])
+        inside = real(0.0)
+        surface = real(0.0)
+        for k in range(i - s * threads, faces.shape[0], threads):
+            face = faces[place(k, 0)]
+            p = x[place(v, face[0])] - middle
+            q = x[place(v, face[1])] - middle
+            r = x[place(v, face[2])] - middle
+            to_p = sixth * wp.cross(q, r)
+            inside += wp.dot(p, to_p)
+            if area:
+                surface += half * length_of(wp.cross(q - p, r - p))
+            if normal:
+                wp.atomic_add(normal, place(v, face[0]), to_p)
+                wp.atomic_add(normal, place(v, face[1]), sixth * wp.cross(r, p))
+                wp.atomic_add(normal, place(v, face[2]), sixth * wp.cross(p, q))
+        wp.atomic_add(volume, s, inside)
+        if area:
+            wp.atomic_add(area, s, surface)
+
+    @wp.func
+    def area_of(p: vec3, q: vec3, r: vec3, factor: real):
+        return half * factor * length_of(wp.cross(q - p, r - p))
+
+    @wp.kernel(module=module)
+    def sizes_back(
+        faces: wp.array(dtype=wp.vec3i),
+        n_vertices: int,
+        x: wp.array(dtype=vec3),
+        centre: wp.array(dtype=vec3),
+        to_volume: wp.array(dtype=real),
+        to_area: wp.array(dtype=real),
+        to_normal: wp.array(dtype=vec3),
+        to_x: wp.array(dtype=vec3),
+        to_centre: wp.array(dtype=vec3),
+        threads: int,
+    ):
+        """Adds the gradients; what the area or the normals receive may be left out."""
+        i = wp.tid()
+        s = i // threads
+        v = s * n_vertices
+        middle = middle_of(x, v, centre, s, faces[0][0])
+        inside = to_volume[s]
+        to_p = vec3()
+        to_q = vec3()
+        to_r = vec3()
+        received = vec3()
+        for k in range(i - s * threads, faces.shape[0], threads):
+            face = faces[place(k, 0)]
+            if to_normal:
+                to_p = to_normal[place(v, face[0])]
+                to_q = to_normal[place(v, face[1])]
+                to_r = to_normal[place(v, face[2])]
+            p = x[place(v, face[0])] - middle
+            q = x[place(v, face[1])] - middle
+            r = x[place(v, face[2])] - middle
+            of_p = sixth * (inside * wp.cross(q, r) + wp.cross(to_q, r) + wp.cross(q, to_r))
+            of_q = sixth * (inside * wp.cross(r, p) + wp.cross(to_r, p) + wp.cross(r, to_p))
+            of_r = sixth * (inside * wp.cross(p, q) + wp.cross(to_p, q) + wp.cross(p, to_q))
+            if to_area:
+                more_p, more_q, more_r, _0 = wp.grad(area_of)(p, q, r, to_area[s])
+                of_p += more_p
+                of_q += more_q
+                of_r += more_r
+            wp.atomic_add(to_x, place(v, face[0]), of_p)
+            wp.atomic_add(to_x, place(v, face[1]), of_q)
+            wp.atomic_add(to_x, place(v, face[2]), of_r)
+            received += of_p + of_q + of_r
+        if to_centre:
+            wp.atomic_add(to_centre, s, -received)
+
+    return SimpleNamespace(module=module, sizes=sizes, sizes_back=sizes_back)

@@ -79,7 +79,7 @@ class FreeVertices(nn.Module):
 
     @staticmethod
     def _ridge(placement: Placement) -> Tensor:
-        return RIDGE * placement[1].weights[0].mean(-1, keepdim=True).clamp_min(1)
+        return RIDGE * placement[1].records[0][..., 0, :].mean(-1, keepdim=True).clamp_min(1)
 
     # ------------------------------------------------------------------------------------------------ Newton's method
     @lasting

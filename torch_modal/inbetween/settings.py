@@ -6,8 +6,8 @@ from typing import Literal, NamedTuple
 
 from torch import Tensor
 
+from torch_modal.elastic.backend import names
 from torch_modal.elastic.bend import Bend, SquaredBend
-from torch_modal.elastic.choice import names
 from torch_modal.elastic.shell import ALPHA, BETA, GAMMA
 from torch_modal.elastic.stretch import Stretch
 from torch_modal.elastic.term import Term

@@ -8,8 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from torch_modal.autograd import plain
-from torch_modal.elastic.backend import TorchBackend
-from torch_modal.elastic.choice import choose
+from torch_modal.elastic.backend import TorchBackend, choose
 from torch_modal.elastic.energy import Energy, RestShapes
 from torch_modal.elastic.implicit import solve_implicit, solve_unrolled
 from torch_modal.elastic.minimise import Solution, Status

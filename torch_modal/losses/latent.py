@@ -118,7 +118,7 @@ class LatentElasticity(nn.Module):
         at = energy.linearise(self.shell._rows(scale * x), reference)
         each = [energy.rates(at, self.shell._rows(scale * field)) for field in along]
         gram = x.new_zeros(len(x), len(along), len(along))
-        for weights, *rates in zip(reference.weights, *each, strict=True):
-            scaled = torch.stack(rates, 1) * weights.sqrt()[:, None]  # (B, k, M)
+        for record, *rates in zip(reference.records, *each, strict=True):
+            scaled = torch.stack(rates, 1) * record[:, :1].sqrt()  # (B, k, M)
             gram = gram + scaled @ scaled.mT
         return gram

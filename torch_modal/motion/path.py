@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch_modal.autograd import broadcast_shapes, full_precision, lasting, require_numbers, untraced
 from torch_modal.contact.active import refuse_transforms
 from torch_modal.contact.in_between import push_apart
-from torch_modal.elastic.choice import choose
+from torch_modal.elastic.backend import choose
 from torch_modal.elastic.energy import RestShapes
 from torch_modal.elastic.minimise import Solution
 from torch_modal.elastic.shell import ALPHA, BETA

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torch_modal.elastic.choice import choose
+from torch_modal.elastic.backend import choose
 from torch_modal.errors import MeshWarning
 from torch_modal.geometry.connectivity import Connectivity, vertex_areas
 from torch_modal.geometry.crossings import Crossings, require_contact

@@ -10,10 +10,10 @@ from torch import Tensor
 from torch.nn.functional import one_hot
 
 from torch_modal import trees
+from torch_modal.elastic.backend import choose
 from torch_modal.elastic.bend import Bend
-from torch_modal.elastic.choice import choose
 from torch_modal.elastic.shell import ALPHA, BETA, GAMMA
-from torch_modal.elastic.steps import FurtherEnergy
+from torch_modal.elastic.steps import FreeEnergy
 from torch_modal.elastic.stretch import Stretch
 from torch_modal.elastic.term import Mesh
 from torch_modal.elastic.volume import Volume, encloses
@@ -100,7 +100,7 @@ class Variation:
 
     @torch.no_grad()
     def relaxed(
-        self, x: Tensor, weights: Tensor, n_steps: int, n_products: int, pulls: FurtherEnergy | None = None
+        self, x: Tensor, weights: Tensor, n_steps: int, n_products: int, pulls: FreeEnergy | None = None
     ) -> Tensor:
         """Newton steps of all vertices towards weighted means of the lengths and angles of the given shapes.
 

@@ -1,39 +1,33 @@
-"""Types and functions of one edge, hinge or face, shared by all kernels."""
+"""Kernels of a term, made from its functions of one element.
+
+Arrays are flat: entry ``s * n + i`` is the i-th of the n vertices or elements of sample ``s``. A thread takes all
+elements of a sample on a CPU, where what is the same for all of them is then worked out once, and every so many-th on a
+GPU; what elements sum up, a thread adds once (:func:`torch_modal.elastic.kernels.launch.launch`).
+
+Derivatives of the functions come from ``wp.grad``. In a kernel without ``enable_backward`` it would lose those of
+functions that call others, in silence: the kernels of :func:`backward` have it, though nothing differentiates them.
+"""
+
+from functools import cache
+from types import SimpleNamespace
 
 import warp as wp
 
-from torch_modal.elastic.bend import COLLAPSED
+from torch_modal.elastic.bend import LEAST_FULLNESS
+from torch_modal.elastic.term import KernelFunctions
 
 real = wp.float64
 vec3 = wp.vec3d
 vec4 = wp.vec4d
 symmetric = wp.types.vector(length=6, dtype=real)
 """Entries ``xx, xy, xz, yy, yz, zz`` of a symmetric matrix."""
-moments = wp.types.vector(length=5, dtype=real)
-"""Sums over rest angles: doubled weight, then that times ``cos``, ``sin``, and ``cos``, ``sin`` of twice the angle."""
-rested = wp.types.vector(length=7, dtype=real)
-"""What an edge and its hinge are compared with: doubled weight and length of the edge, then the moments."""
-linearised = wp.types.vector(length=15, dtype=real)
-"""Factors of an edge and its hinge in the convex Hessian: unit vector, stiffness across and how much more along it;
-gradients of the angle in the edge and in both tips, and the stiffness."""
+wide = wp.types.vector(length=8, dtype=real)
+"""A row's entries of eight columns."""
 
 TINY = wp.constant(real(1.4916681462400413e-154))  # vectors.tiny of float64
 TINIEST = wp.constant(real(2.2250738585072014e-308))
-FLAT = wp.constant(real(COLLAPSED))
 HALF = wp.constant(real(0.5))
-SIXTH = wp.constant(real(1 / 6))
 LARGEST = wp.constant(0x7FFFFFFF)
-
-
-@wp.struct
-class Elements:
-    record: wp.array(dtype=wp.vec4i)
-    """Vertices of each edge and of its hinge, whose tips are -1 where it has none."""
-    hinge: wp.array(dtype=wp.int32)
-    """Number of the hinge of each edge."""
-    capped_faces: wp.array(dtype=wp.vec3i)
-    """Faces, and cones from the boundary to the centre, a vertex of -1."""
-    n_vertices: int
 
 
 @wp.func
@@ -48,8 +42,12 @@ def length_of(e: vec3):
 
 
 @wp.func
-def squared(g: vec3):
-    return symmetric(g[0] * g[0], g[0] * g[1], g[0] * g[2], g[1] * g[1], g[1] * g[2], g[2] * g[2])
+def block(along: real, g: vec3, across: real):
+    """``along * g gᵀ + across`` times the identity."""
+    h = along * g
+    return symmetric(
+        h[0] * g[0] + across, h[0] * g[1], h[0] * g[2], h[1] * g[1] + across, h[1] * g[2], h[2] * g[2] + across
+    )
 
 
 @wp.func
@@ -61,138 +59,679 @@ def applied(m: symmetric, g: vec3):
     )
 
 
-# ------------------------------------------------------------------------------------------------------------- hinges
-@wp.struct
-class Hinge:
-    e: vec3
-    a: vec3
-    b: vec3
-    n1: vec3
-    n2: vec3
-    length: real
-    """Length of the edge."""
-    per_both: real
-    """One over the lengths of both normals."""
-    per1: real
-    """One over the square of a normal."""
-    per2: real
-    flat: bool
-
-
 @wp.func
-def hinge_of(x: wp.array(dtype=vec3), at: int, q: wp.vec4i):
-    """The edge, the vectors to both tips, and the normals of the hinge of a record."""
-    h = Hinge()
-    origin = x[place(at, q[0])]
-    h.e = x[place(at, q[1])] - origin
-    h.a = x[place(at, q[2])] - origin
-    h.b = x[place(at, q[3])] - origin
-    h.n1 = wp.cross(h.e, h.a)
-    h.n2 = wp.cross(h.b, h.e)
-    h.length = length_of(h.e)
-    square1 = wp.dot(h.n1, h.n1)
-    square2 = wp.dot(h.n2, h.n2)
-    h.per_both = real(1.0) / wp.sqrt(wp.max(square1 * square2, TINIEST))
-    h.per1 = h.per_both * h.per_both * square2
-    h.per2 = h.per_both * h.per_both * square1
-    bound = FLAT * wp.dot(h.e, h.e)
-    h.flat = wp.min(square1, square2) <= bound * bound + TINY
-    return h
+def from_square(d: symmetric, g: vec3):
+    """Gradient in a vector of the entries of its square."""
+    two = real(2.0)
+    return vec3(
+        two * d[0] * g[0] + d[1] * g[1] + d[2] * g[2],
+        d[1] * g[0] + two * d[3] * g[1] + d[4] * g[2],
+        d[2] * g[0] + d[4] * g[1] + two * d[5] * g[2],
+    )
 
 
-@wp.func
-def phase_of(h: Hinge):
-    """Cosine and sine of the dihedral angle of a hinge that is not flat."""
-    return h.per_both * wp.vec2d(wp.dot(h.n1, h.n2), -h.length * wp.dot(h.n1, h.b))
+@cache
+def _common(f: KernelFunctions) -> SimpleNamespace:
+    """Types and functions of elements of as many vertices."""
+    n = f.n
+    vectors, corners = wp.types.matrix(shape=(n, 3), dtype=real), wp.types.vector(length=n + 1, dtype=wp.int32)
+
+    @wp.func
+    def edge_vectors(x: wp.array(dtype=vec3), at: int, q: corners):
+        origin = x[place(at, q[0])]
+        found = vectors()
+        for j in range(wp.static(n)):
+            found[j] = x[place(at, q[j + 1])] - origin
+        return found
+
+    @wp.func
+    def add(out: wp.array(dtype=vec3), at: int, q: corners, received: vectors):
+        whole = vec3()
+        for c in range(wp.static(n)):
+            wp.atomic_add(out, place(at, q[c + 1]), received[c])
+            whole += received[c]
+        wp.atomic_add(out, place(at, q[0]), -whole)
+
+    @wp.func
+    def inner(a: vectors, b: vectors):
+        """By rows: several times as fast as ``wp.ddot``."""
+        found = wp.dot(a[0], b[0])
+        for j in range(1, wp.static(n)):
+            found += wp.dot(a[j], b[j])
+        return found
+
+    kind = f.potential.kind
+    if f.across is None:
+
+        @wp.struct
+        class Factors:
+            """Of products with the convex Hessian."""
+
+            gradient: vectors
+            along: real
+
+        @wp.func
+        def stiffness(q: kind, slope: real, along: real):
+            return along, real(0.0)
+
+        @wp.func
+        def factors(gradient: vectors, along: real, across: real):
+            h = Factors()
+            h.gradient = gradient
+            h.along = along
+            return h
+
+        @wp.func
+        def product(h: Factors, e: vectors):
+            """What an element gives, and the product of that with its change."""
+            rate = inner(h.gradient, e)
+            push = h.along * rate
+            return push * h.gradient, push * rate
+
+    else:
+
+        @wp.struct
+        class Factors:
+            gradient: vectors
+            along: real
+            across: real
+
+        @wp.func
+        def stiffness(q: kind, slope: real, along: real):
+            across = f.across(q, slope, along)
+            return along - across, across
+
+        @wp.func
+        def factors(gradient: vectors, along: real, across: real):
+            h = Factors()
+            h.gradient = gradient
+            h.along = along
+            h.across = across
+            return h
+
+        @wp.func
+        def product(h: Factors, e: vectors):
+            rate = inner(h.gradient, e)
+            push = h.along * rate
+            return push * h.gradient + h.across * e, push * rate + h.across * inner(e, e)
+
+    if f.weight is None:
+        return SimpleNamespace(**locals())
+    least, fullness, potential = wp.constant(real(LEAST_FULLNESS)), f.fullness, f.potential
+
+    @wp.func
+    def contribution(e: vectors, pull: real, mean: real):
+        m = f.measure(e)
+        return potential.moments(m, pull * f.weight(e, m, mean))
+
+    if fullness is None:
+
+        @wp.func
+        def fullness(e: vectors, altitude: real):
+            return real(1.0)
+
+    @wp.func
+    def softness(own: real, usual: real, relative: int):
+        """bend.Bend.softening."""
+        found = own
+        if relative > 0:
+            part = wp.min(own / wp.max(usual, least), real(1.0))
+            found = part * part * (real(3.0) - real(2.0) * part)
+        return found
+
+    return SimpleNamespace(**locals())
 
 
-@wp.func
-def doubled(p: wp.vec2d):
-    """Cosine and sine of twice the angle."""
-    return wp.vec2d(p[0] * p[0] - p[1] * p[1], real(2.0) * p[0] * p[1])
+def _module(f: KernelFunctions, part: str) -> "wp.Module":
+    """A module of the kernels of a term, which Warp compiles as a whole."""
+    return wp.get_module(f"{__name__}.{f.name}.{part}")
 
 
-@wp.func
-def angle_gradients(h: Hinge):
-    """Gradients of the dihedral angle in the edge and in both tips, of a hinge that is not flat."""
-    ga = (-h.length * h.per1) * h.n1
-    gb = (-h.length * h.per2) * h.n2
-    per = real(1.0) / h.length
-    ge = (-per * per) * (wp.dot(h.a, h.e) * ga + wp.dot(h.b, h.e) * gb)
-    return ge, ga, gb
+@cache
+def _rider(f: KernelFunctions | None) -> SimpleNamespace:
+    """Functions of a term of edges that rides on one of larger elements, on their first edge vectors; or of none."""
+    if f is None:
+
+        @wp.func
+        def energy(e: vec3, rests: wp.array(dtype=real), at: int):
+            return real(0.0)
+
+        @wp.func
+        def linearised(e: vec3, rests: wp.array(dtype=real), at: int, factors: wp.array(dtype=real), to: int):
+            return real(0.0), vec3(), symmetric()
+
+        @wp.func
+        def product(factors: wp.array(dtype=real), at: int, e: vec3):
+            return vec3(), real(0.0)
+
+        return SimpleNamespace(record=real, Factors=real, energy=energy, linearised=linearised, product=product)
+    c, potential = _common(f), f.potential
+    record, Factors = potential.record, c.Factors
+
+    @wp.func
+    def energy(e: vec3, rests: wp.array(dtype=record), at: int):
+        return potential.energy(f.measure(wp.matrix_from_rows(e)), rests[at])
+
+    @wp.func
+    def linearised(e: vec3, rests: wp.array(dtype=record), at: int, factors: wp.array(dtype=Factors), to: int):
+        m, g = f.linearised(wp.matrix_from_rows(e))
+        own = rests[at]
+        slope = potential.slope(m, own)
+        square = symmetric()
+        if factors:
+            along, across = c.stiffness(m, slope, real(2.0) * own.weight)
+            factors[to] = c.factors(g, along, across)
+            square = block(along, g[0], across)
+        return potential.energy(m, own), slope * g[0], square
+
+    @wp.func
+    def product(factors: wp.array(dtype=Factors), at: int, e: vec3):
+        received, form = c.product(factors[at], wp.matrix_from_rows(e))
+        return received[0], form
+
+    return SimpleNamespace(record=record, Factors=Factors, energy=energy, linearised=linearised, product=product)
 
 
-# The function of torch_modal.elastic.term.PeriodicTerm is 5/2 - 8/3 cos d + 1/6 cos 2d.
-ALL = wp.constant(real(5 / 2))
-ONCE = wp.constant(real(8 / 3))
-FOUR_THIRDS = wp.constant(real(4 / 3))
-THIRD = wp.constant(real(1 / 3))
+@cache
+def convex(f: KernelFunctions, rider: KernelFunctions | None) -> SimpleNamespace:
+    """Value, gradient and convex Hessian of a term, and of another that rides on its elements.
+
+    Where both read and write the same vertices, one pass takes two thirds of the time of two. The elements are then
+    those of the rider; ``own`` has the number of the term's element, or -1 where there is none.
+    """
+    c, potential, module, n = _common(f), f.potential, _module(f, "convex"), f.n
+    corners, edge_vectors, add, Factors, record = c.corners, c.edge_vectors, c.add, c.Factors, potential.record
+    factors_of, stiffness, product_of, other = c.factors, c.stiffness, c.product, _rider(rider)
+    kernel = wp.kernel(enable_backward=False, module=module)
+
+    @kernel
+    def linearise(
+        elements: wp.array(dtype=corners),
+        own: wp.array(dtype=wp.int32),
+        n_own: int,
+        n_vertices: int,
+        x: wp.array(dtype=vec3),
+        rests: wp.array(dtype=record),
+        others: wp.array(dtype=other.record),
+        n_references: int,
+        total: wp.array(dtype=real),
+        gradient: wp.array(dtype=vec3),
+        diagonal: wp.array(dtype=symmetric),
+        factors: wp.array(dtype=Factors),
+        other_factors: wp.array(dtype=other.Factors),
+        threads: int,
+    ):
+        """Energy, gradient, and blocks and factors of the convex Hessian; those without arrays are left out.
+
+        References come round where there are fewer than shapes.
+        """
+        i = wp.tid()
+        s = i // threads
+        v = s * n_vertices
+        r = s % n_references
+        found = real(0.0)
+        for k in range(i - s * threads, elements.shape[0], threads):
+            q = elements[place(k, 0)]
+            at = k
+            if own:
+                at = own[place(k, 0)]
+            e = edge_vectors(x, v, q)
+            if gradient:
+                energy, ridden, square = other.linearised(
+                    e[0], others, place(r * elements.shape[0], k), other_factors, place(s * elements.shape[0], k)
+                )
+                found += energy
+                if at >= 0:
+                    m, g = f.linearised(e)
+                    to = rests[place(r * n_own, at)]
+                    found += potential.energy(m, to)
+                    slope = potential.slope(m, to)
+                    received = slope * g
+                    received[0] = received[0] + ridden
+                    add(gradient, v, q, received)
+                    if diagonal:
+                        along, across = stiffness(m, slope, real(2.0) * to.weight)
+                        whole = g[0]
+                        wp.atomic_add(diagonal, place(v, q[1]), square + block(along, g[0], across))
+                        for j in range(1, wp.static(n)):
+                            whole += g[j]
+                            wp.atomic_add(diagonal, place(v, q[j + 1]), block(along, g[j], across))
+                        wp.atomic_add(diagonal, place(v, q[0]), square + block(along, whole, across))
+                        factors[place(s * n_own, at)] = factors_of(g, along, across)
+                else:
+                    wp.atomic_add(gradient, place(v, q[1]), ridden)
+                    wp.atomic_add(gradient, place(v, q[0]), -ridden)
+                    if diagonal:
+                        wp.atomic_add(diagonal, place(v, q[1]), square)
+                        wp.atomic_add(diagonal, place(v, q[0]), square)
+            else:
+                found += other.energy(e[0], others, place(r * elements.shape[0], k))
+                if at >= 0:
+                    found += potential.energy(f.measure(e), rests[place(r * n_own, at)])
+        wp.atomic_add(total, s, found)
+
+    @kernel
+    def product(
+        elements: wp.array(dtype=corners),
+        own: wp.array(dtype=wp.int32),
+        n_own: int,
+        n_vertices: int,
+        fields: wp.array(dtype=vec3),
+        start: int,
+        factors: wp.array(dtype=Factors),
+        other_factors: wp.array(dtype=other.Factors),
+        out: wp.array(dtype=vec3),
+        out_start: int,
+        scalars: wp.array(dtype=vec3),
+        first: int,
+        threads: int,
+    ):
+        """The convex Hessian times a field, and the field times that, the third of the scalars, where there are some.
+
+        Fields, results and scalars begin at the given places of their arrays.
+        """
+        i = wp.tid()
+        s = i // threads
+        total = real(0.0)
+        for k in range(i - s * threads, elements.shape[0], threads):
+            q = elements[place(k, 0)]
+            at = k
+            if own:
+                at = own[place(k, 0)]
+            e = edge_vectors(fields, start + s * n_vertices, q)
+            ridden, form = other.product(other_factors, place(s * elements.shape[0], k), e[0])
+            total += form
+            if at >= 0:
+                received, own_form = product_of(factors[place(s * n_own, at)], e)
+                total += own_form
+                received[0] = received[0] + ridden
+                add(out, out_start + s * n_vertices, q, received)
+            else:
+                wp.atomic_add(out, place(out_start + s * n_vertices, q[1]), ridden)
+                wp.atomic_add(out, place(out_start + s * n_vertices, q[0]), -ridden)
+        if scalars:
+            wp.atomic_add(scalars, first + s, vec3(real(0.0), real(0.0), total))
+
+    return SimpleNamespace(module=module, linearise=linearise, product=product)
 
 
-@wp.struct
-class Turn:
-    """From the mean phase of the rest shapes: there, differences of sums as large as the weight would be rounding."""
+@cache
+def forward(f: KernelFunctions) -> SimpleNamespace:
+    """Merged rest shapes, and the Jacobian along columns of a space."""
+    c, potential, module, n = _common(f), f.potential, _module(f, "forward"), f.n
+    corners, edge_vectors, record = c.corners, c.edge_vectors, potential.record
+    kernel = wp.kernel(enable_backward=False, module=module)
 
-    d: wp.vec2d
-    """``1 - cos`` and ``sin`` of the angle."""
-    e: wp.vec2d
-    """The same of twice the angle."""
-    once: real
-    """Weighted sum of the phases, along the mean."""
-    twice: wp.vec2d
-    """That of the phases of twice the angle, along and across."""
+    @kernel
+    def jacobian(
+        elements: wp.array(dtype=corners),
+        n_vertices: int,
+        x: wp.array(dtype=vec3),
+        rests: wp.array(dtype=record),
+        columns: wp.array(dtype=wide),
+        n_columns: int,
+        n_blocks: int,
+        first_row: int,
+        n_rows: int,
+        out: wp.array(dtype=wide),
+        entries: wp.array(dtype=real),
+        totals: wp.array(dtype=wp.vec2d),
+        threads: int,
+    ):
+        """Change of each measure along the columns, and the measure's residual; all stiffnesses and energies together.
+
+        All by the root of twice the weight. The residual comes in the column after the last. A component of a vertex
+        has a row of blocks of eight columns; those of the measures are the same memory twice.
+        """
+        i = wp.tid()
+        s = i // threads
+        total = real(0.0)
+        energy = real(0.0)
+        for k in range(i - s * threads, elements.shape[0], threads):
+            q = elements[place(k, 0)]
+            to = rests[place(s * elements.shape[0], k)]
+            row = s * n_rows + first_row + k
+            m, g = f.linearised(edge_vectors(x, s * n_vertices, q))
+            root = wp.sqrt(real(2.0) * to.weight)
+            g = root * g
+            for b in range(n_blocks):
+                found = wide()
+                first = vec3()
+                for j in range(wp.static(n)):
+                    at = place(3 * n_blocks * q[j + 1], b)
+                    found += g[j, 0] * columns[at]
+                    found += g[j, 1] * columns[place(at, n_blocks)]
+                    found += g[j, 2] * columns[place(at, 2 * n_blocks)]
+                    first += g[j]
+                at = place(3 * n_blocks * q[0], b)
+                found -= first[0] * columns[at]
+                found -= first[1] * columns[place(at, n_blocks)]
+                found -= first[2] * columns[place(at, 2 * n_blocks)]
+                out[place(row * n_blocks, b)] = found
+            residual = real(0.0)
+            if root > real(0.0):
+                residual = potential.slope(m, to) / root
+            entries[place(row * n_blocks * 8, n_columns)] = residual
+            total += root * root
+            energy += potential.energy(m, to)
+        wp.atomic_add(totals, s, wp.vec2d(total, energy))
+
+    merge = _merging(f, module) if f.weight is not None else {}
+    return SimpleNamespace(module=module, jacobian=jacobian, **merge)
 
 
-@wp.func
-def turn_to(p: wp.vec2d, w: rested):
-    per_size = real(1.0) / wp.sqrt(wp.max(w[3] * w[3] + w[4] * w[4], TINIEST))
-    c = w[3] * per_size
-    s = w[4] * per_size
-    off = p - wp.vec2d(c, s)
-    mean = doubled(wp.vec2d(c, s))
-    turn = Turn()
-    turn.d = wp.vec2d(HALF * wp.dot(off, off), c * p[1] - s * p[0])
-    turn.e = real(2.0) * turn.d[1] * wp.vec2d(turn.d[1], real(1.0) - turn.d[0])
-    turn.once = c * w[3] + s * w[4]
-    turn.twice = wp.vec2d(mean[0] * w[5] + mean[1] * w[6], mean[0] * w[6] - mean[1] * w[5])
-    return turn
+def _merging(f: KernelFunctions, module: "wp.Module") -> dict[str, "wp.Kernel"]:
+    """Kernels that merge the rest shapes of a term into records (Eq. 8), where it has weights for them."""
+    c, potential = _common(f), f.potential
+    corners, edge_vectors, record, sums = c.corners, c.edge_vectors, potential.record, potential.sums
+    kernel = wp.kernel(enable_backward=False, module=module)
+    fullness, softness, contribution = c.fullness, c.softness, c.contribution
+
+    @kernel
+    def merge(
+        elements: wp.array(dtype=corners),
+        n_vertices: int,
+        x: wp.array(dtype=vec3),
+        pulls: wp.array(dtype=real),
+        means: wp.array(dtype=real),
+        stiffness: wp.array(dtype=real),
+        start: wp.array(dtype=vec3),
+        altitude: real,
+        relative: int,
+        n_shapes: int,
+        n_stiffness: int,
+        out: wp.array(dtype=record),
+        constant: wp.array(dtype=real),
+        threads: int,
+    ):
+        """K rest shapes of each sample as one, softened at the needles of a start, and the energy that remains."""
+        i = wp.tid()
+        s = i // threads
+        left = real(0.0)
+        for k in range(i - s * threads, elements.shape[0], threads):
+            q = elements[place(k, 0)]
+            found = sums()
+            usual = real(0.0)
+            for r in range(s * n_shapes, (s + 1) * n_shapes):
+                e = edge_vectors(x, r * n_vertices, q)
+                found += contribution(e, pulls[r], means[r])
+                if relative > 0:
+                    usual += pulls[r] * fullness(e, altitude)
+            factor = stiffness[place(s * n_stiffness, wp.min(k, n_stiffness - 1))]
+            if start:
+                factor *= softness(fullness(edge_vectors(start, s * n_vertices, q), altitude), usual, relative)
+            to = potential.merged(found, factor)
+            left += potential.left(found, factor, to)
+            out[place(s * elements.shape[0], k)] = to
+        wp.atomic_add(constant, s, left)
+
+    if not f.uses_mean:
+        return {"merge": merge}
+
+    @kernel
+    def total(
+        elements: wp.array(dtype=corners),
+        n_vertices: int,
+        x: wp.array(dtype=vec3),
+        out: wp.array(dtype=real),
+        threads: int,
+    ):
+        """All measures together."""
+        i = wp.tid()
+        s = i // threads
+        found = real(0.0)
+        for k in range(i - s * threads, elements.shape[0], threads):
+            found += f.measure(edge_vectors(x, s * n_vertices, elements[place(k, 0)]))
+        wp.atomic_add(out, s, found)
+
+    return {"merge": merge, "total": total}
 
 
-@wp.func
-def bend_energy(p: wp.vec2d, w: rested):
-    """Twice the energy of a hinge."""
-    t = turn_to(p, w)
-    least = ALL * w[2] - ONCE * t.once + SIXTH * t.twice[0]
-    return least + ONCE * t.once * t.d[0] - SIXTH * (t.twice[0] * t.e[0] - t.twice[1] * t.e[1])
+def _merging_back(f: KernelFunctions, module: "wp.Module") -> "wp.Kernel":
+    """The adjoint of ``merge``."""
+    c, potential = _common(f), f.potential
+    corners, edge_vectors, add, sums = c.corners, c.edge_vectors, c.add, potential.sums
+    fullness, softness, contribution = c.fullness, c.softness, c.contribution
+    packed, row = potential.packed, potential.row
+
+    @wp.func
+    def of_record(m: sums, factor: real, received: row):
+        return wp.dot(packed(potential.merged(m, factor)), received)
+
+    @wp.func
+    def of_measure(m: potential.kind, pull: real, received: sums):
+        return wp.dot(potential.moments(m, pull), received)
+
+    @wp.func
+    def of_weight(e: c.vectors, m: potential.kind, mean: real, received: real):
+        return f.weight(e, m, mean) * received
+
+    @wp.kernel(module=module)
+    def merge(
+        elements: wp.array(dtype=corners),
+        n_vertices: int,
+        x: wp.array(dtype=vec3),
+        pulls: wp.array(dtype=real),
+        means: wp.array(dtype=real),
+        stiffness: wp.array(dtype=real),
+        start: wp.array(dtype=vec3),
+        altitude: real,
+        relative: int,
+        n_shapes: int,
+        n_stiffness: int,
+        to_out: wp.array(dtype=row),
+        to_x: wp.array(dtype=vec3),
+        to_pulls: wp.array(dtype=real),
+        to_stiffness: wp.array(dtype=real),
+        to_start: wp.array(dtype=vec3),
+        threads: int,
+    ):
+        """Adds the gradients; the means, and the energy that remains, have none."""
+        i = wp.tid()
+        s = i // threads
+        for k in range(i - s * threads, elements.shape[0], threads):
+            q = elements[place(k, 0)]
+            found = sums()
+            usual = real(0.0)
+            for r in range(s * n_shapes, (s + 1) * n_shapes):
+                e = edge_vectors(x, r * n_vertices, q)
+                found += contribution(e, pulls[r], means[r])
+                if relative > 0:
+                    usual += pulls[r] * fullness(e, altitude)
+            at = place(s * n_stiffness, wp.min(k, n_stiffness - 1))
+            own = real(1.0)
+            soft = real(1.0)
+            if start:
+                own = fullness(edge_vectors(start, s * n_vertices, q), altitude)
+                soft = softness(own, usual, relative)
+            received = to_out[place(s * elements.shape[0], k)]
+            to_sums, to_factor, _0 = wp.grad(of_record)(found, soft * stiffness[at], received)
+            wp.atomic_add(to_stiffness, at, soft * to_factor)
+            to_usual = real(0.0)
+            if start:
+                to_own, to_usual, _1 = wp.grad(softness)(own, usual, relative)
+                to_own *= stiffness[at] * to_factor
+                to_usual *= stiffness[at] * to_factor
+                if to_own != real(0.0):  # few elements are softened
+                    to_start_e, _2 = wp.grad(fullness)(edge_vectors(start, s * n_vertices, q), altitude)
+                    add(to_start, s * n_vertices, q, to_own * to_start_e)
+            for r in range(s * n_shapes, (s + 1) * n_shapes):
+                e = edge_vectors(x, r * n_vertices, q)
+                m, g = f.linearised(e)
+                weight = f.weight(e, m, means[r])
+                to_m, to_weight, _3 = wp.grad(of_measure)(m, pulls[r] * weight, to_sums)
+                to_e, more, _4, _5 = wp.grad(of_weight)(e, m, means[r], pulls[r] * to_weight)
+                to_pull = weight * to_weight
+                if to_usual != real(0.0):
+                    of_full, _6 = wp.grad(fullness)(e, altitude)
+                    to_e += (pulls[r] * to_usual) * of_full
+                    to_pull += to_usual * fullness(e, altitude)
+                add(to_x, r * n_vertices, q, to_e + potential.rate(m, to_m + more) * g)
+                wp.atomic_add(to_pulls, r, to_pull)
+
+    return merge
 
 
-@wp.func
-def bend_slope(p: wp.vec2d, w: rested):
-    """First derivative of the energy in the angle."""
-    t = turn_to(p, w)
-    return FOUR_THIRDS * t.once * t.d[1] - SIXTH * (t.twice[0] * t.e[1] - t.twice[1] * (real(1.0) - t.e[0]))
+@cache
+def backward(f: KernelFunctions) -> SimpleNamespace:
+    """Adjoints, and second derivatives."""
+    c, potential, module, n = _common(f), f.potential, _module(f, "backward"), f.n
+    vectors, corners, edge_vectors, add, inner = c.vectors, c.corners, c.edge_vectors, c.add, c.inner
+    stiffness, record, packed, row = c.stiffness, potential.record, potential.packed, potential.row
+    kind, slope_of = potential.kind, potential.slope
+
+    @wp.func
+    def of_measure(m: kind, to: record, to_energy: real, to_slope: real, to_along: real, to_across: real):
+        """What follows from the measure, times what each of that receives."""
+        slope = potential.slope(m, to)
+        along, across = stiffness(m, slope, real(2.0) * to.weight)
+        return to_energy * potential.energy(m, to) + to_slope * slope + to_along * along + to_across * across
+
+    @wp.func
+    def of_gradient(e: vectors, received: vectors):
+        """The gradient of the measure along a direction: its own gradient is a product with a Hessian."""
+        _m, g = f.linearised(e)
+        return inner(g, received)
+
+    @wp.kernel(module=module)
+    def linearise(
+        elements: wp.array(dtype=corners),
+        n_vertices: int,
+        x: wp.array(dtype=vec3),
+        rests: wp.array(dtype=record),
+        to_total: wp.array(dtype=real),
+        to_gradient: wp.array(dtype=vec3),
+        to_diagonal: wp.array(dtype=symmetric),
+        fields: wp.array(dtype=vec3),
+        pushed: wp.array(dtype=vec3),
+        n_samples: int,
+        n_products: int,
+        to_x: wp.array(dtype=vec3),
+        to_rests: wp.array(dtype=row),
+        threads: int,
+    ):
+        """Adjoint of ``linearise``, from what energy, gradient and blocks receive, and of the products with factors.
+
+        Those are with directions, the second of three kinds of fields, and each is received by a pushed field.
+        """
+        i = wp.tid()
+        s = i // threads
+        v = s * n_vertices
+        for k in range(i - s * threads, elements.shape[0], threads):
+            q = elements[place(k, 0)]
+            at = place(s * elements.shape[0], k)
+            to = rests[at]
+            e = edge_vectors(x, v, q)
+            d = edge_vectors(to_gradient, v, q)
+            m, g = f.linearised(e)
+            slope = potential.slope(m, to)
+            to_g = slope * d
+            to_along = real(0.0)
+            to_across = real(0.0)
+            if to_diagonal:
+                along, _across = stiffness(m, slope, real(2.0) * to.weight)
+                first = vec3()
+                for j in range(wp.static(n)):
+                    first += g[j]
+                own = to_diagonal[place(v, q[0])]
+                of_first = from_square(own, first)
+                to_along += HALF * wp.dot(of_first, first)
+                to_across += own[0] + own[3] + own[5]
+                for j in range(wp.static(n)):
+                    own = to_diagonal[place(v, q[j + 1])]
+                    of_own = from_square(own, g[j])
+                    to_along += HALF * wp.dot(of_own, g[j])
+                    to_across += own[0] + own[3] + own[5]
+                    to_g[j] = to_g[j] + along * (of_first + of_own)
+                turned = vectors()
+                for p in range(n_products):
+                    direction = edge_vectors(fields, ((n_products + p) * n_samples + s) * n_vertices, q)
+                    push = edge_vectors(pushed, (p * n_samples + s) * n_vertices, q)
+                    rate = inner(g, direction)
+                    rate_of_push = inner(g, push)
+                    to_along += rate * rate_of_push
+                    to_across += inner(direction, push)
+                    turned += rate_of_push * direction + rate * push
+                to_g += along * turned
+            to_energy = real(0.0)
+            if to_total:
+                to_energy = to_total[s]
+            to_m, received, _0, _1, _2, _3 = wp.grad(of_measure)(m, to, to_energy, inner(g, d), to_along, to_across)
+            to_e, _4 = wp.grad(of_gradient)(e, to_g)
+            to_e += potential.rate(m, to_m) * g
+            add(to_x, v, q, to_e)
+            to_rests[at] = to_rests[at] + packed(received)
+
+    @wp.kernel(module=module)
+    def hessians(
+        elements: wp.array(dtype=corners),
+        n_vertices: int,
+        x: wp.array(dtype=vec3),
+        rests: wp.array(dtype=record),
+        out: wp.array(dtype=vectors),
+        threads: int,
+    ):
+        """Second derivatives of the energy of each element beyond Gauss and Newton's, in its edge vectors."""
+        i = wp.tid()
+        s = i // threads
+        for k in range(i - s * threads, elements.shape[0], threads):
+            q = elements[place(k, 0)]
+            at = place(s * elements.shape[0], k)
+            to = rests[at]
+            e = edge_vectors(x, s * n_vertices, q)
+            m, g = f.linearised(e)
+            slope = potential.slope(m, to)
+            to_m, _0 = wp.grad(slope_of)(m, to)
+            beyond = potential.rate(m, to_m) - real(2.0) * to.weight
+            for j in range(3 * n):
+                unit = vectors()
+                unit[j // 3, j % 3] = slope
+                of_unit, _1 = wp.grad(of_gradient)(e, unit)
+                out[place(3 * n * at, j)] = of_unit + (beyond * g[j // 3, j % 3]) * g
+
+    merge = _merging_back(f, module) if f.weight is not None else None
+    return SimpleNamespace(module=module, linearise=linearise, hessians=hessians, merge=merge)
 
 
-@wp.func
-def bend_beyond(p: wp.vec2d, w: rested):
-    """Second derivative beyond that of the square."""
-    t = doubled(p)
-    return FOUR_THIRDS * (w[3] * p[0] + w[4] * p[1]) - THIRD * (w[5] * t[0] + w[6] * t[1]) - w[2]
+@cache
+def curving(n: int) -> SimpleNamespace:
+    """Second derivatives of elements of so many edge vectors, on the columns of a space."""
+    corners, module = wp.types.vector(length=n + 1, dtype=wp.int32), wp.get_module(f"{__name__}.curving{n}")
+    local = wp.types.matrix(shape=(3 * n, 3 * n), dtype=real)
+    tall = wp.types.matrix(shape=(3 * n, 8), dtype=real)
 
+    @wp.kernel(module=module, enable_backward=False)
+    def curved(
+        elements: wp.array(dtype=corners),
+        hessians: wp.array(dtype=local),
+        n_vertices: int,
+        columns: wp.array(dtype=wide),
+        n_blocks: int,
+        out: wp.array(dtype=wide),
+        threads: int,
+    ):
+        """Sums on the vertices."""
+        i = wp.tid()
+        s = i // threads
+        for k in range(i - s * threads, elements.shape[0], threads):
+            q = elements[place(k, 0)]
+            h = hessians[place(s * elements.shape[0], k)]
+            for b in range(n_blocks):
+                moved = tall()
+                first = place(3 * n_blocks * q[0], b)
+                for j in range(wp.static(n)):
+                    at = place(3 * n_blocks * q[j + 1], b)
+                    for a in range(3):
+                        moved[3 * j + a] = columns[place(at, a * n_blocks)] - columns[place(first, a * n_blocks)]
+                for a in range(3):
+                    whole = wide()
+                    for j in range(wp.static(n)):
+                        received = h[3 * j + a, 0] * moved[0]
+                        for r in range(1, wp.static(3 * n)):
+                            received += h[3 * j + a, r] * moved[r]
+                        to = 3 * n_blocks * (s * n_vertices + q[j + 1]) + a * n_blocks
+                        wp.atomic_add(out, place(to, b), received)
+                        whole += received
+                    wp.atomic_add(out, place(3 * n_blocks * (s * n_vertices + q[0]) + a * n_blocks, b), -whole)
 
-# -------------------------------------------------------------------------------------------------------------- faces
-@wp.func
-def corner(x: wp.array(dtype=vec3), centre: vec3, at: int, v: int):
-    found = centre
-    if v >= 0:
-        found = x[place(at, v)]
-    return found
-
-
-@wp.func
-def middle_of(mesh: Elements, x: wp.array(dtype=vec3), centre: wp.array(dtype=vec3), sample: int):
-    """The origin of volumes: the centre; any vertex where the surface is closed."""
-    found = x[place(sample * mesh.n_vertices, mesh.capped_faces[0][0])]
-    if centre:
-        found = centre[sample]
-    return found
+    return SimpleNamespace(module=module, curved=curved)

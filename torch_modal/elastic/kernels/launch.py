@@ -6,7 +6,7 @@ import os
 import sys
 import tempfile
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
 from itertools import chain
@@ -15,13 +15,10 @@ from typing import Any, Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from torch_modal.elastic.term import Mesh
+from torch_modal.elastic import bend, stretch, volume
 from torch_modal.progress import ProgressReport
 
 Module = Literal[
-    "shell",
-    "shell_adjoint",
-    "modal",
     "quasi_newton",
     "steps",
     "rotations",
@@ -30,7 +27,7 @@ Module = Literal[
     "crossings",
 ]
 PACKAGE = "torch_modal.elastic.kernels"
-IN_BETWEENS: tuple[Module, ...] = ("procrustes", "rotations", "shell", "modal", "quasi_newton", "steps")
+IN_BETWEENS: tuple[Module, ...] = ("procrustes", "rotations", "quasi_newton", "steps")
 """The modules for in-betweens without gradients."""
 NO_DRIVER = b"Warp CUDA warning: Could not find or load the NVIDIA CUDA driver"
 """What Warp says where there is no GPU, with no setting that turns it off: in every run, it looks like an error."""
@@ -46,16 +43,34 @@ def kernels(name: Module) -> Any:
     return module
 
 
+@cache
+def made(make: Callable[..., Any], *given: Any) -> Any:
+    """Kernels of one module that a function makes, compiled likewise."""
+    found = make(*given)
+    _load(found.module)
+    return found
+
+
+def of_elements(part: Literal["convex", "forward", "backward", "curving"], *given: Any) -> Any:
+    """Kernels of a module that one or two terms have, or elements of so many edge vectors."""
+    return made(getattr(importlib.import_module(f"{PACKAGE}.elements"), part), *given)
+
+
 def load_kernels() -> None:
-    """Load those of in-betweens, so that nobody waits for it later."""
-    for name in IN_BETWEENS:
-        importlib.import_module(f"{PACKAGE}.{name}")
+    """Load those of in-betweens without gradients, so that nobody waits for it later."""
+    elements, *_ = (importlib.import_module(f"{PACKAGE}.{name}") for name in ("elements", *IN_BETWEENS))
+    own = stretch.kernel_functions(), bend.kernel_functions()
+    for functions in own:
+        elements.forward(functions)
+    elements.convex(*reversed(own))
+    volume.kernels()
+    importlib.import_module("torch_modal.elastic.distortion").kernels()
     _load(PACKAGE)
     for name in IN_BETWEENS:
         kernels(name)
 
 
-def _load(module: str) -> None:
+def _load(module: Any) -> None:
     """Compile a module and those below it, several at a time, or take them from Warp's cache."""
     import warp as wp
 
@@ -129,13 +144,6 @@ class Constants:
         return self.__dict__ | {"_made": {}}
 
 
-def records(mesh: Mesh) -> Tensor:
-    """Vertices of each edge and of the tips of its hinge, -1 where it has none. *Shape:* ``(E, 4)``."""
-    record = torch.cat([mesh.edges, torch.full_like(mesh.edges, -1)], 1)
-    record[torch.tensor(mesh.connectivity.counts == 2)] = mesh.hinges
-    return record
-
-
 class Entry(NamedTuple):
     """Entries of an array that a kernel takes."""
 
@@ -155,7 +163,7 @@ def _entries(kernel: Any) -> list[Entry | None]:
     for argument in inspect.get_annotations(kernel.func).values():
         if not wp.types.is_array(argument):
             found.append(None)
-        elif wp.types.is_struct(argument.dtype):  # structs in arrays are of float64 alone
+        elif wp.types.type_is_struct(argument.dtype):  # structs in arrays are of float64 alone
             n_bytes = wp.types.type_size_in_bytes(argument.dtype)
             found.append(Entry(n_bytes // 8, torch.float64, n_bytes))
         else:
@@ -232,9 +240,13 @@ class _Command:
     def __call__(self, n_threads: int, given: Sequence[Any], adjoints: Sequence[Any]) -> None:
         for i, before in self.others.items():
             x = given[i]
-            if x is not before:
-                self.others[i] = x
-                self.recorded.set_param_at_index(i, x.on(self.device) if isinstance(x, Constants) else x)
+            if x is before:
+                continue
+            self.others[i] = x
+            if isinstance(x, Constants):
+                self.recorded.set_param_at_index(i, x.on(self.device))
+            else:
+                self.recorded.set_param_at_index_from_ctype(i, x)
         for arrays, tensors in zip(self.arrays, (given, adjoints), strict=False):
             for i, array, width, dtype, _ in arrays:
                 x = tensors[i] if i < len(tensors) else None  # not all have an adjoint

@@ -9,7 +9,7 @@ in the opposite order; for each product with ``H`` there is one more, with a fie
 import warp as wp
 
 from torch_modal.elastic import steps as relax
-from torch_modal.elastic.kernels.elements import Elements, applied, linearised, place, real, symmetric, vec3
+from torch_modal.elastic.kernels.elements import applied, place, real, symmetric, vec3
 
 RIDGE = wp.constant(real(relax.RIDGE))
 
@@ -306,76 +306,3 @@ def back_to_residual(
         along -= wp.dot(found, fields[place(product, k)] + push * normal[v])
     if m > 0:
         wp.atomic_add(received, at - n_samples, vec3(along, real(0.0), real(0.0)))
-
-
-@wp.kernel(enable_backward=False)
-def back_to_factors(
-    mesh: Elements,
-    fields: wp.array(dtype=vec3),
-    pushed: wp.array(dtype=vec3),
-    factors: wp.array(dtype=linearised),
-    n_samples: int,
-    n_products: int,
-    to_factors: wp.array(dtype=linearised),
-    threads: int,
-):
-    """Gradients of the Hessian's factors from the pushed fields times ``H`` times the directions."""
-    i = wp.tid()
-    s = i // threads
-    for k in range(i - s * threads, mesh.record.shape[0], threads):
-        q = mesh.record[place(k, 0)]
-        at = place(s * mesh.record.shape[0], k)
-        h = factors[at]
-        unit = vec3(h[0], h[1], h[2])
-        ge = vec3(h[5], h[6], h[7])
-        ga = vec3(h[8], h[9], h[10])
-        gb = vec3(h[11], h[12], h[13])
-        to_unit = vec3()
-        to_across = real(0.0)
-        to_along = real(0.0)
-        to_e = vec3()
-        to_a = vec3()
-        to_b = vec3()
-        to_stiffness = real(0.0)
-        for m in range(n_products):
-            v = (m * n_samples + s) * mesh.n_vertices
-            d = v + n_products * n_samples * mesh.n_vertices
-            origin = fields[place(d, q[0])]
-            start = pushed[place(v, q[0])]
-            e = fields[place(d, q[1])] - origin
-            f = pushed[place(v, q[1])] - start
-            rate = wp.dot(unit, e)
-            rate_f = wp.dot(unit, f)
-            to_unit += rate_f * e + rate * f
-            to_across += wp.dot(e, f)
-            to_along += rate * rate_f
-            if q[2] >= 0:
-                a = fields[place(d, q[2])] - origin
-                b = fields[place(d, q[3])] - origin
-                fa = pushed[place(v, q[2])] - start
-                fb = pushed[place(v, q[3])] - start
-                change = wp.dot(ge, e) + wp.dot(ga, a) + wp.dot(gb, b)
-                change_f = wp.dot(ge, f) + wp.dot(ga, fa) + wp.dot(gb, fb)
-                to_e += change_f * e + change * f
-                to_a += change_f * a + change * fa
-                to_b += change_f * b + change * fb
-                to_stiffness += change * change_f
-        to_unit = h[4] * to_unit
-        w = h[14]
-        to_factors[at] = linearised(
-            to_unit[0],
-            to_unit[1],
-            to_unit[2],
-            to_across,
-            to_along,
-            w * to_e[0],
-            w * to_e[1],
-            w * to_e[2],
-            w * to_a[0],
-            w * to_a[1],
-            w * to_a[2],
-            w * to_b[0],
-            w * to_b[1],
-            w * to_b[2],
-            to_stiffness,
-        )

@@ -1,0 +1,433 @@
+"""An energy by kernels, in float64: each term in one pass over its elements, where torch takes dozens.
+
+The torch code stays: it is what these are tested against, what runs where Warp is not, and what differentiates a
+gradient once more.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from torch_modal import trees
+from torch_modal.elastic import volume
+from torch_modal.elastic.bend import NEEDLE, NEEDLE_OF_STEPS
+from torch_modal.elastic.energy import Energy, OnMesh, Reference, RestShapes
+from torch_modal.elastic.kernels.function import fused
+from torch_modal.elastic.kernels.launch import launch, made, of_elements
+from torch_modal.elastic.term import KernelFunctions, Mesh
+from torch_modal.elastic.volume import MIN_RELATIVE_VOLUME, Volume
+from torch_modal.geometry.vectors import cross, inverse, norm
+
+
+class KernelPoint(NamedTuple):
+    """The energy at given shapes, with factors of products with the convex Hessian."""
+
+    value: Tensor
+    """But for the constant. *Shape:* ``(B,)``."""
+    gradient: Tensor
+    """But for the volume. *Shape:* ``(B, V, 3)``."""
+    diagonal: Any
+    """Blocks of the convex Hessian's diagonal, packed, if wanted. *Shape:* ``(B, V, 6)``."""
+    factors: list[Tensor]
+    """Of each term; none of the volume. *Shape of each:* ``(B, M, f)``."""
+    normal: Tensor
+    """Gradient of the volume. *Shape:* ``(B, V, 3)``."""
+    moment: Tensor
+    """First derivative of the energy in the volume. *Shape:* ``(B,)``."""
+    stiffness: Tensor
+    """Second derivative. *Shape:* ``(B,)``."""
+    beside: Callable[[Tensor], Tensor] | None = None
+    """Products with the Hessian of energies beside, whose values and derivatives are counted in."""
+
+    def slope(self, direction: Tensor) -> Tensor:
+        """Derivative of the energy along a direction. *Shape:* ``(B, V, 3) -> (B,)``."""
+        return (self.gradient * direction).sum((1, 2)) + self.moment * (self.normal * direction).sum((1, 2))
+
+
+class KernelTerm(nn.Module):
+    """A term on a mesh, by kernels.
+
+    Args:
+        part: The term.
+        functions: What the kernels are made from.
+    """
+
+    elements: Tensor
+
+    def __init__(self, part: OnMesh, functions: KernelFunctions) -> None:
+        super().__init__()
+        self.part, self.functions = part, functions
+        self.register_buffer("elements", part.corners.T.int().contiguous(), persistent=False)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "functions": None}  # Warp's functions are no data
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__(state)
+        self.functions = self.part.term.kernel_functions(len(self.part.corners) - 1)
+
+    @property
+    def n_factors(self) -> int:
+        """Numbers of an element's factors."""
+        return 3 * self.functions.n + 1 + (self.functions.across is not None)
+
+    def launch(self, name: str, dim: int, *given: Any, back: bool = False) -> None:
+        """Run a kernel over the elements of so many samples."""
+        kernel = getattr(of_elements("backward" if back else "forward", self.functions), name)
+        launch(kernel, (dim, len(self.elements)), [self.elements, *given])
+
+    def reference(
+        self, rests: RestShapes, stiffness: Tensor, start: Tensor | None, relative: bool
+    ) -> tuple[Tensor, Tensor]:
+        """The record, and the energy that remains. *Shape:* ``(B, M, R), (B,)``."""
+        more = () if start is None or self.functions.fullness is None else (start,)
+        operation, given = _Merged(self, relative and bool(more)), (rests.shapes, rests.weights, stiffness, *more)
+        own = (
+            operation.by_torch(*(x.double() for x in given))
+            if self.functions.weight is None
+            else fused(operation, *given)
+        )
+        return own[0], own[1]
+
+
+class KernelVolume(nn.Module):
+    """The volume of a mesh, by kernels.
+
+    Args:
+        part: The term.
+        mesh: The mesh.
+        used: Vertices of faces.
+    """
+
+    faces: Tensor
+    used: Tensor
+
+    def __init__(self, part: OnMesh, mesh: Mesh, used: Tensor) -> None:
+        super().__init__()
+        self.part, self.n_used = part, len(used)
+        self.closed = len(mesh.connectivity.boundary_chain) == 0
+        self.register_buffer("faces", mesh.faces.int(), persistent=False)
+        #: Vertices of faces. *Shape:* ``(V, 1)``, bool.
+        own = torch.zeros(mesh.n_vertices, 1, dtype=torch.bool).index_fill(0, used.cpu(), True)
+        self.register_buffer("used", own, persistent=False)
+
+    def mean(self, x: Tensor) -> Tensor:
+        """Mean of the vertices of faces. *Shape:* ``(B, V, 3) -> (B, 3)``."""
+        return x.mean(1) if self.n_used == x.shape[1] else (x * self.used).sum(1) / self.n_used
+
+    def _launch(self, name: str, x: Tensor, *given: Tensor | None) -> None:
+        # The origin of volumes: any vertex where the surface is closed.
+        centre = None if self.closed else self.mean(x)
+        launch(
+            getattr(made(volume.kernels), name), (len(x), len(self.faces)), [self.faces, x.shape[1], x, centre, *given]
+        )
+
+    def at(self, x: Tensor, normal: Tensor | None = None, area: Tensor | None = None) -> Tensor:
+        """Volumes. The gradient, and the area, are added where they are wanted. *Shape:* ``(B, V, 3) -> (B,)``."""
+        found = x.new_zeros(len(x))
+        self._launch("sizes", x, found, area, normal)
+        if normal is not None and not self.closed:  # through the centre; on a closed surface that vanishes
+            normal.sub_(normal.sum(1, keepdim=True) / self.n_used * self.used)
+        return found
+
+    def back(
+        self, x: Tensor, to_volume: Tensor, to_area: Tensor | None, to_normal: Tensor | None, to_x: Tensor
+    ) -> None:
+        """Adjoint of :meth:`at`: adds the gradient."""
+        if to_normal is not None and not self.closed:
+            to_normal = (to_normal - self.mean(to_normal)[:, None]).contiguous()
+        to_centre = None if self.closed else x.new_zeros(len(x), 3)
+        self._launch("sizes_back", x, to_volume.contiguous(), to_area, to_normal, to_x, to_centre)
+        if to_centre is not None:
+            to_x.add_(to_centre[:, None] / self.n_used * self.used)
+
+    def reference(
+        self, rests: RestShapes, stiffness: Tensor, start: Tensor | None, relative: bool
+    ) -> tuple[Tensor, Tensor]:
+        """The record, and the energy that remains. *Shape:* ``(B, 1, 2), (B,)``."""
+        volumes, areas = fused(_Sizes(self), rests.shapes)
+        weights = torch.maximum(volumes.abs(), MIN_RELATIVE_VOLUME * areas**1.5) ** -2
+        record, left = self.part.term.merged(volumes[..., None], (rests.weights * weights)[..., None], stiffness)
+        return record.mT, left.squeeze(-1)
+
+
+def by_kernels(part: OnMesh, mesh: Mesh, used: Tensor) -> KernelTerm | KernelVolume | None:
+    """A term by kernels; None for one that torch computes."""
+    term = part.term
+    if type(term) is Volume:
+        return KernelVolume(part, mesh, used)
+    n = len(part.corners) - 1
+    plain = term.anchors is None and 1 <= n <= 3 and bool((part.corners < mesh.n_vertices).all())
+    functions = term.kernel_functions(n) if plain else None
+    return None if functions is None else KernelTerm(part, functions)
+
+
+class Pass(nn.Module):
+    """A pass over elements: a term, and perhaps one of edges that rides on it.
+
+    Args:
+        term: The number of the term, and the term.
+        rider: The same of the other; None where there is none.
+        own: For each edge of that the element that begins with it, or -1. *Shape:* ``(E,)``.
+    """
+
+    elements: Tensor
+    own: Tensor | None
+
+    def __init__(
+        self, term: tuple[int, KernelTerm], rider: tuple[int, KernelTerm] | None = None, own: Tensor | None = None
+    ) -> None:
+        super().__init__()
+        (self.number, self.term), (self.other, self.rider) = term, rider or (None, None)
+        elements = self.term.elements
+        if self.rider is not None and own is not None:
+            # Where there is no element, all further vertices are the first.
+            edges, n = self.rider.elements, elements.shape[1]
+            alone = torch.cat([edges, edges[:, :1].expand(-1, n - 2)], 1)
+            elements = torch.where((own < 0)[:, None], alone, elements[own.clamp_min(0)]).contiguous()
+        self.register_buffer("elements", elements, persistent=False)
+        self.register_buffer("own", None if own is None else own.int(), persistent=False)
+
+    def _launch(self, name: str, dim: int, *given: Any) -> None:
+        kernels = of_elements("convex", self.term.functions, None if self.rider is None else self.rider.functions)
+        dims, n_own = (dim, len(self.elements)), len(self.term.elements)
+        launch(getattr(kernels, name), dims, [self.elements, self.own, n_own, *given])
+
+    def linearise(
+        self, x: Tensor, records: Sequence[Tensor], given: tuple[Any, ...], factors: Sequence[Tensor]
+    ) -> None:
+        """Energy and derivatives are added; arguments of the kernel, of which records and factors are of all terms."""
+        own, other = self._mine(records)
+        own_factors, other_factors = self._mine(factors) if factors else (None, None)
+        self._launch("linearise", len(x), x.shape[1], x, own, other, *given, own_factors, other_factors)
+
+    def product(
+        self, dim: tuple[int, int], field: tuple[Tensor, int], factors: Sequence[Tensor], out: tuple[Any, ...]
+    ) -> None:
+        """Likewise."""
+        self._launch("product", dim[0], dim[1], *field, *self._mine(factors), *out)
+
+    def _mine(self, of_all: Sequence[Tensor]) -> tuple[Tensor, Tensor | None]:
+        return of_all[self.number], None if self.other is None else of_all[self.other]
+
+
+def _passes(parts: Sequence[Any], n_vertices: int) -> list[Pass]:
+    """The terms but the volume in as few passes as may be: edges ride on elements that begin with them."""
+    terms = [(i, part) for i, part in enumerate(parts) if isinstance(part, KernelTerm)]
+    ends = torch.tensor([n_vertices, 1])
+    for edges in (term for term in terms if term[1].functions.even):
+        keys = edges[1].elements.long().sort(1)[0] @ ends
+        order = keys.argsort()
+        for term in (term for term in terms if term[1].functions.n > 1):
+            own = term[1].elements[:, :2].long().sort(1)[0] @ ends
+            at = order[torch.searchsorted(keys[order], own).clamp_max(len(keys) - 1)]
+            if len(own) and bool((keys[at] == own).all()) and len(at.unique()) == len(at):
+                numbers = torch.full_like(keys, -1).index_copy(0, at, torch.arange(len(at)))
+                others = [each for each in terms if each not in (edges, term)]
+                return [Pass(term, edges, numbers), *map(Pass, others)]
+    return [*map(Pass, terms)]
+
+
+class KernelEnergy(nn.Module):
+    """Terms towards K rest shapes, by kernels.
+
+    Args:
+        energy: The same in torch.
+        parts: Its terms.
+    """
+
+    def __init__(self, energy: Energy, parts: Sequence[KernelTerm | KernelVolume]) -> None:
+        super().__init__()
+        self.energy = energy
+        self.parts: Any = nn.ModuleList(parts)
+        #: Numbers of the terms with factors, and of the volume.
+        self.terms = [i for i, part in enumerate(parts) if isinstance(part, KernelTerm)]
+        self.volumes = [i for i, part in enumerate(parts) if isinstance(part, KernelVolume)]
+        #: The terms in passes over elements, each alone or with another that rides on it.
+        self.passes: Any = nn.ModuleList(_passes(parts, energy.n_vertices))
+        #: Whether kernels know the adjoints of all terms.
+        self.exact = all(parts[i].functions.exact for i in self.terms)
+
+    @classmethod
+    def of(cls, energy: Energy, mesh: Mesh) -> "KernelEnergy | None":
+        """An energy by kernels; None where they do not serve all of its terms, or have not one volume at most."""
+        parts = [None if energy.sampled else by_kernels(part, mesh, energy.used) for part in energy.parts]
+        found = [part for part in parts if part is not None]
+        n_volumes = sum(isinstance(part, KernelVolume) for part in found)
+        return cls(energy, found) if len(found) == len(parts) and n_volumes <= 1 else None
+
+    def reference(self, rests: RestShapes, start: Tensor | None = None, relative: bool = False) -> Reference:
+        """Merge rest shapes into one reference (Eq. 8); arguments as :meth:`RestShapes.reference`."""
+        rests = trees.mapped(rests, Tensor.double)
+        pairs = zip(self.parts, rests.stiffness, strict=True)
+        records, left = zip(*(part.reference(rests, own, start, relative) for part, own in pairs), strict=True)
+        return Reference(records, sum(left, start=torch.zeros_like(left[0])))
+
+    def _linearised(
+        self, x: Tensor, to: Reference, gradient: Tensor | None, normal: Tensor | None, diagonal: Tensor | None = None
+    ) -> tuple[Tensor, Tensor, Tensor, list[Tensor]]:
+        """The energy but for its constant; the volume's moment and stiffness; factors. Derivatives are added."""
+        n, n_references, factors = len(x), len(to.constant), []
+        energy = x.new_zeros(n)
+        if diagonal is not None:
+            sizes = [
+                (len(part.elements), part.n_factors) if isinstance(part, KernelTerm) else (0,) for part in self.parts
+            ]
+            factors = [x.new_empty(n, *size) for size in sizes]
+        for one in self.passes:
+            one.linearise(x, to.records, (n_references, energy, gradient, diagonal), factors)
+        if not self.volumes:
+            return energy, energy, energy, factors
+        weight, value = to.records[self.volumes[0]].unbind(-1)
+        stiffness = 2 * weight.squeeze(-1)
+        off = self.parts[self.volumes[0]].at(x, normal).view(-1, n_references) - value.squeeze(-1)
+        moment = stiffness * off
+        energy = torch.addcmul(energy.view(-1, n_references), moment, off, value=0.5).flatten()
+        return energy, moment.flatten(), stiffness, factors
+
+    def at(self, x: Tensor, to: Reference, hessian: bool = True) -> KernelPoint:
+        """Value and derivatives, of which the Hessian's may be left out. *Shape:* ``(B, V, 3)``."""
+        gradient, normal = x.new_zeros(2, *x.shape)
+        diagonal = x.new_zeros(*x.shape[:2], 6) if hessian else None
+        energy, moment, stiffness, factors = self._linearised(x, to, gradient, normal, diagonal)
+        return KernelPoint(energy, gradient, diagonal, factors, normal, moment, stiffness)
+
+    def value_and_gradient(self, x: Tensor, to: Reference) -> tuple[Tensor, Tensor]:
+        """The energy but for its constant, and its gradient. *Shape:* ``(B, V, 3) -> (B,), (B, V, 3)``."""
+        gradient, normal = x.new_zeros(2, *x.shape)
+        energy, moment, *_ = self._linearised(x, to, gradient, normal)
+        return energy, gradient.addcmul_(moment[:, None, None], normal) if self.volumes else gradient
+
+    def value(self, x: Tensor, to: Reference) -> Tensor:
+        """The energy but for its constant, of one shape or more for each reference. *Shape:* ``(D * B, V, 3)``."""
+        return self._linearised(x, to, None, None)[0]
+
+    def product(
+        self, factors: Sequence[Tensor], dim: tuple[int, int], fields: Tensor, start: int, out: Tensor, out_start: int,
+        scalars: Tensor | None = None, first: int = 0,
+    ) -> None:  # fmt: skip
+        """The convex Hessian but for the volume's part times fields of so many samples and vertices.
+
+        Fields, results and scalars begin at the given places of their arrays.
+        """
+        for one in self.passes:
+            one.product(dim, (fields, start), factors, (out, out_start, scalars, first))
+
+    def back(
+        self,
+        x: Tensor,
+        at: KernelPoint,
+        to: Reference,
+        to_gradient: Tensor,
+        to_x: Tensor,
+        to_records: Sequence[Tensor],
+        products: tuple[Tensor, Tensor, Tensor] | None = None,
+        to_normal: Tensor | None = None,
+        to_energy: Tensor | None = None,
+    ) -> None:
+        """Adjoint of :meth:`at`: add the gradients of shapes and references.
+
+        Args:
+            x: The shapes. *Shape:* ``(B, V, 3)``.
+            at: The energy there; its diagonal and factors are not read.
+            to: The references.
+            to_gradient: In the whole gradient, with the volume's part. *Shape:* ``(B, V, 3)``.
+            to_x: Is added to. *Shape:* ``(B, V, 3)``.
+            to_records: Are added to.
+            products: What the diagonal receives, the fields of conjugate gradients, and what their products receive.
+            to_normal: In the volume's gradient beyond that. *Shape:* ``(B, V, 3)``.
+            to_energy: In the energy. *Shape:* ``(B,)``.
+        """
+        b, n = x.shape[:2]
+        to_diagonal, fields, pushed = products or (None, None, None)
+        n_products = 0 if pushed is None else len(pushed)
+        for i in self.terms:
+            given = n, x, to.records[i], to_energy, to_gradient, to_diagonal, fields, pushed, b, n_products
+            self.parts[i].launch("linearise", b, *given, to_x, to_records[i], back=True)
+        if not self.volumes:
+            return
+        i = self.volumes[0]
+        to_moment = (to_gradient * at.normal).sum((1, 2))
+        off = at.moment * inverse(at.stiffness, at.stiffness <= 0)
+        to_volume, to_weight = at.stiffness * to_moment, 2 * off * to_moment
+        if to_energy is not None:
+            to_volume, to_weight = to_volume + at.moment * to_energy, to_weight + off**2 * to_energy
+        own = at.moment[:, None, None] * to_gradient
+        own = own if to_normal is None else own.add_(to_normal)
+        self.parts[i].back(x, to_volume, None, own, to_x)
+        to_records[i].add_(torch.stack([to_weight, -to_volume], -1)[:, None])
+
+
+class _Merged:
+    """Rest shapes, weights, the stiffness of elements, and perhaps a start as a record, and what remains."""
+
+    n_results, n_differentiable = 2, 1
+
+    def __init__(self, term: KernelTerm, relative: bool) -> None:
+        self.term, self.relative = term, relative
+
+    def _launch(self, means: Tensor, given: tuple[Tensor, ...], results: Sequence[Tensor | None], back: bool) -> None:
+        shapes, weights, stiffness, *start = given
+        needle = NEEDLE_OF_STEPS if self.relative else NEEDLE
+        first = shapes.shape[2], shapes.flatten(0, 1), weights, means, stiffness, start[0] if start else None
+        sizes = needle**2, int(self.relative), shapes.shape[1], stiffness.shape[1]
+        self.term.launch("merge", len(shapes), *first, *sizes, *results, back=back)
+
+    def run(self, kept: list[Any] | None, *given: Tensor) -> tuple[Tensor, ...]:
+        """See :class:`~torch_modal.elastic.kernels.function.Operation`."""
+        (shapes, means), term = given[:2], self.term
+        if term.functions.uses_mean:
+            means = shapes.new_zeros(shapes.shape[:2])
+            term.launch("total", means.numel(), shapes.shape[2], shapes.flatten(0, 1), means)
+            means /= max(len(term.elements), 1)
+        record = shapes.new_empty(len(shapes), len(term.elements), term.functions.potential.n_rows)
+        constant = shapes.new_zeros(len(shapes))
+        self._launch(means, given, [record, constant], False)
+        if kept is not None:
+            kept.append(means)
+        return record, constant
+
+    def back(self, kept: list[Any], grads: Sequence[Tensor], *given: Tensor) -> tuple[Tensor | None, ...]:
+        """See :class:`~torch_modal.elastic.kernels.function.Operation`."""
+        if not kept:
+            self.run(kept, *given)
+        found = tuple(torch.zeros_like(each) for each in given)
+        self._launch(kept[0], given, [grads[0], *found, *[None] * (4 - len(found))], True)
+        return found
+
+    def by_torch(
+        self, shapes: Tensor, weights: Tensor, stiffness: Tensor, start: Tensor | None = None
+    ) -> tuple[Tensor, ...]:
+        """See :class:`~torch_modal.elastic.kernels.function.Operation`."""
+        begin = None if start is None else start.movedim(-1, 0)
+        record, left = self.term.part.merged(shapes.movedim(-1, 0), weights, stiffness, begin, self.relative)
+        return record.mT.contiguous(), left.sum(-1)
+
+
+class _Sizes:
+    """Volumes and areas of shapes. *Shape:* ``(B, K, V, 3) -> (B, K), (B, K)``."""
+
+    n_results = n_differentiable = 2
+
+    def __init__(self, volume: KernelVolume) -> None:
+        self.volume = volume
+
+    def run(self, kept: list[Any] | None, shapes: Tensor) -> tuple[Tensor, ...]:
+        """See :class:`~torch_modal.elastic.kernels.function.Operation`."""
+        area = shapes.new_zeros(shapes.shape[:2])
+        return self.volume.at(shapes.flatten(0, 1), None, area).view_as(area), area
+
+    def back(self, kept: list[Any], grads: Sequence[Tensor], shapes: Tensor) -> tuple[Tensor | None, ...]:
+        """See :class:`~torch_modal.elastic.kernels.function.Operation`."""
+        found = torch.zeros_like(shapes)
+        to_volume, to_area = (each.flatten() for each in grads)
+        self.volume.back(shapes.flatten(0, 1), to_volume, to_area, None, found.flatten(0, 1))
+        return (found,)
+
+    def by_torch(self, shapes: Tensor) -> tuple[Tensor, ...]:
+        """See :class:`~torch_modal.elastic.kernels.function.Operation`."""
+        part, rows = self.volume.part, shapes.movedim(-1, 0)
+        p, q, r = part.edge_vectors(torch.cat([rows, rows[..., self.volume.used[:, 0]].mean(-1, keepdim=True)], -1))
+        return (p * cross(q, r)).sum((0, -1)) / 6, 0.5 * norm(cross(q - p, r - p)).sum(-1)

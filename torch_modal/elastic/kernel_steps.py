@@ -1,0 +1,220 @@
+"""Steps of all vertices by kernels, tested against those in torch."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torch_modal.autograd import plain
+from torch_modal.elastic.energy import Energy, Reference, RestShapes
+from torch_modal.elastic.kernel_energy import KernelEnergy, KernelPoint, by_kernels
+from torch_modal.elastic.kernels.function import fused
+from torch_modal.elastic.kernels.launch import kernels, launch
+from torch_modal.elastic.steps import (
+    FineEnergy,
+    FreeEnergy,
+    SumOfEnergies,
+    TermsTowards,
+    descend,
+    descended,
+    step_length,
+)
+from torch_modal.elastic.term import Mesh, Term
+
+
+class KernelFineEnergy(FineEnergy):
+    """:class:`FineEnergy` by kernels; terms that they do not serve, and contacts, are torch's beside them."""
+
+    def __init__(self, mesh: Mesh, terms: Sequence[Term]) -> None:
+        super().__init__(mesh, terms)
+        served = [by_kernels(part, mesh, self.energy.used) is not None for part in self.energy.parts]
+        #: Numbers of the terms that kernels serve, and of the others.
+        self.own, self.others = ([i for i, one in enumerate(served) if one is kind] for kind in (True, False))
+        shell = Energy(mesh, [terms[i] for i in self.own]) if self.others else self.energy
+        self.further = Energy(mesh, [terms[i] for i in self.others]) if self.others else None
+        self.kernels: Any = KernelEnergy.of(shell, mesh)
+
+    def relax_chunk(
+        self, x: Tensor, rests: RestShapes, stages: Sequence[tuple[int, int]], beside: Sequence[FreeEnergy]
+    ) -> Tensor:
+        """Overrides the base class. With further terms or energies, gradients are left to torch."""
+        alone = self.further is None and not beside
+        if not (alone and self.kernels.exact) and ((torch.is_grad_enabled() and x.requires_grad) or not plain(x)):
+            return super().relax_chunk(x, rests, stages, beside)
+        others = [*beside, *([] if self.further is None else [TermsTowards.among(self.further, self.others, rests)])]
+        to = self.kernels.reference(rests._replace(stiffness=[rests.stiffness[i] for i in self.own]), x, relative=True)
+        if alone:
+            moved = x
+            for n_steps, n_products in stages:
+                if n_steps:
+                    moved = fused(_Relaxed(self.kernels, n_steps, n_products), moved, *to.records)[0]
+            return moved.to(x)
+        with torch.no_grad():
+            return descended(KernelProblem(self.kernels, to, others), x.double().contiguous(), stages).to(x)
+
+    def towards(
+        self, x: Tensor, reference: Reference, n_steps: int, n_products: int, beside: Sequence[FreeEnergy] = ()
+    ) -> Tensor:
+        """Overrides the base class. Gradients are left to torch."""
+        if self.further is not None or (torch.is_grad_enabled() and x.requires_grad) or not plain(x):
+            return super().towards(x, reference, n_steps, n_products, beside)
+        problem = KernelProblem(self.kernels, reference.turned(), beside)
+        return descend(problem, x.double().contiguous(), n_steps, n_products).to(x)
+
+
+class KernelProblem:
+    """The terms towards a reference, for :func:`torch_modal.elastic.steps.descend`, in float64.
+
+    Args:
+        kernels: The terms.
+        to: The reference.
+        beside: Other energies.
+    """
+
+    def __init__(self, kernels: KernelEnergy, to: Reference, beside: Sequence[FreeEnergy] = ()) -> None:
+        self.kernels, self.to, self.beside = kernels, to, beside
+        self.products: list[Callable[[Tensor], Tensor]] = []
+
+    def value(self, x: Tensor) -> Tensor:
+        """*Shape:* ``(B, V, 3) -> (B,)``."""
+        return sum((other.value(x) for other in self.beside), start=self.kernels.value(x, self.to))
+
+    def at(self, x: Tensor) -> KernelPoint:
+        """*Shape:* ``(B, V, 3)``."""
+        at = self.kernels.at(x, self.to)
+        if not self.beside:
+            return at
+        others = SumOfEnergies(self.beside).at(x)
+        at.gradient.add_(others.gradient)
+        at.diagonal.add_(others.diagonal)
+        return at._replace(value=at.value + others.value, beside=others.product)
+
+    def solved(self, at: KernelPoint, n_products: int, keep: bool = False) -> tuple[Tensor, Tensor, Tensor]:
+        """Conjugate gradients, fused.
+
+        Args:
+            at: The energy where the step starts; its diagonal is inverted in place.
+            n_products: Iterations.
+            keep: Whether each iteration has memory of its own.
+
+        Returns:
+            The solution, *shape* ``(B, V, 3)``; residuals, directions, and the Hessian's products with these but for
+            the volume's part, of the last iteration alone where they are not kept, *shape* ``(3, n_products, B, V,
+            3)``; three scalars of each iteration (``kernels/steps.py``), *shape* ``(n_products + 1, B, 3)``.
+        """
+        x, module = at.gradient, kernels("steps")
+        (b, n), n_kept = x.shape[:2], n_products if keep else 1
+        kept, scalars = x.new_empty(3, n_kept, *x.shape), x.new_zeros(n_products + 1, b, 3)
+        results = [kept, scalars, torch.empty_like(x)]
+        launch(module.begin, (b, n), [at.gradient, at.normal, at.moment, at.diagonal, n_kept, n, *results])
+        for k in range(n_products):
+            first = k % n_kept * b * n
+            place = n_kept * b * n + first, kept, 2 * n_kept * b * n + first
+            self.kernels.product(at.factors, (b, n), kept, *place, scalars, k * b)
+            if at.beside is not None:
+                pushed = at.beside(kept[1, k % n_kept])
+                kept[2, k % n_kept].add_(pushed)
+                scalars[k, :, 2].add_((pushed * kept[1, k % n_kept]).sum((1, 2)))
+            launch(module.advance, (b, n), [at.normal, at.diagonal, at.stiffness, k, n_kept, n, *results])
+            if k < n_products - 1:
+                launch(module.turn, (b, n), [at.normal, at.diagonal, b, k, n_kept, n, *results[:2]])
+        return results[2], kept, scalars
+
+
+class Taken(NamedTuple):
+    """A step of :func:`torch_modal.elastic.steps.descend`."""
+
+    x: Tensor
+    """Where it started. *Shape:* ``(B, V, 3)``."""
+    at: KernelPoint
+    """The energy there, its diagonal inverted."""
+    solution: Tensor
+    """The whole step. *Shape:* ``(B, V, 3)``."""
+    length: Tensor
+    """*Shape:* ``(B,)``."""
+    kept: Tensor
+    """Of :meth:`KernelProblem.solved`, of all iterations."""
+    scalars: Tensor
+    """Likewise."""
+
+
+class _Relaxed:
+    """Steps of all vertices from shapes, towards the records of a reference."""
+
+    n_results = n_differentiable = 1
+
+    def __init__(self, kernels: KernelEnergy, n_steps: int, n_products: int) -> None:
+        self.kernels, self.n_steps, self.n_products = kernels, n_steps, n_products
+
+    def _reference(self, records: Sequence[Tensor]) -> Reference:
+        return Reference(tuple(records), records[0].new_zeros(len(records[0])))
+
+    def run(self, kept: list[Any] | None, x: Tensor, *records: Tensor) -> tuple[Tensor, ...]:
+        """See :class:`~torch_modal.elastic.kernels.function.Operation`."""
+        problem = KernelProblem(self.kernels, self._reference(records))
+        with torch.no_grad():
+            return (descend(problem, x, self.n_steps, self.n_products, kept),)
+
+    def back(self, kept: list[Any], grads: Sequence[Tensor], x: Tensor, *records: Tensor) -> tuple[Tensor | None, ...]:
+        """See :class:`~torch_modal.elastic.kernels.function.Operation`."""
+        if not kept:
+            self.run(kept, x, *records)
+        to_x, to, to_records = grads[0], self._reference(records), [torch.zeros_like(own) for own in records]
+        for step in reversed(kept):
+            to_x = self._step_back(Taken(*step), to, to_x, to_records)
+        return to_x, *to_records
+
+    def by_torch(self, x: Tensor, *records: Tensor) -> tuple[Tensor, ...]:
+        """See :class:`~torch_modal.elastic.kernels.function.Operation`."""
+        own = TermsTowards(self.kernels.energy, self._reference(records).turned())
+        return (descend(SumOfEnergies([own]), x, self.n_steps, self.n_products),)
+
+    def _step_back(self, step: Taken, to: Reference, to_reached: Tensor, to_records: Sequence[Tensor]) -> Tensor:
+        """The gradient at the start of a step from that at its end; those of the records are added.
+
+        *Shape:* ``(B, V, 3)``.
+        """
+        x, at, solution, length, kept, scalars = step
+        to_x, to_solution, to_energy, to_slope = to_reached.clone(), to_reached, None, None
+        if bool((length < 1).any()):
+            to_solution, to_energy, to_slope = self._length_back(step, to, to_x, to_records)
+        module, (b, n), n_products = kernels("steps"), x.shape[:2], kept.shape[1]
+        force, (residual, direction, to_normal) = torch.empty_like(kept[0]), x.new_zeros(3, *x.shape)
+        to_diagonal, received = torch.zeros_like(at.diagonal), x.new_zeros(n_products, b, 3)
+        launch(module.inner, (b, n), [to_solution, kept[1, -1], n, received[-1]])
+        for k in reversed(range(n_products)):
+            common = [at.normal, at.stiffness, k, n_products, n, kept, scalars]
+            given = [*common, to_solution, residual, force, direction, received]
+            launch(module.back_to_direction, (b, n), given)
+            self.kernels.product(at.factors, (b, n), force, k * b * n, direction, 0)
+            launch(module.back_to_normal, (b, n), [*common, force, direction, to_normal, received])
+            given = [*common, at.diagonal, to_solution, direction, residual, to_diagonal, received]
+            launch(module.back_to_residual, (b, n), given)
+        # The right side is the gradient's opposite.
+        to_gradient = -residual if to_slope is None else to_slope[:, None, None] * solution - residual
+        products = to_diagonal, kept, force
+        self.kernels.back(x, at, to, to_gradient, to_x, to_records, products, to_normal, to_energy)
+        for i in self.kernels.volumes:  # of the stiffness, twice the weight
+            to_records[i][:, 0, 0].add_(2 * (scalars[:-1, :, 1] * received[..., 2]).sum(0))
+        return to_x
+
+    def _length_back(
+        self, step: Taken, to: Reference, to_x: Tensor, to_records: Sequence[Tensor]
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Gradients of the lengths of steps that were shortened: in the solution, the energy before, and the slope.
+
+        Those through the energy after the whole step are added to the gradients in the shape, on entry those at the
+        end of the step, and in the records. *Shape:* ``(B, V, 3), (B,), (B,)``.
+        """
+        to_reached, at, whole = to_x.clone(), step.at, step.x + step.solution
+        there = self.kernels.at(whole, to, hessian=False)
+        with torch.enable_grad():
+            given = step.solution, at.value, there.value, at.slope(step.solution)
+            solution, before, after, slope = leaves = [value.detach().requires_grad_() for value in given]
+            along = slope + at.slope(solution - step.solution)
+            length = step_length(before, along, after, solution.abs().amax((1, 2)))
+            taken = length[:, None, None] * solution
+        to_solution, to_before, to_after, to_slope = torch.autograd.grad(taken, leaves, to_reached)
+        self.kernels.back(whole, there, to, torch.zeros_like(to_x), to_x, to_records, to_energy=to_after)
+        return to_solution + (to_x - to_reached), to_before, to_slope
