@@ -1,5 +1,7 @@
 """New members of a shape space, and the transform that draws them."""
 
+from collections.abc import Sequence
+
 import pytest
 import torch
 from conftest import Shapes
@@ -7,6 +9,10 @@ from shapes import edge_lengths
 from test_coordinates import far
 
 import torch_modal as tm
+from torch_modal.elastic import choice
+from torch_modal.elastic.backend import TorchBackend
+from torch_modal.elastic.steps import FineEnergy
+from torch_modal.elastic.term import Mesh, Term
 from torch_modal.geometry.connectivity import Connectivity
 
 
@@ -24,6 +30,21 @@ def test_the_same_seed_has_the_same_members(space: tm.ShapeSpace) -> None:
     assert torch.equal(one, other) and one.shape == (3, space.n_vertices, 3) and one.dtype == torch.float64
     assert float((space.sample(3, seeded(1)) - one).abs().max()) > 0.01
     assert len(space.sample(0)) == 0
+
+
+def test_members_are_computed_by_the_backend_of_the_solver(bars: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = []
+
+    class Counted(TorchBackend):
+        def fine_energy(self, mesh: Mesh, terms: Sequence[Term]) -> FineEnergy:
+            made.append(len(terms))
+            return super().fine_energy(mesh, terms)
+
+    monkeypatch.setitem(choice.BACKENDS, "counted", Counted)
+    space = tm.ShapeSpace(bars.bases, bars.faces, solver=tm.Solver(backend="counted"))
+    made.clear()  # of the layers of the space
+    assert len(space.sample(1, seeded())) == 1
+    assert made == [3]
 
 
 def test_edges_keep_the_lengths_of_the_keyframes(space: tm.ShapeSpace, bars: Shapes) -> None:

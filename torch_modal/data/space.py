@@ -45,7 +45,7 @@ class ShapeSpace:
         faces: Vertex indices. *Shape:* ``(F, 3)``.
         preset: Of the in-betweens, as for :class:`torch_modal.InBetween`.
         objective: What they minimise; replaces the preset's.
-        solver: How they are solved; replaces the preset's.
+        solver: How they are solved, and by which backend new members; replaces the preset's.
         times: Number of even times at which the in-betweens of two key-frames are solved once; cubics interpolate
             among them. None solves each in-between. At least 4.
         dtype: Of the tables.
@@ -194,7 +194,7 @@ class ShapeSpace:
             raise ValueError(
                 "one key-frame alone does not vary; a space for sample, fit or components needs two or more"
             )
-        return self._made.get("variation", lambda: Variation(self._keyframes, self.faces))
+        return self._made.get("variation", lambda: Variation(self._keyframes, self.faces, self.settings.solver.backend))
 
     @torch.no_grad()
     def sample(

@@ -55,7 +55,7 @@ class Variation:
     All positions are relative to :attr:`origin`. *Shape:* ``(K, V, 3), (F, 3)``.
     """
 
-    def __init__(self, shapes: Tensor, faces: Tensor) -> None:
+    def __init__(self, shapes: Tensor, faces: Tensor, backend: str = "auto") -> None:
         #: Subtracted from all shapes: second moments far from the origin would be rounding. *Shape:* ``(3,)``.
         self.origin = shapes[0, faces.flatten()].mean(0)
         shapes = shapes - self.origin
@@ -80,7 +80,7 @@ class Variation:
         self.scale = CANONICAL_SIZE / self.size
         self.mixtures = LocalMixtures(patches, self.shapes)
         mesh = Mesh(self.coordinates.mesh)
-        self.fine = choose("auto").fine_energy(mesh, [Stretch(ALPHA), Bend(BETA), Volume(GAMMA)])
+        self.fine = choose(backend).fine_energy(mesh, [Stretch(ALPHA), Bend(BETA), Volume(GAMMA)])
         closed = all(encloses(x, mesh.connectivity) for x in self.shapes)
         #: Measures of the given shapes, at a size of 100.
         self.rest = self.fine.energy.rest_of(self.scale * self.shapes)
