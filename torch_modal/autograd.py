@@ -3,7 +3,7 @@
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import wraps
+from functools import partial, wraps
 from itertools import zip_longest
 from typing import Any, ParamSpec, TypeVar
 
@@ -16,6 +16,7 @@ from torch_modal import trees
 
 Made = TypeVar("Made")
 Given = ParamSpec("Given")
+Linear = Callable[[Tensor], Tensor]
 
 
 def traced(x: Tensor) -> bool:
@@ -261,6 +262,33 @@ def applied(function: Any, *given: Any) -> Any:
     """
     alone = not torch.is_grad_enabled() and plain(*(value for value in given if isinstance(value, Tensor)))
     return function.forward(*given) if alone else function.apply(*given)
+
+
+class _LinearMap(torch.autograd.Function):
+    @staticmethod
+    def forward(apply: Linear, transpose: Linear, x: Tensor) -> Tensor:
+        return apply(x.detach())
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        ctx.forwards, ctx.backwards, _ = inputs
+
+    @staticmethod
+    def jvp(ctx: Any, _: None, __: None, tangent: Tensor) -> Tensor:
+        return linear_map(ctx.forwards, ctx.backwards, tangent)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[None, None, Tensor]:
+        return None, None, linear_map(ctx.backwards, ctx.forwards, grads[0])
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[Any, ...], apply: Linear, transpose: Linear, x: Tensor) -> tuple[Tensor, int]:
+        return linear_map(apply, transpose, x.movedim(in_dims[2], 0)), 0
+
+
+#: A linear map of a tensor, with all derivatives and transforms, from a map and its transpose without any. Both take
+#: further dimensions in front, which ``vmap`` adds.
+linear_map: Callable[[Linear, Linear, Tensor], Tensor] = partial(applied, _LinearMap)
 
 
 def pushed(function: Callable[..., Any], given: Sequence[Tensor], tangents: Sequence[Tensor | None]) -> Any:

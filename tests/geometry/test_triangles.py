@@ -1,6 +1,7 @@
 """Rotations and strains of triangles against truth by hand, and the Poisson problem against known shapes."""
 
 import pickle
+from collections.abc import Callable
 from functools import partial
 
 import numpy as np
@@ -10,6 +11,7 @@ import trimesh
 from conftest import Shapes, random_rotation
 from scipy import sparse
 
+from torch_modal.autograd import linear_map
 from torch_modal.data.random_transforms import mirror
 from torch_modal.geometry import sparse as sparse_systems
 from torch_modal.geometry.connectivity import Connectivity
@@ -319,6 +321,35 @@ def test_sparse_solver(has_cholespy: bool, monkeypatch: pytest.MonkeyPatch) -> N
             partial(solve_by, lambda own=solver: own), right[0, :2].clone().requires_grad_()
         )
     assert torch.equal(SparseSolver(sparse.eye(12), np.empty(0, dtype=np.int64))(right), torch.zeros_like(right))
+
+
+def test_linear_maps_have_all_derivatives() -> None:
+    """Of maps without any: against the same matrix, that torch differentiates."""
+    generator = torch.Generator().manual_seed(0)
+    matrix = torch.randn(3, 5, generator=generator, dtype=F64)
+    x, towards = torch.randn(2, 2, 5, 2, generator=generator, dtype=F64)
+
+    def by_numpy(own: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
+        return torch.from_numpy(own.numpy() @ x.numpy())
+
+    def linear(x: torch.Tensor) -> torch.Tensor:
+        return linear_map(partial(by_numpy, matrix), partial(by_numpy, matrix.T), x)
+
+    def known(x: torch.Tensor) -> torch.Tensor:
+        return matrix @ x
+
+    leaf = x.clone().requires_grad_()
+    assert torch.autograd.gradcheck(linear, leaf) and torch.autograd.gradgradcheck(linear, leaf)
+    found, expected = (torch.func.jvp(f, (x,), (towards,))[1] for f in (linear, known))
+    torch.testing.assert_close(found, expected)
+
+    def curved(f: Callable[[torch.Tensor], torch.Tensor], x: torch.Tensor) -> torch.Tensor:
+        return f(f(x).sin().mean() * x).cos().sum()
+
+    for outer in (torch.func.jacrev, torch.func.jacfwd):
+        for inner in (torch.func.grad, torch.func.jacrev):
+            found, expected = (torch.vmap(outer(inner(partial(curved, f))))(x) for f in (linear, known))
+            torch.testing.assert_close(found, expected)
 
 
 def test_sparse_solver_refuses_an_indefinite_matrix() -> None:

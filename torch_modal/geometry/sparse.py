@@ -21,7 +21,7 @@ from scipy.sparse.linalg import SuperLU, splu
 from torch import Tensor
 
 from torch_modal.arrays import FloatArray, IntArray
-from torch_modal.autograd import Recent, applied, untraced
+from torch_modal.autograd import Recent, linear_map, untraced
 
 try:
     import cholespy
@@ -144,29 +144,7 @@ def solve_by(solver: Callable[[], Solve], right: Tensor) -> Tensor:
 
     The solver is made lazily: inside ``torch.func`` transforms, tensors cannot be read earlier.
     """
-    return applied(_Solve, solver, right)
-
-
-class _Solve(torch.autograd.Function):
-    @staticmethod
-    def forward(solver: Callable[[], Solve], right: Tensor) -> Tensor:
-        return solver()(right)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-        ctx.solver = inputs[0]
-
-    @staticmethod
-    def jvp(ctx: Any, _: None, tangent: Tensor) -> Tensor:
-        return _Solve.apply(ctx.solver, tangent)
-
-    @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple[None, Tensor]:
-        return None, _Solve.apply(ctx.solver, grads[0])
-
-    @staticmethod
-    def vmap(info: Any, in_dims: tuple[Any, ...], solver: Callable[[], Solve], right: Tensor) -> tuple[Tensor, int]:
-        return _Solve.apply(solver, right.movedim(in_dims[1], 0)), 0
+    return linear_map(lambda x: solver()(x), lambda x: solver()(x), right)
 
 
 def graph_laplacian(edges: IntArray, weights: FloatArray, n: int) -> sparse.csr_matrix:

@@ -1,13 +1,12 @@
 """The coarse mesh that the energy of the modal solve is evaluated on, with as many faces as the modes need."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from torch_modal.arrays import IntArray
-from torch_modal.autograd import applied
+from torch_modal.autograd import linear_map
 from torch_modal.elastic.stretch import MIN_RELATIVE_LENGTH
 from torch_modal.elastic.term import Mesh
 from torch_modal.geometry.connectivity import Connectivity
@@ -66,9 +65,22 @@ class CoarseMesh(nn.Module):
 
     def restrict(self, x: Tensor) -> Tensor:
         """Cluster averages, linear in ``x``. *Shape:* ``(..., V, 3) -> (..., V_coarse, 3)``."""
-        flat = x.reshape(-1, *x.shape[-2:])
-        means = applied(_ClusterMeans, flat, self.members, self.first_member, self.shares_of_members, self.clusters)
-        return means.reshape(*x.shape[:-2], self.n_vertices, 3)
+        members, first, shares, clusters = self.members, self.first_member, self.shares_of_members, self.clusters
+
+        def means(x: Tensor) -> Tensor:
+            # Sums over clusters, one after the other: ten times as fast as `index_add`. As a matrix, the tensor is
+            # transposed in blocks, several times as fast as by its dimensions.
+            flat, shape = x.reshape(-1, *x.shape[-2:]), (*x.shape[:-2], len(first), 3)
+            rows = flat[0].contiguous() if len(flat) == 1 else flat.flatten(1).T.contiguous().view(len(members), -1)
+            sums = nn.functional.embedding_bag(members, rows, first, mode="sum", per_sample_weights=shares.detach())
+            ordered = sums if len(flat) == 1 else sums.unflatten(1, (3, len(flat))).permute(2, 0, 1).contiguous()
+            return ordered.view(shape)
+
+        def of_members(to_means: Tensor) -> Tensor:
+            received = shares[:, None] * to_means.index_select(-2, clusters[members])
+            return torch.zeros_like(received).index_copy(-2, members, received)
+
+        return linear_map(means, of_members, x)
 
 
 def resolving(shapes: Tensor, whole: Mesh, n_faces: int, modes: Sequence[Tensor]) -> Coarsening:
@@ -137,34 +149,3 @@ def spread(fine: Tensor, coarse: Tensor) -> float:
     half = torch.linalg.solve_triangular(lower, coarse / level + eye, upper=False)
     ratios = torch.linalg.eigvalsh(torch.linalg.solve_triangular(lower, half.mT, upper=False))
     return float(ratios[-1] / ratios[0].clamp_min(torch.finfo(fine.dtype).tiny))
-
-
-class _ClusterMeans(torch.autograd.Function):
-    """Sums over clusters, one after the other: ten times as fast as ``index_add``. *Shape:* ``(B, V, 3)``."""
-
-    @staticmethod
-    def forward(x: Tensor, members: Tensor, first_member: Tensor, shares: Tensor, clusters: Tensor) -> Tensor:
-        # As a matrix it is transposed in blocks, several times as fast as by its dimensions.
-        alone = len(x) == 1
-        rows = x.detach()[0].contiguous() if alone else x.detach().flatten(1).T.contiguous().view(x.shape[1], -1)
-        means = nn.functional.embedding_bag(members, rows, first_member, mode="sum", per_sample_weights=shares.detach())
-        return means[None] if alone else means.unflatten(1, (3, len(x))).permute(2, 0, 1).contiguous()
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: Tensor) -> None:
-        ctx.given = inputs[1:]
-
-    @staticmethod
-    def jvp(ctx: Any, tangent: Tensor, *_: None) -> Tensor:
-        return _ClusterMeans.apply(tangent, *ctx.given)
-
-    @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        members, _, shares, clusters = ctx.given
-        received = shares[:, None] * grads[0].index_select(-2, clusters[members])
-        return torch.zeros_like(received).index_copy(-2, members, received), None, None, None, None
-
-    @staticmethod
-    def vmap(info: Any, in_dims: tuple[Any, ...], x: Tensor, *given: Tensor) -> tuple[Tensor, int]:
-        flat = x.movedim(in_dims[0], 0)
-        return _ClusterMeans.apply(flat.flatten(0, 1), *given).unflatten(0, flat.shape[:2]), 0

@@ -2,14 +2,14 @@
 
 import math
 import warnings
-from typing import Any
+from functools import partial
 
 import numpy as np
 import torch
 from scipy import sparse
 from torch import Tensor, nn
 
-from torch_modal.autograd import full_precision, lasting, plain
+from torch_modal.autograd import full_precision, lasting, linear_map, traced
 from torch_modal.geometry.rigid import best_rotation
 from torch_modal.geometry.triangle_frames import sides
 from torch_modal.geometry.vectors import cross, inverse, norm
@@ -171,37 +171,23 @@ class Passengers(nn.Module):
 
     def _mixed(self, values: Tensor) -> Tensor:
         """Weighted sums over the vertices that points follow. *Shape:* ``(B, V, n) -> (B, P, n)``."""
-        if not plain(values):  # sparse products know neither
+        if traced(values):  # sparse products are not
             counts = self.starts.diff().long()
             row = torch.arange(len(self), device=values.device).repeat_interleave(counts, output_size=len(self.values))
             each = values[:, self.columns.long()] * self.values[:, None]
             return values.new_zeros(values.shape[0], len(self), values.shape[2]).index_add(1, row, each)
-        columns, (p, v) = values.movedim(0, 1).flatten(1), (len(self), len(self.reference))
-        matrix = _csr(self.starts, self.columns, self.values, (p, v))
-        transposed = _csr(self.transposed_starts, self.transposed_columns, self.transposed_values, (v, p))
-        found: Tensor = _Product.apply(columns, matrix, transposed)
-        return found.unflatten(1, (len(values), values.shape[2])).movedim(1, 0)
+        product = partial(_product, self.starts, self.columns, self.values)
+        transposed = partial(_product, self.transposed_starts, self.transposed_columns, self.transposed_values)
+        return linear_map(product, transposed, values)
 
 
-class _Product(torch.autograd.Function):
-    """Product of a sparse matrix, given with its transpose, and a dense one."""
-
-    @staticmethod
-    def forward(ctx: Any, x: Tensor, matrix: Tensor, transposed: Tensor) -> Tensor:
-        ctx.save_for_backward(matrix, transposed)
-        return matrix @ x
-
-    @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        matrix, transposed = ctx.saved_tensors
-        found: Tensor = _Product.apply(grad.contiguous(), transposed, matrix)
-        return found, None, None
-
-
-def _csr(starts: Tensor, columns: Tensor, values: Tensor, shape: tuple[int, int]) -> Tensor:
+def _product(starts: Tensor, columns: Tensor, values: Tensor, x: Tensor) -> Tensor:
+    """Product of a sparse matrix of P rows and a dense one. *Shape:* ``(..., V, n) -> (..., P, n)``."""
+    rows, n = x.movedim(-2, 0), len(starts) - 1
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Sparse CSR")  # "beta", since 2021
-        return torch.sparse_csr_tensor(starts, columns, values, shape, check_invariants=False)
+        matrix = torch.sparse_csr_tensor(starts, columns, values, (n, len(rows)), check_invariants=False)
+    return (matrix @ rows.flatten(1)).view(n, *rows.shape[1:]).movedim(0, -2)
 
 
 def _frames(rows: Tensor, faces: Tensor) -> Tensor:
