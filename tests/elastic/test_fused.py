@@ -37,7 +37,6 @@ from torch_modal.elastic.steps import FineEnergy, relax
 from torch_modal.elastic.stretch import Stretch
 from torch_modal.elastic.term import Mesh
 from torch_modal.elastic.volume import Volume
-from torch_modal.elastic.volumes import Volumes
 from torch_modal.elastic.warp_procrustes import mean_pose
 from torch_modal.elastic.warp_rotations import WarpRotations
 from torch_modal.errors import MissingPackageError
@@ -312,11 +311,6 @@ class TestAlignment:
             torch.testing.assert_close(found @ found.mT, torch.eye(3, dtype=DOUBLE).expand_as(found))
             assert (torch.linalg.det(found) > 0).all()
         assert all(x.isfinite().all() for x in gradients(lambda *x: mean_pose(*x)[1], given))
-
-    def test_volumes(self, small_bars: Shapes) -> None:
-        mesh = Connectivity(small_bars.faces.numpy())
-        found, truth = (kind(mesh)(small_bars.keyframes[None]) for kind in (WarpVolumes, Volumes))
-        torch.testing.assert_close(found, truth, rtol=1e-12, atol=0)
 
 
 class TestRotations:

@@ -3,12 +3,13 @@
 import numpy as np
 import pytest
 import torch
+import trimesh
 from conftest import random_rotation
 from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
 from torch.autograd import gradcheck, gradgradcheck
 
-from torch_modal.geometry.rigid import RigidMotion, best_fit, best_rotation, blend, centroid
+from torch_modal.geometry.rigid import RigidMotion, best_fit, best_rotation, blend, centroid, signed_volumes
 from torch_modal.geometry.rotations import exp
 
 EYE = torch.eye(3, dtype=torch.float64)
@@ -205,3 +206,12 @@ def test_blend_of_a_rigid_motion_stays_congruent(cloud: Tensor, weights: Tensor)
     between = blend(cloud.expand(5, -1, -1), turned.expand(5, -1, -1), times, weights)
     truth = distances(cloud).expand(5, -1, -1)
     torch.testing.assert_close(distances(between), truth, atol=1e-11, rtol=0)
+
+
+def test_signed_volumes_of_ellipsoids_and_their_mirror_images() -> None:
+    mesh = trimesh.creation.icosphere(2)
+    x, corners = torch.from_numpy(mesh.vertices).double(), torch.from_numpy(mesh.faces).T.contiguous()
+    scales = torch.tensor([[1.0, 2, 3], [1, -2, 3], [2, 2, 0]], dtype=torch.float64)
+    shapes = (x * scales[:, None]) @ about([1, 2, 3], 0.7).mT + torch.tensor([1.0, 2, 3])
+    expected = mesh.volume * scales.prod(1)
+    torch.testing.assert_close(signed_volumes(shapes[None], corners), expected[None], rtol=1e-12, atol=1e-12)

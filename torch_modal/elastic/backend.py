@@ -22,7 +22,6 @@ from torch_modal.elastic.kernels.launch import kernels, launch, load_kernels
 from torch_modal.elastic.modal import KernelModalEnergy, ModalEnergy
 from torch_modal.elastic.steps import FineEnergy
 from torch_modal.elastic.term import Mesh, Term
-from torch_modal.elastic.volumes import KernelVolumes, Volumes
 from torch_modal.elastic.warp_crossings import WarpPairs
 from torch_modal.elastic.warp_procrustes import mean_pose as mean_pose_by_kernel
 from torch_modal.elastic.warp_quasi_newton import update
@@ -64,10 +63,6 @@ class TorchBackend:
     def fine_energy(self, mesh: Mesh, terms: Sequence[Term]) -> FineEnergy:
         """All terms on the caller's mesh, for steps of all vertices. Those of Eq. 5 come first."""
         return FineEnergy(mesh, terms)
-
-    def volumes(self, mesh: Connectivity) -> Volumes:
-        """Signed volumes of closed shapes."""
-        return Volumes(mesh)
 
     def distortion(self, mesh: Mesh, further: Energy | None) -> Distortion:
         """A bounded measure of shapes, with terms beside Eq. 5 where there are some."""
@@ -124,10 +119,6 @@ class WarpBackend(TorchBackend):
     def fine_energy(self, mesh: Mesh, terms: Sequence[Term]) -> FineEnergy:
         """Overrides the base class."""
         return KernelFineEnergy(mesh, terms)
-
-    def volumes(self, mesh: Connectivity) -> KernelVolumes:
-        """Overrides the base class."""
-        return KernelVolumes(mesh)
 
     def distortion(self, mesh: Mesh, further: Energy | None) -> Distortion:
         """Overrides the base class."""

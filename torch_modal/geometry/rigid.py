@@ -7,6 +7,7 @@ from torch import Tensor
 
 from torch_modal.autograd import traced, transformed
 from torch_modal.geometry.rotations import exp, log
+from torch_modal.geometry.vectors import pick
 
 # Required gain of a reflection, in mean cosine between normals: mirrored poses of one body have at least 0.44, poses of
 # thin plates at most 0.2.
@@ -132,3 +133,13 @@ def looks_mirrored(first: Tensor, second: Tensor, faces: Tensor) -> Tensor:
     # A reflection M flips normals, and -M is the best rotation of the negative covariance.
     gain = ((best_rotation(-covariance) - best_rotation(covariance)) * alike).sum((1, 2))
     return gain > MIRRORED * total
+
+
+def signed_volumes(x: Tensor, corners: Tensor) -> Tensor:
+    """Volumes of closed shapes: heights of their faces over a plane, times areas in it.
+
+    *Shape:* ``(..., V, 3), (3, F) -> (...)``.
+    """
+    x, y, z = x.mT.contiguous().unbind(-2)
+    (xa, xb, xc), (ya, yb, yc), (za, zb, zc) = ([pick(row, corner) for corner in corners] for row in (x, y, z))
+    return ((za + zb + zc) * ((xb - xa) * (yc - ya) - (xc - xa) * (yb - ya))).sum(-1) / 6

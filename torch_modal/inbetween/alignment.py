@@ -11,7 +11,7 @@ from torch_modal.elastic.backend import TorchBackend
 from torch_modal.errors import MeshWarning
 from torch_modal.geometry.canonical import CANONICAL_SIZE, size
 from torch_modal.geometry.connectivity import Connectivity, vertex_areas
-from torch_modal.geometry.rigid import best_rotation, centroid, looks_mirrored
+from torch_modal.geometry.rigid import best_rotation, centroid, looks_mirrored, signed_volumes
 
 # A key-frame smaller than this part of the reference is a point.
 SMALLEST_SIZE = 1e-6
@@ -45,6 +45,7 @@ class KeyframeAlignment(nn.Module):
     roots: Tensor
     rooted: Tensor
     extent: Tensor
+    corners: Tensor
 
     def __init__(self, references: Tensor, mesh: Connectivity, backend: TorchBackend) -> None:
         super().__init__()
@@ -69,7 +70,8 @@ class KeyframeAlignment(nn.Module):
         extent = (self.reference.amax(0) - self.reference.amin(0)).norm()
         #: Diagonal of the bounding box of the first reference.
         self.register_buffer("extent", extent, persistent=False)
-        self.volumes = backend.volumes(mesh)
+        #: Of the faces. *Shape:* ``(3, F)``.
+        self.register_buffer("corners", torch.tensor(mesh.faces).T.contiguous(), persistent=False)
         self.closed = len(mesh.boundary_edges) == 0
         self.size_warned = False
 
@@ -95,7 +97,7 @@ class KeyframeAlignment(nn.Module):
         x, usable = self.checked(keyframes.mT.contiguous())
         turned, pose = self._aligned(x, weights)
         shapes = turned.mT.contiguous()
-        usable = usable & ~self.mirrored(shapes.detach(), weights)
+        usable = usable & ~self.mirrored(turned.detach().mT, weights)
         return shapes, pose, ((usable | (weights == 0)) & known).all(1)
 
     def checked(self, keyframes: Tensor) -> tuple[Tensor, Tensor]:
@@ -133,13 +135,13 @@ class KeyframeAlignment(nn.Module):
         """True for mirror images of the heaviest, of closed surfaces. *Shape:* ``(B, K, V, 3), (B, K) -> (B, K)``."""
         if not self.closed:
             return torch.zeros_like(weights, dtype=torch.bool)
-        volumes, heaviest = self.volumes(shapes), weights.argmax(1, keepdim=True)
+        volumes, heaviest = signed_volumes(shapes, self.corners), weights.argmax(1, keepdim=True)
         turned = volumes * volumes.gather(1, heaviest) < 0
         if plain(turned) and not turned.any():
             return turned
         first = shapes.take_along_dim(heaviest[..., None, None], 1).expand_as(shapes)
         own, of = first.flatten(0, 1), shapes.flatten(0, 1)
-        return turned & looks_mirrored(own, of, self.volumes.corners.T).view_as(turned)
+        return turned & looks_mirrored(own, of, self.corners.T).view_as(turned)
 
     def _warn_of_size(self, sizes: Tensor) -> None:
         """Say, once for a layer, that key-frames and bases seem to be in different units."""
