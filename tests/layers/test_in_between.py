@@ -105,7 +105,7 @@ class TestValues:
         straight = start.solve(*bars.keyframes[1:], 0.4)
         monkeypatch.setattr(blend, "forward", lambda self, shapes, weights, straight: 3 * straight)
         found = layer.solve(*bars.keyframes[1:], 0.4)
-        assert found.solution.status == Status.FELL_BACK
+        assert found.solution.status == Status.FELL_BACK and float(found.solution.start_weights[1]) == 1
         torch.testing.assert_close(found.shapes, straight.shapes, rtol=0, atol=1e-9)
 
     def test_a_blend_that_is_not_finite_is_straight(self, bars: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,21 +4,28 @@ import dataclasses
 import math
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from conftest import Shapes
 from scipy.interpolate import CubicSpline
 from shapes import diagonal, edge_error, largest
+from sheets import cylinder, rectangle, rolled
 from terms import Area
 from torch import Tensor, nn
 
 import torch_modal as tm
 from torch_modal.data.samples import load_sample
+from torch_modal.geometry.rotations import exp
 from torch_modal.motion import subdivide as sequence
 from torch_modal.motion.cubics import Cubics, Squared, cubics, offset
 from torch_modal.motion.path import Path
 
 DOUBLE = torch.float64
+
+
+def quarter_turns(k: float) -> Tensor:
+    return exp(torch.tensor([0.0, 0.0, k * math.pi / 2], dtype=DOUBLE))
 
 
 def times(*values: float) -> Tensor:
@@ -235,11 +242,12 @@ def test_a_spline_depends_on_all_key_frames_and_a_pair_on_its_own(motion: Shapes
     assert felt.tolist() == [smooth, smooth, smooth, True, True]
 
 
+class Shrinking(Area):
+    part = 0.9
+
+
 def test_gradients_reach_a_term(motion: Shapes) -> None:
     """A course is at rest; what pulls at it is felt, and so is its stiffness."""
-
-    class Shrinking(Area):
-        part = 0.9
 
     def shapes(stiffness: Tensor) -> Tensor:
         objective = tm.Objective(terms=(Shrinking(stiffness),), coarse_faces=200)
@@ -408,6 +416,57 @@ def test_solve_tells_how_it_went(motion: Shapes, path: Path) -> None:
     assert bool(result.solution.usable.all())
     torch.testing.assert_close(result.solution.energy[2], alone.solution.energy)
     assert nothing.shapes.shape == (0, *motion.keyframes.shape[1:]) and nothing.solution.status.shape == (0,)
+
+
+def test_explain_tells_where_velocities_are_limited(bars: Shapes) -> None:
+    """A bar bends, rests for an interval, and goes back: at a key-frame, and within intervals."""
+    own = bars.pick(0, 1, 1, 0)
+    why = Path(own.keyframes, own.faces).explain(own.keyframes, times(0.4, 1.0, 1.5, 2.5)[:, None])
+    assert why.interval.tolist() == [[0], [1], [1], [2]]
+    torch.testing.assert_close(why.fraction, times(0.4, 0.0, 0.5, 0.5)[:, None])
+    assert torch.equal(why.limited > 0.99, torch.tensor([[[0, 1]], [[1, 1]], [[1, 1]], [[1, 0]]]).bool())
+    assert not why.even.any() and not why.solution.start_weights.any() and largest(why.displacement) < 1e-9
+    assert bool((why.turns[[0, 3], :, 1] > 0.5).all()) and largest(why.turns[1:3]) < 1e-6
+    even = torch.stack([bars.keyframes[0] @ quarter_turns(k).mT for k in (0, 0.6, 1.2, 1.8)])
+    steady = Path(even, bars.faces).explain(even, 1.5)
+    assert not steady.limited.any()
+    torch.testing.assert_close(steady.turns, times(0.6 * math.pi / 2, 0), rtol=0, atol=1e-6)
+    pairs = Path(own.keyframes, own.faces, smooth=False).explain(own.keyframes, 1.0)
+    assert pairs.even and not pairs.limited.any()
+
+
+def test_explain_tells_what_is_blended(bars: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, t = Path(bars.keyframes, bars.faces), times(0.3, 0.7)
+    spline, knots = path.splines[0], path.knots(bars.keyframes[None])
+    assert knots is not None
+    which = torch.zeros(2, dtype=torch.int64)
+    straight = spline.alignment.restore(spline.straight(knots[0], 0, which, t), spline.pose(knots[0], 0, which, t))
+    smooth = path(bars.keyframes, t)
+    monkeypatch.setattr(path.distortions[0], "forward", lambda *_: torch.tensor([[2.5e30, 1], [1e30, 1e30]]).double())
+    why = path.explain(bars.keyframes, t)
+    torch.testing.assert_close(why.solution.start_weights, times(0.5, 0)[:, None])
+    torch.testing.assert_close(path(bars.keyframes, t), torch.stack([(smooth + straight)[0] / 2, smooth[1]]))
+
+
+def test_explain_tells_of_more_than_a_full_turn() -> None:
+    """A strip that rolls up, and goes on a little."""
+    points, faces = rectangle(6.0, 1.0, 0.25)
+    shapes = [cylinder(points, time, lambda s: rolled(s, 6.0, 3.0), math.radians(80)) for time in (0.0, 0.9, 1.0)]
+    x = torch.from_numpy(np.stack(shapes))
+    assert Path(x, torch.from_numpy(faces)).explain(x, times(0.5, 1.5)).even.tolist() == [True, False]
+
+
+def test_explain_tells_what_a_term_moved(motion: Shapes) -> None:
+    """Of two motions at two times each."""
+    objective = tm.Objective(terms=(Shrinking(300.0),), coarse_faces=200)
+    path = Path(motion.bases, motion.faces, objective=objective)
+    keyframes, t = torch.stack([motion.keyframes, 1.1 * motion.keyframes])[:, None], times(1.0, 2.5)
+    why = path.explain(keyframes, t)
+    plain = Path(motion.keyframes, motion.faces)(keyframes, t)
+    moved = (path(keyframes, t) - plain).norm(dim=-1).amax(-1)
+    torch.testing.assert_close(why.displacement, moved, rtol=1e-6, atol=1e-9)
+    assert largest(moved[:, 0]) < 1e-9 < 1e-4 * diagonal(motion.keyframes[0]) < float(moved[:, 1].min())
+    assert why.limited.shape == (2, 2, 2) and why.solution.n_steps.shape == (2, 2)
 
 
 def test_times_in_float32_reach_the_key_frames(motion: Shapes) -> None:

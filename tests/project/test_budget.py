@@ -21,11 +21,11 @@ import torch
 import torch_modal as tm
 
 BOUNDS = {
-    "lines": 27951,
-    "lines of code": 18062,
+    "lines": 28015,
+    "lines of code": 18099,
     "files": 194,
-    "functions": 1543,
-    "named tuples": 51,
+    "functions": 1544,
+    "named tuples": 53,
     "docstrings that begin with no noun": 11,
     "functions of in-between": 136,
     "files of in-between": 32,

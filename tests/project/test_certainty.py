@@ -59,9 +59,11 @@ class TestFallBack:
 
         good = layer.solve(x_a, x_b, torch.tensor([0.5, 0.5]))
         assert good.solution.status.tolist() == [Status.CONVERGED] * 2
+        assert not good.solution.start_weights.any()
         monkeypatch.setattr(type(space), "lift", lift)
         result = layer.solve(x_a, x_b, torch.tensor([0.5, 0.5]))
         assert result.solution.status.tolist() == [Status.FELL_BACK, Status.CONVERGED]
+        assert result.solution.start_weights.tolist() == [[1, 0], [0, 0]]
         assert result.solution.usable.all() and result.solution.converged.tolist() == [False, True]
         torch.testing.assert_close(result.shapes[1], good.shapes[1], rtol=0, atol=1e-10)
         # Without a step the shape is the blend by local rotations.

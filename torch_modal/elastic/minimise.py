@@ -75,6 +75,9 @@ class Solution(NamedTuple):
     distortion_ratio: Tensor | None = None
     """Distortion of the minimiser over that of a start, the largest of all; starts count as strained by 2 % at least.
     From 1.1 on the shape is blended into its start, from 1.2 on (paths: 2 and 3) replaced by it. *Shape:* ``(B,)``."""
+    start_weights: Tensor | None = None
+    """Parts, 0 to 1, of the starts in the shape: the blend by local rotations, and linear interpolation; of a smooth
+    path, the spline of the vertices. *Shape:* ``(B, 2)``, or ``(B, 1)``."""
 
     @property
     def usable(self) -> Tensor:

@@ -43,10 +43,11 @@ def no_worse(
         slack: How many times as much distortion as its start a shape may have.
 
     Returns:
-        The shapes, and the solution with ratios of distortions, in which those that a start has replaced are marked.
+        The shapes, and the solution with ratios of distortions and weights of the starts, in which shapes that a start
+        has replaced are marked.
     """
     if not len(x):
-        return x, solution._replace(distortion_ratio=solution.energy)
+        return x, solution._replace(distortion_ratio=solution.energy, start_weights=x.new_zeros(0, len(starts)))
     shapes = [x, *starts]
     with torch.no_grad():
         found = distortion(shapes, rests)
@@ -54,7 +55,7 @@ def no_worse(
     # Added to the distortions of the starts: where nobody sees a strain, nothing is worse.
     slight = distortion.slight(rests.stiffness, x)
     ratio = (found[0] / (found[1:] + slight)).amax(0)
-    solution = solution._replace(distortion_ratio=ratio)
+    solution = solution._replace(distortion_ratio=ratio, start_weights=found.new_zeros(len(x), len(starts)))
     if numbers and bool((ratio <= _least(slack)).all()):
         return x, solution
     if torch.is_grad_enabled():
@@ -62,27 +63,28 @@ def no_worse(
         # To first order, the shapes depend on the distortions where they are blended.
         if not numbers or bool(((parts > 0) & (parts < 1)).any()):
             found = distortion(shapes, rests)
-    x, replaced = blended(x, starts, found, slight, slack)
-    fell = replaced & (solution.status != Status.INVALID)
-    return x, solution._replace(status=torch.where(fell, Status.FELL_BACK, solution.status))
+    x, replaced, weights = blended(x, starts, found, slight, slack)
+    status = torch.where(replaced & (solution.status != Status.INVALID), Status.FELL_BACK, solution.status)
+    return x, solution._replace(status=status, start_weights=weights.detach())
 
 
 def blended(
     x: Tensor, starts: Sequence[Tensor], distortion: Tensor, slight: Tensor, slack: float = SLACK
-) -> tuple[Tensor, Tensor]:
-    """Shapes, blended into their starts by the distortions of all, and where a start has replaced one.
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Shapes, blended into their starts by the distortions of all, where a start has replaced one, and their weights.
 
-    *Shape:* ``(B, V, 3), (1 + S, B), (B,) -> (B, V, 3), (B,)``.
+    *Shape:* ``(B, V, 3), (1 + S, B), (B,) -> (B, V, 3), (B,), (B, S)``.
     """
     own, *others = distortion
-    replaced = torch.zeros_like(own, dtype=torch.bool)
+    replaced, weights = torch.zeros_like(own, dtype=torch.bool), own.new_zeros(len(own), 0)
     for start, other in zip(starts, others, strict=True):
         part = _part(own, other + slight, slack)
         replaced = replaced | (part == 1)
+        weights = torch.cat([(1 - part)[:, None] * weights, part[:, None]], 1)
         whole = part[:, None, None]
         x = torch.where(whole < 1, torch.lerp(x, start, whole), start)
         own = torch.where(part < 1, torch.lerp(own, other, part), other)
-    return x, replaced
+    return x, replaced, weights
 
 
 def _least(slack: float) -> float:

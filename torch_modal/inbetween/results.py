@@ -70,7 +70,7 @@ def unminimised(x: Tensor, usable: Tensor) -> Solution:
 
 
 def of_bodies(results: Sequence[InBetweenResult], vertices: Sequence[Any]) -> InBetweenResult:
-    """Results of bodies as one, from the vertices of each: with the sum of the energies and the worst status."""
+    """Results of bodies as one, from the vertices of each: with the sum of the energies, otherwise the worst of all."""
     if len(results) == 1:
         return results[0]
     a, *numbers = zip(*(result.solution[:5] for result in results), strict=True)
@@ -78,9 +78,10 @@ def of_bodies(results: Sequence[InBetweenResult], vertices: Sequence[Any]) -> In
     worst = (status % Status.FELL_BACK).amax(0)  # that a body fell back is the least of all
     worst = torch.where(worst > 0, worst, status.amax(0))
     shapes = torch.cat([result.shapes for result in results], 1)[:, torch.argsort(torch.cat(list(vertices)))]
-    ratios: Any = [result.solution.distortion_ratio for result in results]
+    compared: Any = [(result.solution.distortion_ratio, result.solution.start_weights) for result in results]
+    ratio, weights = (torch.stack(each).amax(0) for each in zip(*compared, strict=True))
     solution = Solution(torch.cat(a, 1), energy.sum(0), norm.amax(0), n_steps.amax(0), worst)
-    return InBetweenResult(shapes, solution._replace(distortion_ratio=torch.stack(ratios).amax(0)))
+    return InBetweenResult(shapes, solution._replace(distortion_ratio=ratio, start_weights=weights))
 
 
 def report(solution: Solution, solver: Solver) -> None:

@@ -27,7 +27,7 @@ from torch_modal.layers.base import Bases, BasisBuffers, PreciseModule, basis_bu
 from torch_modal.layers.blend import Blend
 from torch_modal.layers.in_between import InBetween
 from torch_modal.motion.cubics import Scheme, by_interval, located, wrapped
-from torch_modal.motion.spline import Knots, Spline
+from torch_modal.motion.spline import Explanation, Knots, Spline
 
 # Even times between two key-frames at which a path looks for contacts.
 N_SEARCHED = 31
@@ -207,6 +207,23 @@ class Path(PreciseModule):
         ends = torch.stack([flat[which, k] for k in pairs.unbind(-1)], 1).to(keyframes.dtype)
         exact = with_exact_keyframes(result.shapes, ends, torch.stack([1 - u, u], -1))
         return result._replace(shapes=exact).unflattened(lead)
+
+    @torch.no_grad()
+    @full_precision
+    def explain(self, keyframes: Tensor, t: Tensor | float) -> Explanation:
+        """Causes of sudden changes in the motion, at given times. Arguments as for :meth:`forward`."""
+        flat, which, segment, u, lead = self._located(keyframes, t)
+        splines, n = self.splines, len(self.pairs)
+        knots = [spline.knots(flat[:, :, own]) for spline, own in zip(splines, self.vertices, strict=True)]
+        limited, turns = zip(*map(Spline.explain, splines, knots), strict=True)
+        part, turn = self.smooth * torch.cat(limited, -1).to(u).mean(-1), torch.stack(turns).amax(0)
+        even = [not self.smooth or any(own.rotations[i].clusters is not None for own in splines) for i in range(n)]
+        known, result = knots if self.smooth else None, self.solve(keyframes, t)
+        alone = joined(*by_interval(segment, n, lambda i, rows: self._alone(known, flat, i, which[rows], u[rows])))
+        moved = (result.shapes.reshape_as(alone.shapes) - alone.shapes).norm(dim=-1).amax(-1)
+        of_intervals = part[segment, :, which], torch.tensor(even, device=u.device)[segment], turn[segment, :, which]
+        found = (x.reshape(lead + x.shape[1:]) for x in (segment, u, *of_intervals, moved))
+        return Explanation._make([*found, result.solution])
 
     def knots(self, motions: Tensor) -> list[Knots] | None:
         """The knots of each body; None if the path is not smooth. *Shape:* ``(L, K, V, 3)``."""
