@@ -27,15 +27,13 @@ class _MeanPose:
 
     @staticmethod
     def run(kept: list[Any] | None, *given: Tensor) -> tuple[Tensor, ...]:
-        """See :class:`~torch_modal.elastic.kernels.function.Operation`."""
         turns, pose = torch.empty_like(given[0]), torch.empty_like(given[0][:, 0])
         launch(kernels("procrustes").mean_pose, (len(pose),), [*given, turns, pose])
         return turns, pose
 
     @staticmethod
     def back(kept: list[Any], grads: Sequence[Tensor], *given: Tensor) -> tuple[Tensor | None, ...]:
-        """See :class:`~torch_modal.elastic.kernels.function.Operation`."""
         found = [torch.zeros_like(x) for x in given]
-        both = _MeanPose.run(None, *given)
-        launch(kernels("rotations_adjoint").mean_pose, (len(given[0]),), [*given, *both, *grads, *found])
+        scratch = [torch.empty_like(x) for x in grads]
+        launch(kernels("rotations_adjoint").mean_pose, (len(given[0]),), [*given, *scratch], [*found, *grads])
         return tuple(found)

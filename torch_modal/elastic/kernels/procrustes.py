@@ -2,37 +2,33 @@
 
 import warp as wp
 
-from torch_modal.elastic.kernels.elements import real, vec4
-from torch_modal.elastic.kernels.rotations import about, first_axis, half_turn, quaternion_of, second_axis
+from torch_modal.elastic.kernels.elements import HALF, TINIEST, real, vec3
+from torch_modal.elastic.kernels.rotations import about, half_turn, quaternion
+
+EPSILON = wp.constant(real(64 * 2.0**-52))
 
 
 @wp.func
 def best_rotation(covariance: wp.mat33d):
-    """rigid.best_rotation."""
+    """rigid.best_rotation. Both factors have determinant one, and the least singular value may be negative."""
     largest = real(0.0)
     for i in range(3):
-        for j in range(3):
-            largest = wp.max(largest, wp.abs(covariance[i, j]))
-    if largest > real(0.0):
-        covariance = covariance / largest
-    u, _, v = wp.svd3(covariance)  # both of determinant one, and the singular value of least size may be negative
+        largest = wp.max(largest, wp.max(wp.abs(covariance[i])))
+    u, _, v = wp.svd3(covariance / wp.where(largest > real(0.0), largest, real(1.0)))
     return u @ wp.transpose(v)
 
 
-@wp.func
-def matrix_of(q: vec4):
-    x = first_axis(q)
-    y = second_axis(q)
-    return wp.matrix_from_cols(x, y, wp.cross(x, y))
-
-
-@wp.func
-def half_of(rotation: wp.mat33d):
-    """Axis times half the angle, which is at most a right angle."""
-    q = quaternion_of(rotation)
-    if q[0] < real(0.0):
-        q = -q
-    return half_turn(q)
+@wp.func_grad(best_rotation)
+def to_covariance(covariance: wp.mat33d, to_rotation: wp.mat33d):
+    """By Newton's step from the solution, which has a floor, as there: singular values may be equal."""
+    rotation = best_rotation(covariance)
+    p = covariance @ wp.transpose(rotation)
+    trace = wp.trace(p)
+    floor = wp.where(wp.abs(trace) > TINIEST, EPSILON * wp.abs(trace), real(1.0))
+    hessian = (trace + floor) * wp.identity(n=3, dtype=real) - HALF * (p + wp.transpose(p))
+    m = to_rotation @ wp.transpose(rotation)
+    torque = vec3(m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1])
+    wp.adjoint[covariance] += wp.skew(wp.inverse(hessian) @ torque) @ rotation
 
 
 @wp.kernel(enable_backward=False)
@@ -51,4 +47,6 @@ def mean_pose(
     first = best_rotation(w[0] * to_reference[2 * s] + w[1] * to_reference[2 * s + 1] @ back)
     turns[2 * s] = first
     turns[2 * s + 1] = first @ onto
-    pose[s] = matrix_of(about(w[1] * half_of(back))) @ wp.transpose(first)
+    q = quaternion(back)
+    half = half_turn(wp.where(q[0] < real(0.0), -q, q))
+    pose[s] = wp.quat_to_matrix(about(w[1] * half)) @ wp.transpose(first)
