@@ -21,7 +21,7 @@ import torch_modal as tm
 from torch_modal import trees
 from torch_modal.contact.active import ContactEnergy, Contacts
 from torch_modal.elastic.energy import Energy, RestShapes
-from torch_modal.elastic.steps import ConvexHessian, _solved
+from torch_modal.elastic.steps import SumOfEnergies, TermsTowards
 from torch_modal.inbetween.alignment import Pose
 from torch_modal.inbetween.paired import PairedSpace
 from torch_modal.inbetween.settings import PRESETS
@@ -109,11 +109,9 @@ def assert_there(tree: Any) -> None:
 
 def steps(energy: Energy, x: Tensor, reference: Any) -> None:
     """All that a step of all vertices does but for its length."""
-    rows = energy.extend(x.movedim(-1, 0).contiguous())
-    at = energy.linearise(rows, reference)
-    right = -energy.fold(energy.gradient(at))
-    assert_there([energy.value(rows, reference), energy.value_at(at, reference)])
-    assert_there(_solved(energy, ConvexHessian(energy, at), right, 3, []))
+    problem = SumOfEnergies([TermsTowards(energy, reference)])
+    at = problem.at(x)
+    assert_there([problem.value(x), at.value, at.gradient, problem.solved(at, 3)])
 
 
 def assert_core_runs(core: Any, x: Tensor, stiffness: list[Tensor]) -> None:

@@ -15,25 +15,20 @@ from conftest import Shapes
 from terms import Area, Spring
 from torch import Tensor
 from torch.func import functional_call, grad, vmap
-from torch_modal.elastic.warp import shell as fused_shell
-from torch_modal.elastic.warp_distortion import WarpDistortion
-from torch_modal.elastic.warp_fine_steps import WarpFineEnergy, WarpSteps
-from torch_modal.elastic.warp_modal_energy import WarpModalEnergy
-from torch_modal.elastic.warp_shell import ShellReference, WarpShell
-from torch_modal.elastic.warp_volumes import WarpVolumes
 
 import torch_modal as tm
 from torch_modal import trees
-from torch_modal.elastic import warp_backend as backend
-from torch_modal.elastic import warp_modal_energy as fused_modal
+from torch_modal.elastic import backend, kernel_energy, modal
 from torch_modal.elastic.backend import TorchBackend, choose
 from torch_modal.elastic.bend import Bend
-from torch_modal.elastic.distortion import Distortion
-from torch_modal.elastic.energy import Energy, RestShapes
+from torch_modal.elastic.distortion import Distortion, KernelDistortion
+from torch_modal.elastic.energy import Energy, Reference, RestShapes
+from torch_modal.elastic.kernel_energy import KernelEnergy, _Merged
+from torch_modal.elastic.kernel_steps import KernelFineEnergy, KernelProblem, _Relaxed
 from torch_modal.elastic.kernels import launch
 from torch_modal.elastic.kernels.function import fused as fused_operation
-from torch_modal.elastic.modal import ModalEnergy, Placement
-from torch_modal.elastic.steps import FineEnergy, relax
+from torch_modal.elastic.modal import KernelModalEnergy, ModalEnergy, Placement
+from torch_modal.elastic.steps import FineEnergy, SumOfEnergies, TermsTowards, descend
 from torch_modal.elastic.stretch import Stretch
 from torch_modal.elastic.term import Mesh
 from torch_modal.elastic.volume import Volume
@@ -62,7 +57,7 @@ class Case:
         generator = torch.Generator().manual_seed(0)
         mesh = self.mesh = Mesh.of(faces, shapes.keyframes.shape[1])
         self.energy = Energy(mesh, [Stretch(), Bend(), Volume()])
-        self.fused = WarpSteps(self.energy, mesh)
+        self.fused = KernelEnergy.of(self.energy, mesh)
         x = shapes.keyframes * (CANONICAL_SIZE / (shapes.keyframes[0].amax(0) - shapes.keyframes[0].amin(0)).norm())
         n_edges, n_hinges = len(mesh.edges), len(mesh.hinges)
         stiffness = [
@@ -80,10 +75,12 @@ class Case:
         return RestShapes(torch.stack([first, second], 1), torch.stack([1 - t, t], -1), stiffness)
 
     def by_torch(self, x: Tensor, *rests: Tensor) -> Tensor:
-        return relax(self.energy, x, self.rests(*rests).reference(self.energy), 2, 4)
+        own = TermsTowards(self.energy, self.rests(*rests).reference(self.energy))
+        return descend(SumOfEnergies([own]), x, 2, 4)
 
     def by_warp(self, x: Tensor, *rests: Tensor) -> Tensor:
-        return self.fused(x, self.fused.reference(self.rests(*rests)), 2, 4)
+        to = self.fused.reference(self.rests(*rests))
+        return fused_operation(_Relaxed(self.fused, 2, 4), x, *to.records)[0]
 
 
 @pytest.fixture(params=["closed", "open", "flat"])
@@ -111,6 +108,12 @@ def assert_alike(found: tuple[Tensor, ...], truth: tuple[Tensor, ...], to: float
         torch.testing.assert_close(got, wanted, rtol=0, atol=to * max(float(wanted.abs().max()), 0.01))
 
 
+def assert_same_reference(found: Reference, wanted: Reference, rtol: float) -> None:
+    for got, truth in zip(found.records, wanted.records, strict=True):
+        torch.testing.assert_close(got, torch.where(truth[..., :1] > 0, truth, got), rtol=rtol, atol=1e-9)
+    torch.testing.assert_close(found.constant, wanted.constant, rtol=rtol, atol=1e-9)
+
+
 def assert_kernels(run: Any, truth: Any, given: list[Tensor], atol: float, to: float, second: bool = True) -> None:
     """Kernels have the values of torch, its gradients and its second ones."""
     torch.testing.assert_close(run(*given), truth(*given), rtol=0, atol=atol)
@@ -121,7 +124,7 @@ def assert_kernels(run: Any, truth: Any, given: list[Tensor], atol: float, to: f
 
 def test_local_steps(case: Case) -> None:
     assert float((case.by_torch(*case.given) - case.given[0]).abs().max()) > 1e-2
-    assert_kernels(case.by_warp, case.by_torch, case.given, 1e-8 * CANONICAL_SIZE, 1e-6, case.fused.closed)
+    assert_kernels(case.by_warp, case.by_torch, case.given, 1e-8 * CANONICAL_SIZE, 2e-6, case.fused.parts[2].closed)
 
 
 @torch.no_grad()
@@ -132,7 +135,7 @@ def test_distortion(case: Case) -> None:
         middle = 0.5 * (x[:, [i]] + x[:, [j]])
         x[:, tips] = middle + 0.05 * (x[:, tips] - middle)
     shapes, rests = case.given[:3], case.rests(*case.given[1:])
-    found, wanted = (kind(case.mesh, None)(shapes, rests) for kind in (WarpDistortion, Distortion))
+    found, wanted = (kind(case.mesh, None)(shapes, rests) for kind in (KernelDistortion, Distortion))
     torch.testing.assert_close(found, wanted, rtol=1e-12, atol=0)
 
 
@@ -141,9 +144,7 @@ def test_edges_that_are_points_at_rest_weigh_nothing(small_bars: Shapes) -> None
     one, other = case.mesh.edges[0].tolist()
     case.given[1][:, other] = case.given[1][:, one] + 1e-7
     rests = case.rests(*case.given[1:])
-    found, truth = case.fused.reference(rests), case.fused.packed(rests.reference(case.energy))
-    for got, wanted in zip(found, truth, strict=True):
-        torch.testing.assert_close(got, wanted, rtol=1e-9, atol=1e-9)
+    assert_same_reference(case.fused.reference(rests), rests.reference(case.energy).turned(), 1e-9)
     assert_alike(gradients(case.by_warp, case.given), gradients(case.by_torch, case.given), 1e-6)
 
 
@@ -151,8 +152,8 @@ def test_steps_that_would_go_uphill_are_shortened(small_bars: Shapes) -> None:
     case = Case(small_bars, small_bars.faces, 10.0)
     case.given[5] *= 1e5
     to, taken = case.fused.reference(case.rests(*case.given[1:])), []
-    found = case.fused.steps(case.given[0].contiguous(), to, 2, 4, taken)
-    lengths = torch.stack([step.length for step in taken])
+    found = descend(KernelProblem(case.fused, to), case.given[0].contiguous(), 2, 4, taken)
+    lengths = torch.stack([step[3] for step in taken])
     assert float(lengths.min()) < 0.5 < float(lengths.max()), "no step is shortened, or all are"
     torch.testing.assert_close(found, case.by_torch(*case.given), rtol=0, atol=1e-8 * CANONICAL_SIZE)
     assert_alike(gradients(case.by_warp, case.given), gradients(case.by_torch, case.given), 1e-6)
@@ -174,8 +175,8 @@ class TestModal:
     def both(case: Case) -> list[tuple[ModalEnergy, Placement]]:
         start, generator = case.given[0], torch.Generator().manual_seed(2)
         columns = torch.randn(5, *start.shape[1:], dtype=DOUBLE, generator=generator)
-        shell = WarpShell(case.energy, case.mesh)
-        modals = WarpModalEnergy(case.energy, case.mesh, columns), ModalEnergy(case.energy, columns)
+        shell = case.fused
+        modals = KernelModalEnergy(shell, columns), ModalEnergy(case.energy, columns)
         rests = case.rests(*case.given[1:])
         return [
             (modals[0], modals[0].place(start, shell.reference(rests))),
@@ -188,7 +189,6 @@ class TestModal:
         (fused, own), (plain, truth) = self.both(case)
         several = torch.stack([a, 2 * a, -a])
         torch.testing.assert_close(fused.value(several, own), plain.value(several, truth), rtol=1e-12, atol=0)
-        torch.testing.assert_close(fused.rows(a, own), plain.rows(a, truth), rtol=0, atol=1e-11)
         found, wanted = fused.derivatives(a, own), plain.derivatives(a, truth)
         assert float(wanted.second_order.abs().max()) > 1e-3 * float(wanted.gauss_newton.abs().max())
         assert_alike(found, wanted, 1e-9)
@@ -207,7 +207,7 @@ class TestModal:
             return fused.gradient(a, trees.filled(own, leaves))
 
         def by_torch(a: Tensor, *leaves: Tensor) -> Tensor:
-            return plain.gradient(a, fused.unpacked(trees.filled(own, leaves)))
+            return plain.gradient(a, fused.by_torch(trees.filled(own, leaves)))
 
         assert_alike([by_kernels(*given)], [plain.derivatives(a, truth).gradient], 1e-10)
         found, wanted = (torch.func.vjp(each, *given)[1](direction) for each in (by_kernels, by_torch))
@@ -217,18 +217,18 @@ class TestModal:
     def test_softer_at_needles(self, case: Case, relative: bool) -> None:
         """Shapes with needles, along either side of their triangles; rest shapes with some, too."""
         (fused, own), _ = self.both(case)
-        shapes = own.base * torch.tensor([0.02, 1.0, 3.0], dtype=DOUBLE)
-        operation, given = fused_shell._Softened(fused.shell), [shapes, own.reference.elements]
+        start = own.base * torch.tensor([0.02, 1.0, 3.0], dtype=DOUBLE)
+        rests, weights = case.rests(*case.given[1:])[:2]
+        rests = torch.cat([rests[:, :1] * torch.tensor([1.0, 0.04, 1.0], dtype=DOUBLE), rests[:, 1:]], 1)
+        operation, given = _Merged(fused.kernels.parts[1], relative), [rests, weights, case.given[5]]
         if relative:
-            rests, weights = case.rests(*case.given[1:])[:2]
-            rests = torch.cat([rests[:, :1] * torch.tensor([1.0, 0.04, 1.0], dtype=DOUBLE), rests[:, 1:]], 1)
             alone = torch.tensor([[1.0, 0.0]] * 2, dtype=DOUBLE)
-            torch.testing.assert_close(operation.by_torch(rests[:, 1], given[1], rests.flip(1), alone)[0], given[1])
-            given += [rests, weights]
-        softened, hard = operation.by_torch(*given)[0][..., 2], own.reference.elements[..., 2]
+            as_stiff = operation.by_torch(rests.flip(1), alone, case.given[5], rests[:, 1])[0]
+            torch.testing.assert_close(as_stiff, operation.by_torch(rests.flip(1), alone, case.given[5])[0])
+        hard, softened = (operation.by_torch(*given, *more)[0][..., 0] for more in ((), (start,)))
         assert float((softened / hard)[hard > 0].min()) < 0.1
         run, truth = lambda *x: fused_operation(operation, *x)[0], lambda *x: operation.by_torch(*x)[0]
-        assert_kernels(run, truth, given, 1e-12 * float(hard.max()), 1e-11)
+        assert_kernels(run, truth, [*given, start], 1e-12 * float(hard.max()), 1e-11)
 
     @torch.no_grad()
     def test_samples_that_are_too_many_at_a_time(self, case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -237,15 +237,16 @@ class TestModal:
         (fused, own), _ = self.both(case)
         several, many = torch.cat([a, -a, 2 * a])[:5], trees.rows(own, torch.tensor([0, 1, 0, 1, 0]))
         truth = fused.derivatives(several, many)
-        largest = len(fused.blocks) * fused.blocks.shape[1] * 8
-        monkeypatch.setattr(fused_modal, "MOST_NUMBERS", largest)
+        largest = max(len(fused.blocks) * fused.blocks.shape[1], 81 * len(case.mesh.hinges)) * 3
+        monkeypatch.setattr(modal, "MOST_NUMBERS", largest)
         sizes: list[int] = []
 
         def watched(kernel: Any, dim: tuple[int, ...], given: list[Any]) -> None:
             sizes.extend(x.numel() for x in given if isinstance(x, Tensor))
             launch.launch(kernel, dim, given)
 
-        monkeypatch.setattr(fused_modal, "launch", watched)
+        monkeypatch.setattr(modal, "launch", watched)
+        monkeypatch.setattr(kernel_energy, "launch", watched)
         found = fused.derivatives(several, many)
         assert max(sizes) <= largest
         assert_alike(found, truth, 1e-13)
@@ -253,26 +254,22 @@ class TestModal:
 
     @pytest.mark.parametrize("n_shapes", [1, 2, 4])
     def test_references(self, case: Case, n_shapes: int) -> None:
-        shell, (_, first, second, _, *stiffness) = WarpShell(case.energy, case.mesh), case.given
+        shell, (_, first, second, _, *stiffness) = case.fused, case.given
         shapes = torch.stack([first, second, 0.5 * (first + second), 1.1 * second], 1)[:, :n_shapes]
         weights = torch.tensor([[0.4, 0.7, 0.2, -0.3], [0.1, 0.2, 0.3, 0.4]], dtype=DOUBLE)[:, :n_shapes]
 
-        def by_kernels(*given: Tensor) -> ShellReference:
+        def by_kernels(*given: Tensor) -> Reference:
             return shell.reference(RestShapes(*given[:2], given[2:]))
 
-        def by_torch(*given: Tensor) -> ShellReference:
-            return shell.packed(RestShapes(*given[:2], given[2:]).reference(case.energy))
+        def by_torch(*given: Tensor) -> Reference:
+            return RestShapes(*given[:2], given[2:]).reference(case.energy).turned()
 
         def flat(run: Any) -> Any:
-            return lambda *given: torch.cat([part.flatten() for part in run(*given)[:-1]])
+            return lambda *given: torch.cat([part.flatten() for part in run(*given).records])
 
         given = [shapes.clone(), weights.clone(), *stiffness]
-        for found, wanted in zip(by_kernels(*given), by_torch(*given), strict=True):
-            torch.testing.assert_close(found, wanted, rtol=1e-11, atol=1e-9)
+        assert_same_reference(by_kernels(*given), by_torch(*given), 1e-11)
         assert_kernels(flat(by_kernels), flat(by_torch), given, 1e-6, 1e-9)
-        there, back = by_torch(*given), shell.packed(shell.unpacked(by_kernels(*given)))
-        for found, wanted in zip(back, there, strict=True):
-            torch.testing.assert_close(found, wanted, rtol=1e-11, atol=1e-9)
 
 
 def turned(rotations: WarpRotations, kind: type[LocalRotations] = WarpRotations) -> Any:
@@ -364,7 +361,7 @@ class TestLayers:
     def test_in_between_and_path(self, bars: Shapes, dtype: torch.dtype) -> None:
         x, t = bars.keyframes.to(dtype), torch.tensor([0.3, 0.5], dtype=dtype)
         found = []
-        for kind, fine in (("warp", WarpFineEnergy), ("torch", FineEnergy)):
+        for kind, fine in (("warp", KernelFineEnergy), ("torch", FineEnergy)):
             solver = tm.Solver(backend=kind)  # type: ignore[arg-type]
             layer = tm.InBetween(bars.bases[:2], bars.faces, solver=solver).to(dtype)
             assert type(layer.core.fine) is fine
@@ -408,7 +405,7 @@ class TestLayers:
         for kind in ("warp", "torch"):
             solver = tm.Solver(backend=kind, polish=1)  # type: ignore[arg-type]
             path = tm.Path(bars.bases[:n], bars.faces, objective=objective, solver=solver)
-            assert isinstance(path.layers[0].core.fine, WarpFineEnergy) == (kind == "warp")
+            assert isinstance(path.layers[0].core.fine, KernelFineEnergy) == (kind == "warp")
             keyframes = bars.keyframes[:n].clone().requires_grad_()
             shape = path(keyframes, t)
             with torch.no_grad():
@@ -466,7 +463,7 @@ class TestBackend:
         code = (
             "import sys; from torch_modal.elastic.kernels.launch import kernels; kernels('rotations'); "
             "sys.exit(any(f'torch_modal.elastic.kernels.{name}' in sys.modules "
-            "for name in ('shell', 'modal', 'steps')))"
+            "for name in ('quasi_newton', 'steps')))"
         )
         folder = Path(tm.__file__).parents[1]
         result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, cwd=folder)
@@ -498,5 +495,5 @@ def test_what_warp_says_of_itself_is_left_alone() -> None:
         warnings.simplefilter("error")
         before = warp.config.log_level
         launch.kernels.cache_clear()
-        launch.kernels("shell")
+        launch.kernels("steps")
         assert warp.config.log_level == before

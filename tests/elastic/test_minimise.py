@@ -10,14 +10,15 @@ from scipy.optimize import least_squares
 from test_gauss_newton import LeastSquares, Rosenbrock, Uphill, start
 from torch import Tensor
 from torch.func import jacfwd
-from torch_modal.elastic.warp_backend import WarpBackend
 
 from torch_modal.elastic import minimise as minimisation
+from torch_modal.elastic.backend import WarpBackend
+from torch_modal.elastic.bend import Bend
 from torch_modal.elastic.gauss_newton import GaussNewtonStep
 from torch_modal.elastic.minimise import Solution, Status, minimise
 from torch_modal.elastic.modal import Derivatives
 from torch_modal.elastic.shell import ShellEnergy
-from torch_modal.elastic.term import periodic_square
+from torch_modal.elastic.term import Term, periodic_square
 from torch_modal.inbetween.results import ConvergenceError, report
 from torch_modal.inbetween.settings import Solver
 from torch_modal.layers.mid_shape import MidShape
@@ -146,7 +147,7 @@ def solve(layer: MidShape, bars: Shapes, bends: list[float], tolerance: float = 
 
 @pytest.mark.parametrize("ends", [(0, 1), (1, 2)])
 def test_agrees_with_scipy(ends: tuple[int, int], small_bars: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("torch_modal.elastic.energy.softening", lambda edge_vectors, *_: 1.0)
+    monkeypatch.setattr(Bend, "softening", Term.softening)
     bars = small_bars.pick(*ends)
     layer = MidShape(bars.bases, bars.faces, **modal(anchor=0.0, backend="torch"))
     core, energy, half = layer.in_between.core, layer.space, torch.full((1, 2), 0.5, dtype=torch.float64)

@@ -8,7 +8,7 @@ from torch.func import hessian, jacfwd
 
 from torch_modal.elastic import modal
 from torch_modal.elastic.bend import Bend
-from torch_modal.elastic.energy import Energy
+from torch_modal.elastic.energy import Energy, Rest
 from torch_modal.elastic.modal import Derivatives, ModalEnergy
 from torch_modal.elastic.shell import ALPHA, BETA, GAMMA, ShellEnergy
 from torch_modal.elastic.term import Mesh
@@ -46,7 +46,8 @@ class Case:
         both = self.pulls[0] + self.pulls[1]
         factors = [both[:, None] * stiffness for stiffness in self.shell.stiffness]
         rests = [self.shell.rest(r) for r in self.rests]
-        reference = self.shell.energy.among(rests, torch.stack(self.pulls, -1) / both[:, None], factors)
+        stacked = Rest(*(tuple(torch.stack(x, -2) for x in zip(*own, strict=True)) for own in zip(*rests, strict=True)))
+        reference = self.shell.energy.merged(stacked, torch.stack(self.pulls, -1) / both[:, None], factors)
         self.placement = self.modal.place(base, reference)
         self.a = 0.02 * size * random(BATCH, N)
 

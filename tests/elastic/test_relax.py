@@ -9,19 +9,25 @@ from conftest import Shapes
 from torch import Tensor
 from torch.func import hessian, jacfwd
 
-from torch_modal.elastic.energy import Linearised, Reference
+from torch_modal.elastic.energy import Energy, Linearised, Reference, Rest
 from torch_modal.elastic.shell import ShellEnergy
 from torch_modal.elastic.steps import (
     RIDGE,
     ConvexHessian,
+    SumOfEnergies,
+    TermsTowards,
     chunk_of,
+    descend,
     inverse_of_symmetric,
-    relax,
     step_length,
 )
 from torch_modal.geometry.vectors import norm
 
 BATCH = 2
+
+
+def relax(core: Energy, x: Tensor, reference: Reference, n_steps: int, n_products: int) -> Tensor:
+    return descend(SumOfEnergies([TermsTowards(core, reference)]), x, n_steps, n_products)
 
 
 class Case:
@@ -45,7 +51,10 @@ class Case:
         pulls = [pull[rows] for pull in self.pulls]
         rests = [self.shell.rest(rest.expand_as(self.x)[rows]) for rest in self.rests]
         factors = [(pulls[0] + pulls[1])[:, None] * stiffness for stiffness in self.shell.stiffness]
-        return self.core.among(rests, torch.stack(pulls, -1) / (pulls[0] + pulls[1])[:, None], factors)
+        both = Rest(
+            *(tuple(torch.stack(each, -2) for each in zip(*own, strict=True)) for own in zip(*rests, strict=True))
+        )
+        return self.core.merged(both, torch.stack(pulls, -1) / (pulls[0] + pulls[1])[:, None], factors)
 
     def at(self, x: Tensor) -> list[Linearised]:
         return self.core.linearise(self.core.extend(x.movedim(-1, 0).contiguous()), self.reference)

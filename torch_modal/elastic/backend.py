@@ -113,8 +113,9 @@ class WarpBackend(TorchBackend):
     def modal_energy(self, energy: Energy, mesh: Mesh, columns: Tensor) -> ModalEnergy:
         """Overrides the base class."""
         found = KernelEnergy.of(energy, mesh)
-        exact = found is not None and found.exact
-        return KernelModalEnergy(found, columns) if exact else super().modal_energy(energy, mesh, columns)
+        if found is None or not found.exact:
+            return super().modal_energy(energy, mesh, columns)
+        return KernelModalEnergy(found, columns)
 
     def fine_energy(self, mesh: Mesh, terms: Sequence[Term]) -> FineEnergy:
         """Overrides the base class."""

@@ -1,6 +1,7 @@
 """Dihedral angles, the second term of Eq. 5."""
 
 from functools import cache, reduce
+from typing import no_type_check
 
 import torch
 from torch import Tensor
@@ -180,6 +181,7 @@ def collapsed(edge: Tensor, normal: Tensor) -> Tensor:
 
 
 @cache
+@no_type_check
 def kernel_functions() -> KernelFunctions:
     """Hinges as above, by cosine and sine of the angle, for kernels."""
     import warp as wp

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from functools import cache
 from types import SimpleNamespace
+from typing import no_type_check
 
 import torch
 from torch import Tensor, nn
@@ -127,6 +128,7 @@ class KernelDistortion(Distortion):
 
 
 @cache
+@no_type_check
 def kernels() -> SimpleNamespace:
     """The same elements, for kernels."""
     import warp as wp

@@ -18,7 +18,7 @@ from torch_modal.elastic.kernels.function import fused
 from torch_modal.elastic.kernels.launch import launch, made, of_elements
 from torch_modal.elastic.term import KernelFunctions, Mesh
 from torch_modal.elastic.volume import MIN_RELATIVE_VOLUME, Volume
-from torch_modal.geometry.vectors import cross, inverse, norm
+from torch_modal.geometry.vectors import cross, inverse, norm, pick
 
 
 class KernelPoint(NamedTuple):
@@ -55,6 +55,7 @@ class KernelTerm(nn.Module):
     """
 
     elements: Tensor
+    functions: Any
 
     def __init__(self, part: OnMesh, functions: KernelFunctions) -> None:
         super().__init__()
@@ -106,16 +107,18 @@ class KernelVolume(nn.Module):
 
     def __init__(self, part: OnMesh, mesh: Mesh, used: Tensor) -> None:
         super().__init__()
-        self.part, self.n_used = part, len(used)
+        self.part = part
         self.closed = len(mesh.connectivity.boundary_chain) == 0
         self.register_buffer("faces", mesh.faces.int(), persistent=False)
-        #: Vertices of faces. *Shape:* ``(V, 1)``, bool.
-        own = torch.zeros(mesh.n_vertices, 1, dtype=torch.bool).index_fill(0, used.cpu(), True)
-        self.register_buffer("used", own, persistent=False)
+        self.register_buffer("used", used, persistent=False)
 
     def mean(self, x: Tensor) -> Tensor:
         """Mean of the vertices of faces. *Shape:* ``(B, V, 3) -> (B, 3)``."""
-        return x.mean(1) if self.n_used == x.shape[1] else (x * self.used).sum(1) / self.n_used
+        return (x if len(self.used) == x.shape[1] else x[:, self.used]).mean(1)
+
+    def _spread(self, to_centre: Tensor, to_x: Tensor) -> None:
+        share = (to_centre / len(self.used))[:, None].expand(-1, len(self.used), -1)
+        to_x.index_add_(1, self.used, share)
 
     def _launch(self, name: str, x: Tensor, *given: Tensor | None) -> None:
         # The origin of volumes: any vertex where the surface is closed.
@@ -129,7 +132,7 @@ class KernelVolume(nn.Module):
         found = x.new_zeros(len(x))
         self._launch("sizes", x, found, area, normal)
         if normal is not None and not self.closed:  # through the centre; on a closed surface that vanishes
-            normal.sub_(normal.sum(1, keepdim=True) / self.n_used * self.used)
+            self._spread(-normal.sum(1), normal)
         return found
 
     def back(
@@ -141,7 +144,7 @@ class KernelVolume(nn.Module):
         to_centre = None if self.closed else x.new_zeros(len(x), 3)
         self._launch("sizes_back", x, to_volume.contiguous(), to_area, to_normal, to_x, to_centre)
         if to_centre is not None:
-            to_x.add_(to_centre[:, None] / self.n_used * self.used)
+            self._spread(to_centre, to_x)
 
     def reference(
         self, rests: RestShapes, stiffness: Tensor, start: Tensor | None, relative: bool
@@ -153,15 +156,18 @@ class KernelVolume(nn.Module):
         return record.mT, left.squeeze(-1)
 
 
-def by_kernels(part: OnMesh, mesh: Mesh, used: Tensor) -> KernelTerm | KernelVolume | None:
-    """A term by kernels; None for one that torch computes."""
-    term = part.term
-    if type(term) is Volume:
-        return KernelVolume(part, mesh, used)
-    n = len(part.corners) - 1
-    plain = term.anchors is None and 1 <= n <= 3 and bool((part.corners < mesh.n_vertices).all())
-    functions = term.kernel_functions(n) if plain else None
-    return None if functions is None else KernelTerm(part, functions)
+def by_kernels(energy: Energy, mesh: Mesh) -> list[KernelTerm | KernelVolume | None]:
+    """The terms of an energy by kernels; None for one that torch computes: all but one volume, for example."""
+    found: list[Any] = []
+    for part in energy.parts:
+        term, n = part.term, len(part.corners) - 1
+        if type(term) is Volume and not any(isinstance(each, KernelVolume) for each in found):
+            found.append(KernelVolume(part, mesh, energy.used))
+            continue
+        plain = term.anchors is None and 1 <= n <= 3 and bool((part.corners < mesh.n_vertices).all())
+        functions = term.kernel_functions(n) if plain and not energy.sampled else None
+        found.append(None if functions is None else KernelTerm(part, functions))
+    return found
 
 
 class Pass(nn.Module):
@@ -180,7 +186,9 @@ class Pass(nn.Module):
         self, term: tuple[int, KernelTerm], rider: tuple[int, KernelTerm] | None = None, own: Tensor | None = None
     ) -> None:
         super().__init__()
-        (self.number, self.term), (self.other, self.rider) = term, rider or (None, None)
+        self.number, self.term = term
+        both: Any = (None, None) if rider is None else rider
+        self.other, self.rider = both
         elements = self.term.elements
         if self.rider is not None and own is not None:
             # Where there is no element, all further vertices are the first.
@@ -248,15 +256,14 @@ class KernelEnergy(nn.Module):
         #: The terms in passes over elements, each alone or with another that rides on it.
         self.passes: Any = nn.ModuleList(_passes(parts, energy.n_vertices))
         #: Whether kernels know the adjoints of all terms.
-        self.exact = all(parts[i].functions.exact for i in self.terms)
+        self.exact = all(part.functions.exact for part in parts if isinstance(part, KernelTerm))
 
     @classmethod
     def of(cls, energy: Energy, mesh: Mesh) -> "KernelEnergy | None":
-        """An energy by kernels; None where they do not serve all of its terms, or have not one volume at most."""
-        parts = [None if energy.sampled else by_kernels(part, mesh, energy.used) for part in energy.parts]
+        """An energy by kernels; None where they do not serve all of its terms."""
+        parts = by_kernels(energy, mesh)
         found = [part for part in parts if part is not None]
-        n_volumes = sum(isinstance(part, KernelVolume) for part in found)
-        return cls(energy, found) if len(found) == len(parts) and n_volumes <= 1 else None
+        return cls(energy, found) if len(found) == len(parts) else None
 
     def reference(self, rests: RestShapes, start: Tensor | None = None, relative: bool = False) -> Reference:
         """Merge rest shapes into one reference (Eq. 8); arguments as :meth:`RestShapes.reference`."""
@@ -429,5 +436,6 @@ class _Sizes:
     def by_torch(self, shapes: Tensor) -> tuple[Tensor, ...]:
         """See :class:`~torch_modal.elastic.kernels.function.Operation`."""
         part, rows = self.volume.part, shapes.movedim(-1, 0)
-        p, q, r = part.edge_vectors(torch.cat([rows, rows[..., self.volume.used[:, 0]].mean(-1, keepdim=True)], -1))
+        centre = pick(rows, self.volume.used).mean(-1, keepdim=True)
+        p, q, r = part.edge_vectors(torch.cat([rows, centre], -1))
         return (p * cross(q, r)).sum((0, -1)) / 6, 0.5 * norm(cross(q - p, r - p)).sum(-1)

@@ -28,7 +28,7 @@ class KernelFineEnergy(FineEnergy):
 
     def __init__(self, mesh: Mesh, terms: Sequence[Term]) -> None:
         super().__init__(mesh, terms)
-        served = [by_kernels(part, mesh, self.energy.used) is not None for part in self.energy.parts]
+        served = [part is not None for part in by_kernels(self.energy, mesh)]
         #: Numbers of the terms that kernels serve, and of the others.
         self.own, self.others = ([i for i, one in enumerate(served) if one is kind] for kind in (True, False))
         shell = Energy(mesh, [terms[i] for i in self.own]) if self.others else self.energy

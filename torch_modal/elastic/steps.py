@@ -193,8 +193,10 @@ class SumOfEnergies:
         """*Shape:* ``(B, V, 3)``."""
         each = [one.at(x) for one in self.energies]
         values, gradients, diagonals, products = zip(*each, strict=True)
-        sums = (reduce(torch.add, own) for own in (values, gradients, diagonals))
-        return Point(*sums, lambda field: reduce(torch.add, [product(field) for product in products]))
+        value, gradient, diagonal = (reduce(torch.add, own) for own in (values, gradients, diagonals))
+        return Point(
+            value, gradient, diagonal, lambda field: reduce(torch.add, [product(field) for product in products])
+        )
 
     @staticmethod
     def solved(at: Point, n_products: int, keep: bool = False) -> tuple[Tensor]:

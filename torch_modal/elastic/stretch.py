@@ -1,6 +1,7 @@
 """Edge lengths, the first term of Eq. 5."""
 
 from functools import cache
+from typing import no_type_check
 
 import torch
 from torch import Tensor
@@ -58,6 +59,7 @@ class Stretch(Term):
 
 
 @cache
+@no_type_check
 def kernel_functions() -> KernelFunctions:
     """Edges as above, for kernels."""
     import warp as wp

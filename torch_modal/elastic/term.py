@@ -11,7 +11,7 @@ Kernels of NVIDIA Warp are made from the same functions of one element, written 
 
 import math
 from functools import cache
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, no_type_check
 
 import torch
 from torch import Tensor, nn
@@ -372,6 +372,7 @@ def wrap_angle(angle: Tensor) -> Tensor:
 
 # --------------------------------------------------------------------------------------------------------- for kernels
 @cache
+@no_type_check
 def square() -> Potential:
     """That of :class:`Term`."""
     import warp as wp
@@ -422,6 +423,7 @@ def square() -> Potential:
 
 
 @cache
+@no_type_check
 def periodic() -> Potential:
     """That of :class:`PeriodicTerm`, of cosine and sine of the measure."""
     import warp as wp
@@ -499,6 +501,7 @@ def periodic() -> Potential:
 
 
 @cache
+@no_type_check
 def _of_measure(name: str, n: int, potential: Potential, measure: Any, gradient: Any) -> KernelFunctions:
     """Of a measure alone, or with its gradient."""
     import warp as wp
@@ -519,6 +522,7 @@ def _of_measure(name: str, n: int, potential: Potential, measure: Any, gradient:
 
 
 @cache
+@no_type_check
 def _of_angle(name: str, n: int, measure: Any, gradient: Any) -> KernelFunctions:
     """Of an angle, by its cosine and sine."""
     import warp as wp

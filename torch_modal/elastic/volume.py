@@ -2,6 +2,7 @@
 
 from functools import cache
 from types import SimpleNamespace
+from typing import no_type_check
 
 import torch
 from torch import Tensor
@@ -68,6 +69,7 @@ def encloses(x: Tensor, mesh: Connectivity) -> bool:
 
 
 @cache
+@no_type_check
 def kernels() -> SimpleNamespace:
     """Volumes as above, with their gradients, and the adjoint."""
     import warp as wp
