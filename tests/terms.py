@@ -67,3 +67,26 @@ class Pull(Spring):
     def elements(self, mesh: Mesh) -> Tensor:
         vertices = torch.arange(mesh.n_vertices)
         return torch.stack([torch.full_like(vertices, mesh.first_anchor), vertices], 1)
+
+
+def fibres() -> type[Term]:
+    """Lengths of edges along an axis, also for kernels."""
+    import warp as wp
+
+    edge = wp.types.matrix(shape=(1, 3), dtype=wp.float64)
+
+    @wp.func
+    def length(edge_vectors: edge):  # type: ignore[no-untyped-def, valid-type]
+        return wp.length(edge_vectors[0])  # type: ignore[index]
+
+    @wp.func
+    def direction(edge_vectors: edge):  # type: ignore[no-untyped-def, valid-type]
+        return wp.matrix_from_rows(wp.normalize(edge_vectors[0]))  # type: ignore[index]
+
+    class Fibres(Edges):
+        kernel_measure, kernel_gradient = length, direction
+
+        def weights(self, edge_vectors: Tensor, measures: Tensor) -> Tensor:
+            return edge_vectors[0, 1] ** 4 / measures**5
+
+    return Fibres

@@ -12,7 +12,7 @@ import pytest
 import torch
 from bodies import sheet_surface
 from conftest import Shapes
-from terms import Area, Spring
+from terms import Area, Spring, fibres
 from torch import Tensor
 from torch.func import functional_call, grad, vmap
 
@@ -413,6 +413,44 @@ class TestLayers:
             found.append((shape.detach(), torch.autograd.grad(shape.square().sum(), keyframes)[0]))
         torch.testing.assert_close(found[0][0], found[1][0], rtol=0, atol=1e-7)
         torch.testing.assert_close(found[0][1], found[1][1], rtol=1e-4, atol=1e-5)
+
+    @pytest.mark.parametrize("exact", [True, False], ids=["with its gradient", "measure alone"])
+    def test_a_term_of_ones_own_by_kernels(self, bars: Shapes, exact: bool) -> None:
+        """The same numbers as torch's, with a gradient and without; its kernels compute them."""
+        kind = fibres()
+        if not exact:
+            kind.kernel_gradient = None
+        x, found = bars.keyframes[:2], []
+        for backend_name in ("warp", "torch"):
+            solver = tm.Solver(backend=backend_name, tolerance=1e-12)
+            objective = tm.Objective(terms=(kind(1e3),))
+            layer = tm.InBetween(bars.bases[:2], bars.faces, objective=objective, solver=solver)
+            ends = x.clone().requires_grad_()
+            with torch.no_grad():
+                still = layer(*ends, 0.3)
+            shape = layer(*ends, 0.3)
+            found.append((still, shape.detach(), torch.autograd.grad(shape.square().sum(), ends)[0]))
+            if backend_name == "warp":
+                assert layer.core.fine.further is None and len(layer.core.fine.kernels.terms) == 3
+        plain = tm.InBetween(bars.bases[:2], bars.faces)(*x, 0.3)
+        assert float((found[0][0] - plain).abs().max()) > 1e-3 * float(plain.abs().max())
+        for got, wanted, to in zip(*found, (1e-11, 1e-11, 1e-9), strict=True):
+            torch.testing.assert_close(got, wanted, rtol=0, atol=to * float(wanted.abs().max()))
+
+    @torch.no_grad()
+    def test_kernels_of_a_term_of_ones_own(self, case: Case) -> None:
+        """Energy, gradient and Hessian of one term are those of torch."""
+        energy = Energy(case.mesh, [fibres()(1e3)])
+        own = KernelEnergy.of(energy, case.mesh)
+        start, first, second, t, *_ = case.given
+        rests = case.rests(first, second, t, torch.full((2, 1), 1e3, dtype=DOUBLE))
+        to, truth = own.reference(rests), TermsTowards(energy, rests.reference(energy))
+        found, wanted = KernelProblem(own, to).at(start.contiguous()), truth.at(start)
+        torch.testing.assert_close(found.value + to.constant, wanted.value, rtol=1e-12, atol=0)
+        assert_alike([found.gradient, found.diagonal], [wanted.gradient, wanted.diagonal], 1e-12)
+        field, out = torch.randn_like(start).contiguous(), torch.zeros(start.shape, dtype=DOUBLE)
+        own.product(found.factors, tuple(start.shape[:2]), field, 0, out, 0)
+        assert_alike([out], [wanted.product(field)], 1e-12)
 
     def test_what_has_no_numbers_is_torchs(self, small_bars: Shapes) -> None:
         from torch._subclasses import FakeTensorMode

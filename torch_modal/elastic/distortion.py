@@ -111,19 +111,30 @@ class Distortion(nn.Module):
 class KernelDistortion(Distortion):
     """:class:`Distortion` without gradients in one kernel, in float64; with them it is the base class."""
 
+    elements: Tensor
+    hinged: Tensor
+
+    def __init__(self, mesh: Mesh, further: Energy | None) -> None:
+        super().__init__(mesh, further)
+        for name, own in (("elements", self.edges), ("hinged", self.hinges)):
+            self.register_buffer(name, self.vertices[own].T.int().contiguous(), persistent=False)
+
     def of_shell(self, shapes: Sequence[Tensor], rests: RestShapes) -> Tensor:
         """Overrides the base class."""
         values = *shapes, rests.shapes, rests.weights, *rests.stiffness[:2]
         if torch.is_grad_enabled() or not plain(*values):
             return super().of_shell(shapes, rests)
-        elements = [self.vertices[own].T.int().contiguous() for own in (self.edges, self.hinges)]
         given = [x.double().contiguous() for x in (torch.stack([*shapes]), rests.shapes, rests.weights)]
         stiffness = [x.double().contiguous() for x in self.on_elements(rests.stiffness)]
         (n_samples, n_rests), n_vertices = rests.weights.shape, shapes[0].shape[1]
         found = given[0].new_zeros(len(shapes), n_samples, 2)
         sizes = [len(shapes), n_samples, n_rests, n_vertices, *(x.shape[-1] for x in stiffness)]
-        dim = n_samples, max(map(len, elements))
-        launch(made(kernels).distortion, dim, [*elements, *given, *stiffness, *sizes, found])
+        given += stiffness
+        launch(
+            made(kernels).distortion,
+            (n_samples, len(self.elements)),
+            [self.elements, self.hinged, *given, *sizes, found],
+        )
         return (found @ found.new_tensor(self.shares)).to(rests.weights)
 
 
@@ -140,32 +151,20 @@ def kernels() -> SimpleNamespace:
     edge, hinge = stretch.kernel_functions(), bend.kernel_functions()
 
     @wp.func
-    def length_of(x: wp.array(dtype=vec3), at: int, q: wp.vec2i):
+    def length_of(x: wp.array[vec3], at: int, q: wp.vec2i):
         return edge.measure(wp.matrix_from_rows(x[place(at, q[1])] - x[place(at, q[0])]))
 
     @wp.func
-    def hinge_of(x: wp.array(dtype=vec3), at: int, q: wp.vec4i):
+    def hinge_of(x: wp.array[vec3], at: int, q: wp.vec4i):
         o = x[place(at, q[0])]
         return wp.matrix_from_rows(x[place(at, q[1])] - o, x[place(at, q[2])] - o, x[place(at, q[3])] - o)
 
     @wp.kernel(module=module, enable_backward=False)
     def distortion(
-        edges: wp.array(dtype=wp.vec2i),
-        hinges: wp.array(dtype=wp.vec4i),
-        x: wp.array(dtype=vec3),
-        rests: wp.array(dtype=vec3),
-        weights: wp.array(dtype=real),
-        alpha: wp.array(dtype=real),
-        beta: wp.array(dtype=real),
-        n_shapes: int,
-        n_samples: int,
-        n_rests: int,
-        n_vertices: int,
-        n_alpha: int,
-        n_beta: int,
-        out: wp.array(dtype=vec2),
-        threads: int,
-    ):
+        edges: wp.array[wp.vec2i], hinges: wp.array[wp.vec4i], x: wp.array[vec3], rests: wp.array[vec3],
+        weights: wp.array[real], alpha: wp.array[real], beta: wp.array[real], n_shapes: int, n_samples: int,
+        n_rests: int, n_vertices: int, n_alpha: int, n_beta: int, out: wp.array[vec2], threads: int,
+    ):  # fmt: skip
         """Bounded stretching and bending of several shapes of each sample against its rest shapes."""
         i = wp.tid()
         s = i // threads

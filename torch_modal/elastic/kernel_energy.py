@@ -70,9 +70,9 @@ class KernelTerm(nn.Module):
         self.functions = self.part.term.kernel_functions(len(self.part.corners) - 1)
 
     @property
-    def n_factors(self) -> int:
-        """Numbers of an element's factors."""
-        return 3 * self.functions.n + 1 + (self.functions.across is not None)
+    def size_of_factors(self) -> tuple[int, int]:
+        """Numbers of elements, and of the factors of each."""
+        return len(self.elements), 3 * self.functions.n + 1 + (self.functions.across is not None)
 
     def launch(self, name: str, dim: int, *given: Any, back: bool = False) -> None:
         """Run a kernel over the elements of so many samples."""
@@ -104,6 +104,7 @@ class KernelVolume(nn.Module):
 
     faces: Tensor
     used: Tensor
+    size_of_factors = (0,)
 
     def __init__(self, part: OnMesh, mesh: Mesh, used: Tensor) -> None:
         super().__init__()
@@ -279,14 +280,12 @@ class KernelEnergy(nn.Module):
         n, n_references, factors = len(x), len(to.constant), []
         energy = x.new_zeros(n)
         if diagonal is not None:
-            sizes = [
-                (len(part.elements), part.n_factors) if isinstance(part, KernelTerm) else (0,) for part in self.parts
-            ]
-            factors = [x.new_empty(n, *size) for size in sizes]
+            factors = [x.new_empty(n, *part.size_of_factors) for part in self.parts]
         for one in self.passes:
             one.linearise(x, to.records, (n_references, energy, gradient, diagonal), factors)
         if not self.volumes:
-            return energy, energy, energy, factors
+            nothing = torch.zeros_like(energy)
+            return energy, nothing, nothing, factors
         weight, value = to.records[self.volumes[0]].unbind(-1)
         stiffness = 2 * weight.squeeze(-1)
         off = self.parts[self.volumes[0]].at(x, normal).view(-1, n_references) - value.squeeze(-1)

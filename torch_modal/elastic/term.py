@@ -230,12 +230,18 @@ class Term(nn.Module):
 
     def kernel_functions(self, n: int) -> KernelFunctions | None:
         """What kernels are made from, for elements of ``n`` edge vectors; None for a term that torch computes."""
-        if self.kernel_measure is None or self.total or type(self).difference is not Term.difference:
+        if self.kernel_measure is None or not self._has(
+            Term, "difference", "energies", "slopes", "curvatures", "tension"
+        ):
             return None
         return _of_measure(self._name(), n, square(), self.kernel_measure, self.kernel_gradient)
 
     def _name(self) -> str:
         return f"{type(self).__module__}.{type(self).__qualname__}"
+
+    def _has(self, kind: type["Term"], *methods: str) -> bool:
+        """Whether a class that is no total has the methods of another."""
+        return not self.total and all(getattr(type(self), each) is getattr(kind, each) for each in methods)
 
     def softening(self, start: Tensor, rest: Tensor, weights: Tensor | None) -> Tensor | None:
         """Factors of the stiffness where minimisations start; None for one.
@@ -339,7 +345,7 @@ class PeriodicTerm(Term):
 
     def kernel_functions(self, n: int) -> KernelFunctions | None:
         """As in the base class; kernels know angles by cosine and sine."""
-        if self.kernel_measure is None or self.total:
+        if self.kernel_measure is None or not self._has(PeriodicTerm, "energies", "slopes", "curvatures"):
             return None
         return _of_angle(self._name(), n, self.kernel_measure, self.kernel_gradient)
 

@@ -80,7 +80,7 @@ def kernels() -> SimpleNamespace:
     half, sixth = wp.constant(real(0.5)), wp.constant(real(1 / 6))
 
     @wp.func
-    def middle_of(x: wp.array(dtype=vec3), v: int, centre: wp.array(dtype=vec3), s: int, first: int):
+    def middle_of(x: wp.array[vec3], v: int, centre: wp.array[vec3], s: int, first: int):
         """The centre; any vertex where the surface is closed."""
         found = x[place(v, first)]
         if centre:
@@ -89,15 +89,9 @@ def kernels() -> SimpleNamespace:
 
     @wp.kernel(module=module, enable_backward=False)
     def sizes(
-        faces: wp.array(dtype=wp.vec3i),
-        n_vertices: int,
-        x: wp.array(dtype=vec3),
-        centre: wp.array(dtype=vec3),
-        volume: wp.array(dtype=real),
-        area: wp.array(dtype=real),
-        normal: wp.array(dtype=vec3),
-        threads: int,
-    ):
+        faces: wp.array[wp.vec3i], n_vertices: int, x: wp.array[vec3], centre: wp.array[vec3], volume: wp.array[real],
+        area: wp.array[real], normal: wp.array[vec3], threads: int,
+    ):  # fmt: skip
         """The volume; the area, and the gradient of the volume with a fixed centre, where there are arrays for them."""
         i = wp.tid()
         s = i // threads
@@ -128,17 +122,10 @@ def kernels() -> SimpleNamespace:
 
     @wp.kernel(module=module)
     def sizes_back(
-        faces: wp.array(dtype=wp.vec3i),
-        n_vertices: int,
-        x: wp.array(dtype=vec3),
-        centre: wp.array(dtype=vec3),
-        to_volume: wp.array(dtype=real),
-        to_area: wp.array(dtype=real),
-        to_normal: wp.array(dtype=vec3),
-        to_x: wp.array(dtype=vec3),
-        to_centre: wp.array(dtype=vec3),
-        threads: int,
-    ):
+        faces: wp.array[wp.vec3i], n_vertices: int, x: wp.array[vec3], centre: wp.array[vec3],
+        to_volume: wp.array[real], to_area: wp.array[real], to_normal: wp.array[vec3], to_x: wp.array[vec3],
+        to_centre: wp.array[vec3], threads: int,
+    ):  # fmt: skip
         """Adds the gradients; what the area or the normals receive may be left out."""
         i = wp.tid()
         s = i // threads

@@ -97,7 +97,8 @@ class Solver:
             the bases: no gradient goes through the choice. Two bases of one reference have none.
         backend: ``"warp"`` (kernels of NVIDIA Warp for the local rotations, the modal energy and the local steps),
             ``"torch"``, ``"auto"`` (kernels where Warp is installed), or one that was registered (docs/extending.md).
-            Kernels compute in float64. Terms beyond Eq. 5 are computed by torch.
+            Kernels compute in float64, also in a layer of float32. Terms of your own without a
+            :attr:`~torch_modal.Term.kernel_measure` are computed by torch.
 
     Raises:
         ValueError: A choice that does not exist, or a number out of range.

@@ -78,7 +78,7 @@ def pierces(p: vec3, q: vec3, r: vec3, a: vec3, b: vec3, c: vec3) -> bool:
 
 
 @wp.func
-def cross(x: wp.array(dtype=vec3), f: wp.vec3i, g: wp.vec3i) -> bool:
+def cross(x: wp.array[vec3], f: wp.vec3i, g: wp.vec3i) -> bool:
     """Whether two faces without a common vertex pass through each other, or miss each other by rounding only."""
     found = not meet(f, g)
     if found:
@@ -94,15 +94,9 @@ def cross(x: wp.array(dtype=vec3), f: wp.vec3i, g: wp.vec3i) -> bool:
 
 @wp.kernel(enable_backward=False)
 def crossing(
-    x: wp.array(dtype=vec3),
-    corners: wp.array(dtype=wp.vec3i),
-    n: int,
-    boxes: wp.array(dtype=box),
-    stack: wp.array(dtype=wp.vec2i),
-    room: int,
-    pairs: wp.array(dtype=wp.vec2i),
-    number: wp.array(dtype=int),
-):
+    x: wp.array[vec3], corners: wp.array[wp.vec3i], n: int, boxes: wp.array[box], stack: wp.array[wp.vec2i],
+    room: int, pairs: wp.array[wp.vec2i], number: wp.array[int],
+):  # fmt: skip
     """Pairs of faces that cross or nearly do and share no vertex, as many as there is room for, and their number.
 
     Node ``i`` has the nodes ``2 i`` and ``2 i + 1`` below it, and the last ``n`` are the faces. One thread goes down

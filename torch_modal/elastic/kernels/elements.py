@@ -77,7 +77,7 @@ def _common(f: KernelFunctions) -> SimpleNamespace:
     vectors, corners = wp.types.matrix(shape=(n, 3), dtype=real), wp.types.vector(length=n + 1, dtype=wp.int32)
 
     @wp.func
-    def edge_vectors(x: wp.array(dtype=vec3), at: int, q: corners):
+    def edge_vectors(x: wp.array[vec3], at: int, q: corners):
         origin = x[place(at, q[0])]
         found = vectors()
         for j in range(wp.static(n)):
@@ -85,7 +85,7 @@ def _common(f: KernelFunctions) -> SimpleNamespace:
         return found
 
     @wp.func
-    def add(out: wp.array(dtype=vec3), at: int, q: corners, received: vectors):
+    def add(out: wp.array[vec3], at: int, q: corners, received: vectors):
         whole = vec3()
         for c in range(wp.static(n)):
             wp.atomic_add(out, place(at, q[c + 1]), received[c])
@@ -193,15 +193,15 @@ def _rider(f: KernelFunctions | None) -> SimpleNamespace:
     if f is None:
 
         @wp.func
-        def energy(e: vec3, rests: wp.array(dtype=real), at: int):
+        def energy(e: vec3, rests: wp.array[real], at: int):
             return real(0.0)
 
         @wp.func
-        def linearised(e: vec3, rests: wp.array(dtype=real), at: int, factors: wp.array(dtype=real), to: int):
+        def linearised(e: vec3, rests: wp.array[real], at: int, factors: wp.array[real], to: int):
             return real(0.0), vec3(), symmetric()
 
         @wp.func
-        def product(factors: wp.array(dtype=real), at: int, e: vec3):
+        def product(factors: wp.array[real], at: int, e: vec3):
             return vec3(), real(0.0)
 
         return SimpleNamespace(record=real, Factors=real, energy=energy, linearised=linearised, product=product)
@@ -209,11 +209,11 @@ def _rider(f: KernelFunctions | None) -> SimpleNamespace:
     record, Factors = potential.record, c.Factors
 
     @wp.func
-    def energy(e: vec3, rests: wp.array(dtype=record), at: int):
+    def energy(e: vec3, rests: wp.array[record], at: int):
         return potential.energy(f.measure(wp.matrix_from_rows(e)), rests[at])
 
     @wp.func
-    def linearised(e: vec3, rests: wp.array(dtype=record), at: int, factors: wp.array(dtype=Factors), to: int):
+    def linearised(e: vec3, rests: wp.array[record], at: int, factors: wp.array[Factors], to: int):
         m, g = f.linearised(wp.matrix_from_rows(e))
         own = rests[at]
         slope = potential.slope(m, own)
@@ -225,7 +225,7 @@ def _rider(f: KernelFunctions | None) -> SimpleNamespace:
         return potential.energy(m, own), slope * g[0], square
 
     @wp.func
-    def product(factors: wp.array(dtype=Factors), at: int, e: vec3):
+    def product(factors: wp.array[Factors], at: int, e: vec3):
         received, form = c.product(factors[at], wp.matrix_from_rows(e))
         return received[0], form
 
@@ -239,28 +239,23 @@ def convex(f: KernelFunctions, rider: KernelFunctions | None) -> SimpleNamespace
     Where both read and write the same vertices, one pass takes two thirds of the time of two. The elements are then
     those of the rider; ``own`` has the number of the term's element, or -1 where there is none.
     """
-    c, potential, module, n = _common(f), f.potential, _module(f, "convex"), f.n
+    c, potential, module, n = (
+        _common(f),
+        f.potential,
+        _module(f, "convex" if rider is None else f"convex.{rider.name}"),
+        f.n,
+    )
     corners, edge_vectors, add, Factors, record = c.corners, c.edge_vectors, c.add, c.Factors, potential.record
     factors_of, stiffness, product_of, other = c.factors, c.stiffness, c.product, _rider(rider)
     kernel = wp.kernel(enable_backward=False, module=module)
 
     @kernel
     def linearise(
-        elements: wp.array(dtype=corners),
-        own: wp.array(dtype=wp.int32),
-        n_own: int,
-        n_vertices: int,
-        x: wp.array(dtype=vec3),
-        rests: wp.array(dtype=record),
-        others: wp.array(dtype=other.record),
-        n_references: int,
-        total: wp.array(dtype=real),
-        gradient: wp.array(dtype=vec3),
-        diagonal: wp.array(dtype=symmetric),
-        factors: wp.array(dtype=Factors),
-        other_factors: wp.array(dtype=other.Factors),
-        threads: int,
-    ):
+        elements: wp.array[corners], own: wp.array[wp.int32], n_own: int, n_vertices: int, x: wp.array[vec3],
+        rests: wp.array[record], others: wp.array[other.record], n_references: int, total: wp.array[real],
+        gradient: wp.array[vec3], diagonal: wp.array[symmetric], factors: wp.array[Factors],
+        other_factors: wp.array[other.Factors], threads: int,
+    ):  # fmt: skip
         """Energy, gradient, and blocks and factors of the convex Hessian; those without arrays are left out.
 
         References come round where there are fewer than shapes.
@@ -312,20 +307,10 @@ def convex(f: KernelFunctions, rider: KernelFunctions | None) -> SimpleNamespace
 
     @kernel
     def product(
-        elements: wp.array(dtype=corners),
-        own: wp.array(dtype=wp.int32),
-        n_own: int,
-        n_vertices: int,
-        fields: wp.array(dtype=vec3),
-        start: int,
-        factors: wp.array(dtype=Factors),
-        other_factors: wp.array(dtype=other.Factors),
-        out: wp.array(dtype=vec3),
-        out_start: int,
-        scalars: wp.array(dtype=vec3),
-        first: int,
-        threads: int,
-    ):
+        elements: wp.array[corners], own: wp.array[wp.int32], n_own: int, n_vertices: int, fields: wp.array[vec3],
+        start: int, factors: wp.array[Factors], other_factors: wp.array[other.Factors], out: wp.array[vec3],
+        out_start: int, scalars: wp.array[vec3], first: int, threads: int,
+    ):  # fmt: skip
         """The convex Hessian times a field, and the field times that, the third of the scalars, where there are some.
 
         Fields, results and scalars begin at the given places of their arrays.
@@ -364,20 +349,10 @@ def forward(f: KernelFunctions) -> SimpleNamespace:
 
     @kernel
     def jacobian(
-        elements: wp.array(dtype=corners),
-        n_vertices: int,
-        x: wp.array(dtype=vec3),
-        rests: wp.array(dtype=record),
-        columns: wp.array(dtype=wide),
-        n_columns: int,
-        n_blocks: int,
-        first_row: int,
-        n_rows: int,
-        out: wp.array(dtype=wide),
-        entries: wp.array(dtype=real),
-        totals: wp.array(dtype=wp.vec2d),
-        threads: int,
-    ):
+        elements: wp.array[corners], n_vertices: int, x: wp.array[vec3], rests: wp.array[record],
+        columns: wp.array[wide], n_columns: int, n_blocks: int, first_row: int, n_rows: int, out: wp.array[wide],
+        entries: wp.array[real], totals: wp.array[wp.vec2d], threads: int,
+    ):  # fmt: skip
         """Change of each measure along the columns, and the measure's residual; all stiffnesses and energies together.
 
         All by the root of twice the weight. The residual comes in the column after the last. A component of a vertex
@@ -429,21 +404,10 @@ def _merging(f: KernelFunctions, module: "wp.Module") -> dict[str, "wp.Kernel"]:
 
     @kernel
     def merge(
-        elements: wp.array(dtype=corners),
-        n_vertices: int,
-        x: wp.array(dtype=vec3),
-        pulls: wp.array(dtype=real),
-        means: wp.array(dtype=real),
-        stiffness: wp.array(dtype=real),
-        start: wp.array(dtype=vec3),
-        altitude: real,
-        relative: int,
-        n_shapes: int,
-        n_stiffness: int,
-        out: wp.array(dtype=record),
-        constant: wp.array(dtype=real),
-        threads: int,
-    ):
+        elements: wp.array[corners], n_vertices: int, x: wp.array[vec3], pulls: wp.array[real], means: wp.array[real],
+        stiffness: wp.array[real], start: wp.array[vec3], altitude: real, relative: int, n_shapes: int,
+        n_stiffness: int, out: wp.array[record], constant: wp.array[real], threads: int,
+    ):  # fmt: skip
         """K rest shapes of each sample as one, softened at the needles of a start, and the energy that remains."""
         i = wp.tid()
         s = i // threads
@@ -470,12 +434,8 @@ def _merging(f: KernelFunctions, module: "wp.Module") -> dict[str, "wp.Kernel"]:
 
     @kernel
     def total(
-        elements: wp.array(dtype=corners),
-        n_vertices: int,
-        x: wp.array(dtype=vec3),
-        out: wp.array(dtype=real),
-        threads: int,
-    ):
+        elements: wp.array[corners], n_vertices: int, x: wp.array[vec3], out: wp.array[real], threads: int,
+    ):  # fmt: skip
         """All measures together."""
         i = wp.tid()
         s = i // threads
@@ -508,24 +468,11 @@ def _merging_back(f: KernelFunctions, module: "wp.Module") -> "wp.Kernel":
 
     @wp.kernel(module=module)
     def merge(
-        elements: wp.array(dtype=corners),
-        n_vertices: int,
-        x: wp.array(dtype=vec3),
-        pulls: wp.array(dtype=real),
-        means: wp.array(dtype=real),
-        stiffness: wp.array(dtype=real),
-        start: wp.array(dtype=vec3),
-        altitude: real,
-        relative: int,
-        n_shapes: int,
-        n_stiffness: int,
-        to_out: wp.array(dtype=row),
-        to_x: wp.array(dtype=vec3),
-        to_pulls: wp.array(dtype=real),
-        to_stiffness: wp.array(dtype=real),
-        to_start: wp.array(dtype=vec3),
-        threads: int,
-    ):
+        elements: wp.array[corners], n_vertices: int, x: wp.array[vec3], pulls: wp.array[real], means: wp.array[real],
+        stiffness: wp.array[real], start: wp.array[vec3], altitude: real, relative: int, n_shapes: int,
+        n_stiffness: int, to_out: wp.array[row], to_x: wp.array[vec3], to_pulls: wp.array[real],
+        to_stiffness: wp.array[real], to_start: wp.array[vec3], threads: int,
+    ):  # fmt: skip
         """Adds the gradients; the means, and the energy that remains, have none."""
         i = wp.tid()
         s = i // threads
@@ -595,21 +542,11 @@ def backward(f: KernelFunctions) -> SimpleNamespace:
 
     @wp.kernel(module=module)
     def linearise(
-        elements: wp.array(dtype=corners),
-        n_vertices: int,
-        x: wp.array(dtype=vec3),
-        rests: wp.array(dtype=record),
-        to_total: wp.array(dtype=real),
-        to_gradient: wp.array(dtype=vec3),
-        to_diagonal: wp.array(dtype=symmetric),
-        fields: wp.array(dtype=vec3),
-        pushed: wp.array(dtype=vec3),
-        n_samples: int,
-        n_products: int,
-        to_x: wp.array(dtype=vec3),
-        to_rests: wp.array(dtype=row),
-        threads: int,
-    ):
+        elements: wp.array[corners], n_vertices: int, x: wp.array[vec3], rests: wp.array[record],
+        to_total: wp.array[real], to_gradient: wp.array[vec3], to_diagonal: wp.array[symmetric],
+        fields: wp.array[vec3], pushed: wp.array[vec3], n_samples: int, n_products: int, to_x: wp.array[vec3],
+        to_rests: wp.array[row], threads: int,
+    ):  # fmt: skip
         """Adjoint of ``linearise``, from what energy, gradient and blocks receive, and of the products with factors.
 
         Those are with directions, the second of three kinds of fields, and each is received by a pushed field.
@@ -664,13 +601,9 @@ def backward(f: KernelFunctions) -> SimpleNamespace:
 
     @wp.kernel(module=module)
     def hessians(
-        elements: wp.array(dtype=corners),
-        n_vertices: int,
-        x: wp.array(dtype=vec3),
-        rests: wp.array(dtype=record),
-        out: wp.array(dtype=vectors),
-        threads: int,
-    ):
+        elements: wp.array[corners], n_vertices: int, x: wp.array[vec3], rests: wp.array[record],
+        out: wp.array[vectors], threads: int,
+    ):  # fmt: skip
         """Second derivatives of the energy of each element beyond Gauss and Newton's, in its edge vectors."""
         i = wp.tid()
         s = i // threads
@@ -702,14 +635,9 @@ def curving(n: int) -> SimpleNamespace:
 
     @wp.kernel(module=module, enable_backward=False)
     def curved(
-        elements: wp.array(dtype=corners),
-        hessians: wp.array(dtype=local),
-        n_vertices: int,
-        columns: wp.array(dtype=wide),
-        n_blocks: int,
-        out: wp.array(dtype=wide),
-        threads: int,
-    ):
+        elements: wp.array[corners], hessians: wp.array[local], n_vertices: int, columns: wp.array[wide],
+        n_blocks: int, out: wp.array[wide], threads: int,
+    ):  # fmt: skip
         """Sums on the vertices."""
         i = wp.tid()
         s = i // threads

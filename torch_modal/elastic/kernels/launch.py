@@ -51,6 +51,7 @@ def made(make: Callable[..., Any], *given: Any) -> Any:
     return found
 
 
+@cache
 def of_elements(part: Literal["convex", "forward", "backward", "curving"], *given: Any) -> Any:
     """Kernels of a module that one or two terms have, or elements of so many edge vectors."""
     return made(getattr(importlib.import_module(f"{PACKAGE}.elements"), part), *given)

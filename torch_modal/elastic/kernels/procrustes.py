@@ -33,12 +33,9 @@ def to_covariance(covariance: wp.mat33d, to_rotation: wp.mat33d):
 
 @wp.kernel(enable_backward=False)
 def mean_pose(
-    to_reference: wp.array(dtype=wp.mat33d),
-    among: wp.array(dtype=wp.mat33d),
-    weights: wp.array(dtype=wp.vec2d),
-    turns: wp.array(dtype=wp.mat33d),
-    pose: wp.array(dtype=wp.mat33d),
-):
+    to_reference: wp.array[wp.mat33d], among: wp.array[wp.mat33d], weights: wp.array[wp.vec2d],
+    turns: wp.array[wp.mat33d], pose: wp.array[wp.mat33d],
+):  # fmt: skip
     """procrustes.mean_pose of two shapes."""
     s = wp.tid()
     w = weights[s]

@@ -7,23 +7,11 @@ from torch_modal.elastic.kernels.elements import HALF, place, real
 
 @wp.kernel(enable_backward=False)
 def update(
-    n: int,
-    value: wp.array(dtype=real),
-    slope: wp.array(dtype=real),
-    slack: real,
-    shortest: real,
-    goal: wp.array(dtype=real),
-    rounding: wp.array(dtype=real),
-    a: wp.array(dtype=real),
-    there: wp.array(dtype=real),
-    energy: wp.array(dtype=real),
-    gradient: wp.array(dtype=real),
-    norm: wp.array(dtype=real),
-    inverse: wp.array(dtype=real),
-    length: wp.array(dtype=real),
-    n_steps: wp.array(dtype=wp.int64),
-    pushed: wp.array(dtype=real),
-):
+    n: int, value: wp.array[real], slope: wp.array[real], slack: real, shortest: real, goal: wp.array[real],
+    rounding: wp.array[real], a: wp.array[real], there: wp.array[real], energy: wp.array[real],
+    gradient: wp.array[real], norm: wp.array[real], inverse: wp.array[real], length: wp.array[real],
+    n_steps: wp.array[wp.int64], pushed: wp.array[real],
+):  # fmt: skip
     """Take a step or not, with the inverse after it; then go to where the next one leads."""
     s = wp.tid()
     v = s * n

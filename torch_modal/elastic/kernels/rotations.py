@@ -25,14 +25,14 @@ ARC = wp.constant(five(*[(-1) ** k / (2 * k + 1) for k in range(5)]))
 
 @wp.struct
 class FaceTables:
-    faces: wp.array(dtype=wp.vec3i)
-    sides: wp.array(dtype=wp.vec3i)
+    faces: wp.array[wp.vec3i]
+    sides: wp.array[wp.vec3i]
     """Edges of the sides of each triangle."""
-    signs: wp.array(dtype=vec3)
-    order: wp.array(dtype=wp.int32)
+    signs: wp.array[vec3]
+    order: wp.array[wp.int32]
     """Triangles, parents before children."""
-    parent: wp.array(dtype=wp.int32)
-    piece: wp.array(dtype=wp.int32)
+    parent: wp.array[wp.int32]
+    piece: wp.array[wp.int32]
     n_vertices: int
     n_edges: int
     n_pieces: int
@@ -89,7 +89,7 @@ def quaternion(r: wp.mat33d):
 
 
 @wp.func
-def corners(surface: FaceTables, x: wp.array(dtype=vec3), at: int, k: int):
+def corners(surface: FaceTables, x: wp.array[vec3], at: int, k: int):
     f = surface.faces[place(k, 0)]
     return wp.matrix_from_rows(x[place(at, f[0])], x[place(at, f[1])], x[place(at, f[2])])
 
@@ -146,13 +146,9 @@ def sides(e1: vec3, e2: vec3, stretch: vec3):
 
 @wp.kernel(enable_backward=False)
 def turns(
-    surface: FaceTables,
-    x: wp.array(dtype=vec3),
-    quaternions: wp.array(dtype=vec4),
-    areas: wp.array(dtype=real),
-    found: wp.array(dtype=packed_turn),
-    threads: int,
-):
+    surface: FaceTables, x: wp.array[vec3], quaternions: wp.array[vec4], areas: wp.array[real],
+    found: wp.array[packed_turn], threads: int,
+):  # fmt: skip
     """Quaternions between the frames of two shapes, twice both areas, and the other inputs of :func:`part_turned`."""
     i = wp.tid()
     s = i // threads
@@ -168,12 +164,9 @@ def turns(
 
 @wp.kernel(enable_backward=False)
 def sign_votes(
-    surface: FaceTables,
-    quaternions: wp.array(dtype=vec4),
-    areas: wp.array(dtype=real),
-    sign: wp.array(dtype=real),
-    vote: wp.array(dtype=real),
-):
+    surface: FaceTables, quaternions: wp.array[vec4], areas: wp.array[real], sign: wp.array[real],
+    vote: wp.array[real],
+):  # fmt: skip
     """Signs passed down the tree, parents before children; then each piece votes. One thread for a sample."""
     s = wp.tid()
     n = surface.order.shape[0]
@@ -205,15 +198,9 @@ def pulled(at: packed_turn, q: vec4, w: wp.vec2d, stiffness: vec3, to: wp.mat33d
 
 @wp.kernel(enable_backward=False)
 def part_turned(
-    surface: FaceTables,
-    quaternions: wp.array(dtype=vec4),
-    sign: wp.array(dtype=real),
-    given: wp.array(dtype=packed_turn),
-    weights: wp.array(dtype=wp.vec2d),
-    stiffness: wp.array(dtype=vec3),
-    pulls: wp.array(dtype=vec3),
-    threads: int,
-):
+    surface: FaceTables, quaternions: wp.array[vec4], sign: wp.array[real], given: wp.array[packed_turn],
+    weights: wp.array[wp.vec2d], stiffness: wp.array[vec3], pulls: wp.array[vec3], threads: int,
+):  # fmt: skip
     """Pulls of the edge vectors between two shapes on their vertices, of turns whose signs are known."""
     i = wp.tid()
     s = i // threads
@@ -226,13 +213,9 @@ def part_turned(
 
 @wp.kernel(enable_backward=False)
 def trajectory_edges(
-    surface: FaceTables,
-    trajectory: wp.array(dtype=packed_trajectory),
-    which: wp.array(dtype=wp.int32),
-    time: wp.array(dtype=real),
-    total: wp.array(dtype=vec4),
-    threads: int,
-):
+    surface: FaceTables, trajectory: wp.array[packed_trajectory], which: wp.array[wp.int32], time: wp.array[real],
+    total: wp.array[vec4], threads: int,
+):  # fmt: skip
     """Sides of triangles on a smooth trajectory, summed on the edges by area, and the areas."""
     i = wp.tid()
     s = i // threads

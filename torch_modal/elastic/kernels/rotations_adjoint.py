@@ -33,16 +33,10 @@ def gradients(first: wp.mat33d, second: wp.mat33d, sign: real, w: wp.vec2d, stif
 
 @wp.kernel
 def part_turned(
-    surface: FaceTables,
-    shapes: wp.array(dtype=vec3),
-    weights: wp.array(dtype=wp.vec2d),
-    sign: wp.array(dtype=real),
-    stiffness: wp.array(dtype=vec3),
-    to_pulls: wp.array(dtype=vec3),
-    to_shapes: wp.array(dtype=vec3),
-    to_weights: wp.array(dtype=wp.vec2d),
+    surface: FaceTables, shapes: wp.array[vec3], weights: wp.array[wp.vec2d], sign: wp.array[real],
+    stiffness: wp.array[vec3], to_pulls: wp.array[vec3], to_shapes: wp.array[vec3], to_weights: wp.array[wp.vec2d],
     threads: int,
-):
+):  # fmt: skip
     """Adjoint of ``rotations.part_turned``: adds the gradients of both shapes and the weights."""
     i = wp.tid()
     s = i // threads

@@ -55,17 +55,9 @@ def row(kind: int, k: int, n_kept: int, n_samples: int, s: int, n: int):
 
 @wp.kernel(enable_backward=False)
 def begin(
-    gradient: wp.array(dtype=vec3),
-    normal: wp.array(dtype=vec3),
-    moment: wp.array(dtype=real),
-    diagonal: wp.array(dtype=symmetric),
-    n_kept: int,
-    n: int,
-    fields: wp.array(dtype=vec3),
-    scalars: wp.array(dtype=vec3),
-    solution: wp.array(dtype=vec3),
-    threads: int,
-):
+    gradient: wp.array[vec3], normal: wp.array[vec3], moment: wp.array[real], diagonal: wp.array[symmetric],
+    n_kept: int, n: int, fields: wp.array[vec3], scalars: wp.array[vec3], solution: wp.array[vec3], threads: int,
+):  # fmt: skip
     """The first residual and direction. The diagonal is inverted in place."""
     i = wp.tid()
     s = i // threads
@@ -91,17 +83,9 @@ def begin(
 
 @wp.kernel(enable_backward=False)
 def advance(
-    normal: wp.array(dtype=vec3),
-    inverse: wp.array(dtype=symmetric),
-    stiffness: wp.array(dtype=real),
-    m: int,
-    n_kept: int,
-    n: int,
-    fields: wp.array(dtype=vec3),
-    scalars: wp.array(dtype=vec3),
-    solution: wp.array(dtype=vec3),
-    threads: int,
-):
+    normal: wp.array[vec3], inverse: wp.array[symmetric], stiffness: wp.array[real], m: int, n_kept: int, n: int,
+    fields: wp.array[vec3], scalars: wp.array[vec3], solution: wp.array[vec3], threads: int,
+):  # fmt: skip
     """The solution after a direction, and the residual there."""
     i = wp.tid()
     s = i // threads
@@ -127,16 +111,9 @@ def advance(
 
 @wp.kernel(enable_backward=False)
 def turn(
-    normal: wp.array(dtype=vec3),
-    inverse: wp.array(dtype=symmetric),
-    n_samples: int,
-    m: int,
-    n_kept: int,
-    n: int,
-    fields: wp.array(dtype=vec3),
-    scalars: wp.array(dtype=vec3),
-    threads: int,
-):
+    normal: wp.array[vec3], inverse: wp.array[symmetric], n_samples: int, m: int, n_kept: int, n: int,
+    fields: wp.array[vec3], scalars: wp.array[vec3], threads: int,
+):  # fmt: skip
     """The next direction; its product is set to zero."""
     i = wp.tid()
     s = i // threads
@@ -158,7 +135,7 @@ def turn(
 
 # ----------------------------------------------------------------------------------------------------- and back again
 @wp.kernel(enable_backward=False)
-def inner(a: wp.array(dtype=vec3), b: wp.array(dtype=vec3), n: int, found: wp.array(dtype=vec3), threads: int):
+def inner(a: wp.array[vec3], b: wp.array[vec3], n: int, found: wp.array[vec3], threads: int):
     """Inner product of two fields, added to the first of three numbers."""
     i = wp.tid()
     s = i // threads
@@ -170,20 +147,10 @@ def inner(a: wp.array(dtype=vec3), b: wp.array(dtype=vec3), n: int, found: wp.ar
 
 @wp.kernel(enable_backward=False)
 def back_to_direction(
-    normal: wp.array(dtype=vec3),
-    stiffness: wp.array(dtype=real),
-    m: int,
-    n_products: int,
-    n: int,
-    fields: wp.array(dtype=vec3),
-    scalars: wp.array(dtype=vec3),
-    to_solution: wp.array(dtype=vec3),
-    to_residual: wp.array(dtype=vec3),
-    pushed: wp.array(dtype=vec3),
-    to_direction: wp.array(dtype=vec3),
-    received: wp.array(dtype=vec3),
-    threads: int,
-):
+    normal: wp.array[vec3], stiffness: wp.array[real], m: int, n_products: int, n: int, fields: wp.array[vec3],
+    scalars: wp.array[vec3], to_solution: wp.array[vec3], to_residual: wp.array[vec3], pushed: wp.array[vec3],
+    to_direction: wp.array[vec3], received: wp.array[vec3], threads: int,
+):  # fmt: skip
     """Gradient of a direction except through the Hessian, and the field that the Hessian is applied to for the rest.
 
     After the last direction there is no next one. What the length of the step, the ratio to the previous direction and
@@ -218,19 +185,10 @@ def back_to_direction(
 
 @wp.kernel(enable_backward=False)
 def back_to_normal(
-    normal: wp.array(dtype=vec3),
-    stiffness: wp.array(dtype=real),
-    m: int,
-    n_products: int,
-    n: int,
-    fields: wp.array(dtype=vec3),
-    scalars: wp.array(dtype=vec3),
-    pushed: wp.array(dtype=vec3),
-    to_direction: wp.array(dtype=vec3),
-    to_normal: wp.array(dtype=vec3),
-    received: wp.array(dtype=vec3),
-    threads: int,
-):
+    normal: wp.array[vec3], stiffness: wp.array[real], m: int, n_products: int, n: int, fields: wp.array[vec3],
+    scalars: wp.array[vec3], pushed: wp.array[vec3], to_direction: wp.array[vec3], to_normal: wp.array[vec3],
+    received: wp.array[vec3], threads: int,
+):  # fmt: skip
     """The volume's part of the Hessian, and the gradient of the ratio to the previous direction, if any."""
     i = wp.tid()
     s = i // threads
@@ -253,21 +211,10 @@ def back_to_normal(
 
 @wp.kernel(enable_backward=False)
 def back_to_residual(
-    normal: wp.array(dtype=vec3),
-    stiffness: wp.array(dtype=real),
-    m: int,
-    n_products: int,
-    n: int,
-    fields: wp.array(dtype=vec3),
-    scalars: wp.array(dtype=vec3),
-    inverse: wp.array(dtype=symmetric),
-    to_solution: wp.array(dtype=vec3),
-    to_direction: wp.array(dtype=vec3),
-    to_residual: wp.array(dtype=vec3),
-    to_diagonal: wp.array(dtype=symmetric),
-    received: wp.array(dtype=vec3),
-    threads: int,
-):
+    normal: wp.array[vec3], stiffness: wp.array[real], m: int, n_products: int, n: int, fields: wp.array[vec3],
+    scalars: wp.array[vec3], inverse: wp.array[symmetric], to_solution: wp.array[vec3], to_direction: wp.array[vec3],
+    to_residual: wp.array[vec3], to_diagonal: wp.array[symmetric], received: wp.array[vec3], threads: int,
+):  # fmt: skip
     """Gradients of a residual, of the preconditioner, and of the previous step length, if any."""
     i = wp.tid()
     s = i // threads
