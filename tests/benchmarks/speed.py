@@ -4,13 +4,15 @@
     python tests/benchmarks/speed.py --before CHECKOUT
     python tests/benchmarks/speed.py --parts growth first
     python tests/benchmarks/speed.py --parts batches [--device cuda]
+    python tests/benchmarks/speed.py --parts threads [--rounds 10]
 
 Each side runs in processes of its own, on one thread, in turns; what is told are ratios of processor seconds, the best
 of all rounds, so that what else a machine does slows all sides. In-betweens, with gradients too, are over theirs
 without; making a layer is over the set-up of their shape space. ``--before`` names the folder of another checkout, for
 example of an earlier commit, which each column is then compared with. Bases are there before the clock starts, but for
 ``--parts first``: from two new key-frames to a sequence with nothing cached, on the clock. ``--parts batches`` compares
-batches, forward and with their gradients, with single calls.
+batches, forward and with their gradients, with single calls. ``--parts threads`` compares two threads with one, in
+turns, on the clock: more rounds find the quiet moments of a machine.
 """
 
 import argparse
@@ -36,6 +38,7 @@ from tables import geometric_mean
 from timing import limit_threads, timed
 
 import torch_modal as tm
+from torch_modal.data.samples import load_sample
 
 WORK = ("whole", "no local steps", "fast", "torch alone", "forward and backward", "making a layer")
 DIVIDED = ("sample creature", "mh-hand", "mh-woman")
@@ -167,6 +170,41 @@ def batches(arguments: argparse.Namespace) -> None:
         print(f"batch of {n:2d}: {1e3 * forward / n:6.1f} ms each, with gradients {1e3 * backward / n:6.1f} ms")
 
 
+def threads(arguments: argparse.Namespace) -> None:
+    """Two threads over one, on the clock: the sample creature, the best of all rounds."""
+    case = next(case for case in samples() if "creature" in case.name)
+    layer, times = tm.InBetween(case.bases(), case.faces), torch.linspace(0.05, 0.95, 16, dtype=torch.float64)
+    ends = [x.expand(len(times), -1, -1) for x in (case.x_a, case.x_b)]
+    six = load_sample("creature").keyframes[:6]
+
+    def forward() -> None:
+        with torch.no_grad():
+            layer(*ends, times)
+
+    def backward() -> None:
+        layer(*(x.clone().requires_grad_() for x in ends), times).square().sum().backward()
+
+    def divided() -> None:
+        tm.subdivide(torch.stack([case.x_a, case.x_b]), case.faces, 4, bases=case.bases(), progress=False)
+
+    def extracted() -> None:
+        with tempfile.TemporaryDirectory() as scratch:
+            os.environ["TORCH_MODAL_CACHE"] = scratch
+            tm.extract_bases(six, case.faces, progress=False)
+
+    works = {"16 in-betweens": forward, "the same with gradients": backward, "subdivide, levels=4": divided}
+    for name, work in {**works, "extract_bases of six": extracted}.items():
+        best = {1: math.inf, 2: math.inf}
+        for _ in range(arguments.rounds + 1):
+            for n in best:
+                limit_threads(n)
+                start = time.perf_counter()
+                work()
+                best[n] = min(best[n], time.perf_counter() - start)
+        one, two = best.values()
+        print(f"{name:<24}{1e3 * one:7.0f} ms on one thread, {1e3 * two:7.0f} on two: {one / two:.2f}", flush=True)
+
+
 FIRST = """
 import json, os, sys, time
 start = time.perf_counter()
@@ -202,7 +240,7 @@ def first(arguments: argparse.Namespace) -> None:
         )
 
 
-PARTS = {"compare": compare, "growth": growth, "first": first, "batches": batches}
+PARTS = {"compare": compare, "growth": growth, "first": first, "batches": batches, "threads": threads}
 
 
 def main() -> None:

@@ -22,6 +22,7 @@ FLOORS = [
     "progress",
     "trees",
     "autograd",
+    "threads",
     "geometry",
     "io",
     "keyframes",

@@ -1,6 +1,5 @@
 """Gradients of a minimiser: by the implicit function theorem, or through a fixed number of steps."""
 
-import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -11,6 +10,7 @@ from torch_modal import trees
 from torch_modal.autograd import applied, flattened, recorded, transposed
 from torch_modal.elastic.gauss_newton import GaussNewtonStep
 from torch_modal.elastic.minimise import AmplitudeEnergy, Solution, Status, minimise, ridged
+from torch_modal.threads import warn
 
 Inverse = Callable[[Any, Tensor, Any, Tensor], Callable[[Tensor], Tensor]]
 
@@ -110,10 +110,10 @@ def _warn_of_singular(singular: Tensor) -> None:
     except RuntimeError:  # under vmap there is no number to see
         return
     if number:
-        warnings.warn(
-            f"the Hessian of {number} in-betweens is singular: no gradient flows through their amplitudes",
+        warn(
+            "the Hessian of {} in-betweens is singular: no gradient flows through their amplitudes",
+            number,
             ConvergenceWarning,
-            stacklevel=2,
         )
 
 

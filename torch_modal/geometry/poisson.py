@@ -11,7 +11,7 @@ from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.autograd import plain
 from torch_modal.geometry.connectivity import Connectivity, half_cotangents, vertex_areas
 from torch_modal.geometry.rigid import best_fit
-from torch_modal.geometry.sparse import SparseSolver, graph_laplacian, solve_by, solve_exported
+from torch_modal.geometry.sparse import MAKING, SparseSolver, graph_laplacian, solve_by, solve_exported
 from torch_modal.geometry.triangle_frames import Sides, edge_means
 
 # Bounds of cotangent weights, for slivers. Positive weights make the matrix positive definite.
@@ -57,16 +57,17 @@ class Poisson(nn.Module):
 
     def _solver_of(self, weights: Tensor) -> SparseSolver:
         """Inverse of the Laplacian for the current weights, which ``functional_call`` may replace."""
-        if self._made is not None:
-            known, solver = self._made
-            alike = (known.dtype, known.device) == (weights.dtype, weights.device)
-            if known is weights or (alike and torch.equal(known, weights)):
-                return solver
-        laplacian = graph_laplacian(self.edges.cpu().numpy(), weights.double().cpu().numpy(), len(self.piece))
-        # A copy: `share_memory()`, as for spawned workers, frees what is under the view of a tensor.
-        solver = SparseSolver(laplacian, self.free.cpu().numpy().copy())
-        self._made = weights, solver
-        return solver
+        with MAKING:
+            if self._made is not None:
+                known, solver = self._made
+                alike = (known.dtype, known.device) == (weights.dtype, weights.device)
+                if known is weights or (alike and torch.equal(known, weights)):
+                    return solver
+            laplacian = graph_laplacian(self.edges.cpu().numpy(), weights.double().cpu().numpy(), len(self.piece))
+            # A copy: `share_memory()`, as for spawned workers, frees what is under the view of a tensor.
+            solver = SparseSolver(laplacian, self.free.cpu().numpy().copy())
+            self._made = weights, solver
+            return solver
 
     def forward(self, pulls: Tensor, near: Tensor) -> Tensor:
         """The shape that fits target edge vectors, by their :meth:`pulls`, with the centres of the pieces of ``near``.

@@ -9,6 +9,7 @@ releases the GIL.
 import atexit
 import ctypes
 import sys
+import threading
 import weakref
 from collections.abc import Callable
 from functools import cache
@@ -33,6 +34,9 @@ Solve = Callable[[Tensor], Tensor]
 
 # Right-hand sides per solve: more are not faster and use more memory; CUDA allows at most 128.
 MOST_COLUMNS = 48
+
+MAKING = threading.RLock()
+"""Lock of factorisations: threads that need the same factors compute them once."""
 
 
 def factorize(matrix: sparse.spmatrix, ordering: str = "MMD_AT_PLUS_A") -> SuperLU:
@@ -81,9 +85,10 @@ class SparseSolver:
         columns = right.detach().to(device, torch.float64).movedim(-2, 0)
         if not columns.numel():
             return torch.zeros_like(right)
-        if device not in self._solves:
-            _SOLVERS.add(self)
-            self._solves[device] = _superlu(self._inner) if cholespy is None else _cholesky(self._inner, device)
+        with MAKING:
+            if device not in self._solves:
+                _SOLVERS.add(self)
+                self._solves[device] = _superlu(self._inner) if cholespy is None else _cholesky(self._inner, device)
         solved = [self._solves[device](part.contiguous()) for part in columns.flatten(1).split(MOST_COLUMNS, 1)]
         out = solved[0] if len(solved) == 1 else torch.cat(solved, 1)
         out.index_fill_(0, torch.from_numpy(self.fixed).to(device), 0)

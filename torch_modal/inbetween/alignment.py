@@ -151,7 +151,7 @@ class KeyframeAlignment(nn.Module):
         if bool(((ratios < OTHER_SIZE) & (ratios > 1 / OTHER_SIZE)).all()):
             return
         other = (ratios > SMALLEST_SIZE) & ((ratios > OTHER_SIZE) | (ratios < 1 / OTHER_SIZE)) & ratios.isfinite()
-        if not bool(other.any()):
+        if not bool(other.any()) or self.size_warned:  # perhaps by another thread
             return
         self.size_warned = True
         warnings.warn(

@@ -19,6 +19,7 @@ from torch_modal.inbetween.solver import InBetweenSolver
 from torch_modal.keyframes.arrays import as_faces, as_positions
 from torch_modal.keyframes.check import checked_surface
 from torch_modal.modes.basis import ModalBasis, checked_bases
+from torch_modal.threads import alone, by_chunks
 
 
 class BasisBuffers(nn.Module):
@@ -148,6 +149,7 @@ class InBetweenLayer(PreciseModule):
         self.register_load_state_dict_post_hook(InBetweenLayer._build)
 
     @lasting
+    @alone()
     def _build(self, _: Any = None) -> None:
         """Build everything that follows from the bases, in float64 on the CPU, then of their dtype and device."""
         like = self.bases[0].reference
@@ -200,7 +202,9 @@ class InBetweenLayer(PreciseModule):
         pulls = weights.to(self.dtype).expand(*lead, n).reshape(-1, n)
         mu, found = self.mu_of(pulls, lead), []
         for i, (own, core) in enumerate(zip(self.vertices, self.cores, strict=True)):
-            found.append(core(Samples(flat[:, :, own], pulls, mu, self.stiffness_of(pulls, lead, i))))
+            samples = Samples(flat[:, :, own], pulls, mu, self.stiffness_of(pulls, lead, i))
+            # Further terms may have parameters of their own.
+            found.append(by_chunks(core, samples, samples.keyframes.shape[2], closed=not self.objective.terms))
         return of_bodies(found, self.vertices).unflattened(lead)
 
     def mu_of(self, like: Tensor, lead: torch.Size) -> Tensor:

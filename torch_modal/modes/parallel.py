@@ -9,6 +9,8 @@ from typing import Any, TypeVar
 
 from threadpoolctl import OpenBLASController, ThreadpoolController
 
+from torch_modal.threads import n_threads
+
 Result = TypeVar("Result")
 
 
@@ -17,10 +19,9 @@ class StoppedError(Exception):
 
 
 def n_cpus() -> int:
-    """Number of processors available to this process."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    """Number of processors available to this process, or of torch's threads if they are fewer."""
+    available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return min(available, n_threads())
 
 
 def run_all(work: Callable[[int], Result], n: int, stop: threading.Event, most: int) -> list[Result]:
@@ -31,11 +32,11 @@ def run_all(work: Callable[[int], Result], n: int, stop: threading.Event, most: 
     The largest number of threads bounds memory; at least one is used.
     """
     alone = one_blas_thread()(work)
-    n_threads = min(n, n_cpus(), max(most, 1))
-    if n_threads < 2:  # in this thread, which Ctrl-C ends at once
+    most = min(n, n_cpus(), max(most, 1))
+    if most < 2:  # in this thread, which Ctrl-C ends at once
         return [alone(index) for index in range(n)]
     futures: list[Future[Result]] = []
-    with ThreadPoolExecutor(n_threads, thread_name_prefix="torch_modal") as pool:
+    with ThreadPoolExecutor(most, thread_name_prefix="torch_modal") as pool:
         try:
             # Inside the try block: Ctrl-C may come between submissions.
             for index in range(n):

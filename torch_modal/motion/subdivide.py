@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 from dataclasses import replace
 from itertools import pairwise
 from typing import Any
@@ -25,6 +26,7 @@ from torch_modal.modes.extract import bases_of_checked
 from torch_modal.motion.path import Path
 from torch_modal.passengers.proxy import Proxy, proxy_size
 from torch_modal.progress import Progress, ProgressReport
+from torch_modal.threads import alone
 
 MAX_LEVELS = 12
 
@@ -131,7 +133,8 @@ def subdivide(
     by_path = smooth or chosen.objective.contact
     sequence = keyframes.new_empty(places[-1] + 1, *keyframes.shape[1:])
     total = (len(places) - 1) * (1 if by_path else levels)
-    with ProgressReport(total, "in-between shapes", progress) as bar, torch.no_grad():
+    own = nullcontext() if by_path else alone()  # splines are torch's work
+    with ProgressReport(total, "in-between shapes", progress) as bar, torch.no_grad(), own:
         if by_path:
             path = Path(made, faces.cpu(), times, cyclic, smooth, objective=chosen.objective, solver=chosen.solver)
             parts = _along_path(path.to(keyframes.device), keyframes, faces, places)

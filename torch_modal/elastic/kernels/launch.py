@@ -33,25 +33,31 @@ NO_DRIVER = b"Warp CUDA warning: Could not find or load the NVIDIA CUDA driver"
 """What Warp says where there is no GPU, with no setting that turns it off: in every run, it looks like an error."""
 MOST_ENTRIES = 2**31 - 1
 """Kernels index with 32 bits: no array of theirs, and no launch, may be longer."""
+_LOADING = threading.RLock()
+_MADE: dict[tuple[Any, ...], Any] = {}
 
 
 @cache
 def kernels(name: Module) -> Any:
     """A module of the kernels, compiled by the first who asks on a machine, and kept by Warp."""
     module = importlib.import_module(f"{PACKAGE}.{name}")
-    _load(module.__name__)
+    with _LOADING:
+        _load(module.__name__)
     return module
 
 
-@cache
 def made(make: Callable[..., Any], *given: Any) -> Any:
-    """Kernels of one module that a function makes, compiled likewise."""
-    found = make(*given)
-    _load(found.module)
-    return found
+    """Kernels of one module that a function makes, compiled likewise; by one thread for all."""
+    key = make, *given
+    if key not in _MADE:
+        with _LOADING:
+            if key not in _MADE:
+                found = make(*given)
+                _load(found.module)
+                _MADE[key] = found
+    return _MADE[key]
 
 
-@cache
 def of_elements(part: Literal["convex", "forward", "backward", "curving"], *given: Any) -> Any:
     """Kernels of a module that one or two terms have, or elements of so many edge vectors."""
     return made(getattr(importlib.import_module(f"{PACKAGE}.elements"), part), *given)
@@ -59,16 +65,17 @@ def of_elements(part: Literal["convex", "forward", "backward", "curving"], *give
 
 def load_kernels() -> None:
     """Load those of in-betweens without gradients, so that nobody waits for it later."""
-    elements, *_ = (importlib.import_module(f"{PACKAGE}.{name}") for name in ("elements", *IN_BETWEENS))
-    own = stretch.kernel_functions(), bend.kernel_functions()
-    for functions in own:
-        elements.forward(functions)
-    elements.convex(*reversed(own))
-    volume.kernels()
-    importlib.import_module("torch_modal.elastic.distortion").kernels()
-    _load(PACKAGE)
-    for name in IN_BETWEENS:
-        kernels(name)
+    with _LOADING:
+        elements, *_ = (importlib.import_module(f"{PACKAGE}.{name}") for name in ("elements", *IN_BETWEENS))
+        own = stretch.kernel_functions(), bend.kernel_functions()
+        for functions in own:
+            elements.forward(functions)
+        elements.convex(*reversed(own))
+        volume.kernels()
+        importlib.import_module("torch_modal.elastic.distortion").kernels()
+        _load(PACKAGE)
+        for name in IN_BETWEENS:
+            kernels(name)
 
 
 def _load(module: Any) -> None:
@@ -138,7 +145,7 @@ class Constants:
                     setattr(made, name, wp.array(value.numpy(), dtype=entry, device=wp.device_from_torch(device)))
                 else:
                     setattr(made, name, value)
-            self._made[device] = made
+            return self._made.setdefault(device, made)  # one for all threads: a struct owns its arrays
         return self._made[device]
 
     def __getstate__(self) -> dict[str, Any]:
