@@ -8,10 +8,9 @@ import torch
 from conftest import Shapes, random_rotation
 from shapes import edge_lengths, largest
 from torch import Tensor
-from torch_modal.elastic.warp_backend import WarpBackend
 
 import torch_modal as tm
-from torch_modal.elastic.backend import TorchBackend
+from torch_modal.elastic.backend import TorchBackend, WarpBackend
 from torch_modal.geometry import connectivity
 from torch_modal.geometry.rigid import blend
 from torch_modal.inbetween.settings import Objective, Solver

@@ -8,9 +8,9 @@ import pytest
 import torch
 from conftest import Shapes
 from torch import Tensor
-from torch_modal.elastic.warp_backend import WarpBackend
 
 import torch_modal as tm
+from torch_modal.elastic.backend import WarpBackend
 from torch_modal.elastic.distortion import Distortion, _weights
 from torch_modal.elastic.energy import RestShapes
 from torch_modal.elastic.implicit import ConvergenceWarning

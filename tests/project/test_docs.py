@@ -144,7 +144,7 @@ def test_what_does_not_exist_is_found() -> None:
     text = """
 `torch-modal compress a.obj`, `torch-modal view --bones 3 --lines` and `--faster`; tm.InBetween and `tm.Between` of
 torch_modal.layers.in_betwixt, tm.losses.Shell, `tests/project/test_docs.py::test_nothing`, `examples/walk.py`,
-`solve/minimize.py`, `solve/minimise.py`, `space.sample(3)`, `space.samples` and `Solution.state`.
+`elastic/minimize.py`, `elastic/minimise.py`, `space.sample(3)`, `space.samples` and `Solution.state`.
 
 | member | meaning |
 |---|---|
@@ -156,12 +156,12 @@ torch_modal.layers.in_betwixt, tm.losses.Shell, `tests/project/test_docs.py::tes
 
 | folder | contents |
 |---|---|
-| `solve/` | `implicit.py`, `explicit.py` |
+| `elastic/` | `implicit.py`, `explicit.py` |
 """
     assert missing(text, "extending") == {
         *("torch-modal compress", "torch-modal view --lines", "--faster", "tm.Between", "tm.losses.Shell"),
         *("tm.layers.in_betwixt", "tests/project/test_docs.py::test_nothing", "examples/walk.py"),
-        *("solve/minimize.py", "solve/explicit.py", "space.samples", "Solution.state", "Term.blocks"),
+        *("elastic/minimize.py", "elastic/explicit.py", "space.samples", "Solution.state", "Term.blocks"),
         *("Solver.min_steps", "explicit.py"),
     }
 

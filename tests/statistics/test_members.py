@@ -9,7 +9,7 @@ from shapes import edge_lengths
 from test_coordinates import far
 
 import torch_modal as tm
-from torch_modal.elastic import choice
+from torch_modal.elastic import backend
 from torch_modal.elastic.backend import TorchBackend
 from torch_modal.elastic.steps import FineEnergy
 from torch_modal.elastic.term import Mesh, Term
@@ -40,7 +40,7 @@ def test_members_are_computed_by_the_backend_of_the_solver(bars: Shapes, monkeyp
             made.append(len(terms))
             return super().fine_energy(mesh, terms)
 
-    monkeypatch.setitem(choice.BACKENDS, "counted", Counted)
+    monkeypatch.setitem(backend.BACKENDS, "counted", Counted)
     space = tm.ShapeSpace(bars.bases, bars.faces, solver=tm.Solver(backend="counted"))
     made.clear()  # of the layers of the space
     assert len(space.sample(1, seeded())) == 1

@@ -276,7 +276,7 @@ class KernelModalEnergy(ModalEnergy):
         most = max(1, MOST_NUMBERS // max(self.blocks.shape[1] * rows, *local))
         parts = [
             self._derivatives(a[i : i + most], trees.rows(placement, slice(i, i + most)), second_order)
-            for i in range(0, len(a), most)
+            for i in range(0, max(len(a), 1), most)
         ]
         joined = [None if each[0] is None else torch.cat(each) for each in zip(*parts, strict=True)]
         return parts[0] if len(parts) == 1 else Derivatives(*joined)  # type: ignore[arg-type]

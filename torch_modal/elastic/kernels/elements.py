@@ -131,7 +131,7 @@ def _common(f: KernelFunctions) -> SimpleNamespace:
     else:
 
         @wp.struct
-        class Factors:
+        class TenseFactors:
             gradient: vectors
             along: real
             across: real
@@ -143,17 +143,19 @@ def _common(f: KernelFunctions) -> SimpleNamespace:
 
         @wp.func
         def factors(gradient: vectors, along: real, across: real):
-            h = Factors()
+            h = TenseFactors()
             h.gradient = gradient
             h.along = along
             h.across = across
             return h
 
         @wp.func
-        def product(h: Factors, e: vectors):
+        def product(h: TenseFactors, e: vectors):
             rate = inner(h.gradient, e)
             push = h.along * rate
             return push * h.gradient + h.across * e, push * rate + h.across * inner(e, e)
+
+        Factors = TenseFactors
 
     if f.weight is None:
         return SimpleNamespace(**locals())
