@@ -160,11 +160,13 @@ class Recent:
 def one_thread() -> Iterator[None]:
     """One thread for torch: sums are then split the same way everywhere, and give the same bits."""
     threads = torch.get_num_threads()
-    torch.set_num_threads(1)
+    if threads > 1:  # MKL would be slower for some time after each setting, also of the same number
+        torch.set_num_threads(1)
     try:
         yield
     finally:
-        torch.set_num_threads(threads)
+        if threads > 1:
+            torch.set_num_threads(threads)
 
 
 def outlasting(x: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""What in-betweens are computed with: torch, the reference, and kernels of NVIDIA Warp, the fast path.
+"""Backends of in-betweens: torch, the reference, and kernels of NVIDIA Warp, the fast path.
 
 A backend makes each part of an in-between. It is chosen once, when a layer is made (:func:`choose`); no other room
 knows which one it is.
@@ -89,7 +89,7 @@ class WarpBackend(TorchBackend):
     @staticmethod
     @cache
     def works() -> bool:
-        """Whether Warp is installed, compiles, and computes."""
+        """True where Warp is installed, compiles, and computes."""
         if importlib.util.find_spec("warp") is None:
             return False
         try:
@@ -144,7 +144,7 @@ def register_backend(name: str, make: Callable[[], TorchBackend]) -> None:
 
 
 def names() -> tuple[str, ...]:
-    """What :func:`choose` takes."""
+    """Names that :func:`choose` takes."""
     return ("auto", *BACKENDS)
 
 

@@ -141,7 +141,7 @@ class KernelDistortion(Distortion):
 @cache
 @no_type_check
 def kernels() -> SimpleNamespace:
-    """The same elements, for kernels."""
+    """Kernel of :class:`KernelDistortion`."""
     import warp as wp
 
     from torch_modal.elastic.kernels.elements import place

@@ -5,7 +5,7 @@ gradient once more.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -60,10 +60,11 @@ class KernelTerm(nn.Module):
     def __init__(self, part: OnMesh, functions: KernelFunctions) -> None:
         super().__init__()
         self.part, self.functions = part, functions
+        self.forward_kernels = self.backward_kernels = None
         self.register_buffer("elements", part.corners.T.int().contiguous(), persistent=False)
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "functions": None}  # Warp's functions are no data
+    def __getstate__(self) -> dict[str, Any]:  # Warp's functions and kernels are no data
+        return {**self.__dict__, "functions": None, "forward_kernels": None, "backward_kernels": None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)
@@ -76,8 +77,11 @@ class KernelTerm(nn.Module):
 
     def launch(self, name: str, dim: int, *given: Any, back: bool = False) -> None:
         """Run a kernel over the elements of so many samples."""
-        kernel = getattr(of_elements("backward" if back else "forward", self.functions), name)
-        launch(kernel, (dim, len(self.elements)), [self.elements, *given])
+        which: Literal["forward", "backward"] = "backward" if back else "forward"
+        kernels = self.__dict__[f"{which}_kernels"]
+        if kernels is None:
+            kernels = self.__dict__[f"{which}_kernels"] = of_elements(which, self.functions)
+        launch(getattr(kernels, name), (dim, len(self.elements)), [self.elements, *given])
 
     def reference(
         self, rests: RestShapes, stiffness: Tensor, start: Tensor | None, relative: bool
@@ -121,19 +125,25 @@ class KernelVolume(nn.Module):
         share = (to_centre / len(self.used))[:, None].expand(-1, len(self.used), -1)
         to_x.index_add_(1, self.used, share)
 
+    def centre(self, x: Tensor) -> Tensor | None:
+        """The origin of volumes: the mean; None, for any vertex, where the surface is closed. *Shape:* ``(B, 3)``."""
+        return None if self.closed else self.mean(x)
+
+    def through_centre(self, normal: Tensor) -> None:
+        """Adds to gradients with a fixed centre those through it; on a closed surface they vanish."""
+        if not self.closed:
+            self._spread(-normal.sum(1), normal)
+
     def _launch(self, name: str, x: Tensor, *given: Tensor | None) -> None:
-        # The origin of volumes: any vertex where the surface is closed.
-        centre = None if self.closed else self.mean(x)
-        launch(
-            getattr(made(volume.kernels), name), (len(x), len(self.faces)), [self.faces, x.shape[1], x, centre, *given]
-        )
+        kernel = getattr(made(volume.kernels), name)
+        launch(kernel, (len(x), len(self.faces)), [self.faces, x.shape[1], x, self.centre(x), *given])
 
     def at(self, x: Tensor, normal: Tensor | None = None, area: Tensor | None = None) -> Tensor:
         """Volumes. The gradient, and the area, are added where they are wanted. *Shape:* ``(B, V, 3) -> (B,)``."""
         found = x.new_zeros(len(x))
         self._launch("sizes", x, found, area, normal)
-        if normal is not None and not self.closed:  # through the centre; on a closed surface that vanishes
-            self._spread(-normal.sum(1), normal)
+        if normal is not None:
+            self.through_centre(normal)
         return found
 
     def back(
@@ -196,21 +206,32 @@ class Pass(nn.Module):
             edges, n = self.rider.elements, elements.shape[1]
             alone = torch.cat([edges, edges[:, :1].expand(-1, n - 2)], 1)
             elements = torch.where((own < 0)[:, None], alone, elements[own.clamp_min(0)]).contiguous()
+        self.kernels = None
         self.register_buffer("elements", elements, persistent=False)
         self.register_buffer("own", None if own is None else own.int(), persistent=False)
 
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "kernels": None}
+
     def _launch(self, name: str, dim: int, *given: Any) -> None:
-        kernels = of_elements("convex", self.term.functions, None if self.rider is None else self.rider.functions)
+        if self.kernels is None:
+            rider = None if self.rider is None else self.rider.functions
+            self.kernels = of_elements("convex", self.term.functions, rider)
         dims, n_own = (dim, len(self.elements)), len(self.term.elements)
-        launch(getattr(kernels, name), dims, [self.elements, self.own, n_own, *given])
+        launch(getattr(self.kernels, name), dims, [self.elements, self.own, n_own, *given])
 
     def linearise(
-        self, x: Tensor, records: Sequence[Tensor], given: tuple[Any, ...], factors: Sequence[Tensor]
+        self,
+        x: Tensor,
+        records: Sequence[Tensor],
+        given: tuple[Any, ...],
+        factors: Sequence[Tensor],
+        volume: tuple[Tensor | None, ...],
     ) -> None:
         """Energy and derivatives are added; arguments of the kernel, of which records and factors are of all terms."""
         own, other = self._mine(records)
         own_factors, other_factors = self._mine(factors) if factors else (None, None)
-        self._launch("linearise", len(x), x.shape[1], x, own, other, *given, own_factors, other_factors)
+        self._launch("linearise", len(x), x.shape[1], x, own, other, *given, own_factors, other_factors, *volume)
 
     def product(
         self, dim: tuple[int, int], field: tuple[Tensor, int], factors: Sequence[Tensor], out: tuple[Any, ...]
@@ -277,38 +298,43 @@ class KernelEnergy(nn.Module):
         self, x: Tensor, to: Reference, gradient: Tensor | None, normal: Tensor | None, diagonal: Tensor | None = None
     ) -> tuple[Tensor, Tensor, Tensor, list[Tensor]]:
         """The energy but for its constant; the volume's moment and stiffness; factors. Derivatives are added."""
-        n, n_references, factors = len(x), len(to.constant), []
-        energy = x.new_zeros(n)
+        (energy, inside), factors = x.new_zeros(2, len(x)).unbind(), []
         if diagonal is not None:
-            factors = [x.new_empty(n, *part.size_of_factors) for part in self.parts]
+            factors = [x.new_empty(len(x), *part.size_of_factors) for part in self.parts]
+        n_references, volume = len(to.constant), self.parts[self.volumes[0]] if self.volumes else None
+        # The volume comes with the first pass.
+        more: tuple[Any, ...] = (None,) * 4 if volume is None else (volume.faces, volume.centre(x), inside, normal)
         for one in self.passes:
-            one.linearise(x, to.records, (n_references, energy, gradient, diagonal), factors)
-        if not self.volumes:
-            nothing = torch.zeros_like(energy)
-            return energy, nothing, nothing, factors
-        weight, value = to.records[self.volumes[0]].unbind(-1)
-        stiffness = 2 * weight.squeeze(-1)
-        off = self.parts[self.volumes[0]].at(x, normal).view(-1, n_references) - value.squeeze(-1)
+            one.linearise(x, to.records, (n_references, energy, gradient, diagonal), factors, more)
+            more = (None,) * 4
+        if volume is None:
+            return energy, inside, inside, factors
+        if normal is not None:
+            volume.through_centre(normal)
+        weight, value = to.records[self.volumes[0]][:, 0].unbind(1)
+        stiffness = 2 * weight
+        if len(x) != n_references:
+            energy, inside = energy.view(-1, n_references), inside.view(-1, n_references)
+        off = inside - value
         moment = stiffness * off
-        energy = torch.addcmul(energy.view(-1, n_references), moment, off, value=0.5).flatten()
-        return energy, moment.flatten(), stiffness, factors
+        return torch.addcmul(energy, moment, off, value=0.5), moment, stiffness, factors
 
     def at(self, x: Tensor, to: Reference, hessian: bool = True) -> KernelPoint:
         """Value and derivatives, of which the Hessian's may be left out. *Shape:* ``(B, V, 3)``."""
-        gradient, normal = x.new_zeros(2, *x.shape)
+        gradient, normal = x.new_zeros(2, *x.shape).unbind()
         diagonal = x.new_zeros(*x.shape[:2], 6) if hessian else None
         energy, moment, stiffness, factors = self._linearised(x, to, gradient, normal, diagonal)
         return KernelPoint(energy, gradient, diagonal, factors, normal, moment, stiffness)
 
     def value_and_gradient(self, x: Tensor, to: Reference) -> tuple[Tensor, Tensor]:
         """The energy but for its constant, and its gradient. *Shape:* ``(B, V, 3) -> (B,), (B, V, 3)``."""
-        gradient, normal = x.new_zeros(2, *x.shape)
+        gradient, normal = x.new_zeros(2, *x.shape).unbind()
         energy, moment, *_ = self._linearised(x, to, gradient, normal)
         return energy, gradient.addcmul_(moment[:, None, None], normal) if self.volumes else gradient
 
     def value(self, x: Tensor, to: Reference) -> Tensor:
         """The energy but for its constant, of one shape or more for each reference. *Shape:* ``(D * B, V, 3)``."""
-        return self._linearised(x, to, None, None)[0]
+        return self._linearised(x, to, None, None)[0].flatten()
 
     def product(
         self, factors: Sequence[Tensor], dim: tuple[int, int], fields: Tensor, start: int, out: Tensor, out_start: int,

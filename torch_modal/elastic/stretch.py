@@ -54,7 +54,7 @@ class Stretch(Term):
         return 0.5 * (slope + (slope * slope + width * width + torch.finfo(slope.dtype).tiny).sqrt()) / length
 
     def kernel_functions(self, n: int) -> KernelFunctions | None:
-        """Of edges; of a class that inherits from this one, those of its own."""
+        """Functions of edges; of a class that inherits from this one, its own."""
         return kernel_functions() if type(self) is Stretch else super().kernel_functions(n)
 
 

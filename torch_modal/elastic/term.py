@@ -82,7 +82,7 @@ class Potential(NamedTuple):
 
 
 class KernelFunctions(NamedTuple):
-    """What kernels of a term are made from, as functions of Warp on one element: a matrix of its edge vectors, by row.
+    """Functions of Warp that kernels of a term are made from, of one element: a matrix of its edge vectors, by row.
 
     A term of your own has them by :attr:`Term.kernel_measure`.
     """
@@ -98,6 +98,8 @@ class KernelFunctions(NamedTuple):
     """Edge vectors -> measure, gradient."""
     exact: bool = True
     """Whether the gradient is written out, so that it can be differentiated."""
+    turned: Any = None
+    """Edge vectors, matrix -> the measure's Hessian times the matrix; from the gradient where it is None."""
     weight: Any = None
     """Weight at rest: edge vectors, measure, mean of the measures; None where torch merges the rest shapes."""
     uses_mean: bool = False
@@ -229,7 +231,7 @@ class Term(nn.Module):
         return measures
 
     def kernel_functions(self, n: int) -> KernelFunctions | None:
-        """What kernels are made from, for elements of ``n`` edge vectors; None for a term that torch computes."""
+        """Functions that kernels are made from, of ``n`` edge vectors; None for a term that torch computes."""
         if self.kernel_measure is None or not self._has(
             Term, "difference", "energies", "slopes", "curvatures", "tension"
         ):
@@ -240,7 +242,7 @@ class Term(nn.Module):
         return f"{type(self).__module__}.{type(self).__qualname__}"
 
     def _has(self, kind: type["Term"], *methods: str) -> bool:
-        """Whether a class that is no total has the methods of another."""
+        """True for a term that is no total and has the methods of a class."""
         return not self.total and all(getattr(type(self), each) is getattr(kind, each) for each in methods)
 
     def softening(self, start: Tensor, rest: Tensor, weights: Tensor | None) -> Tensor | None:
@@ -509,7 +511,7 @@ def periodic() -> Potential:
 @cache
 @no_type_check
 def _of_measure(name: str, n: int, potential: Potential, measure: Any, gradient: Any) -> KernelFunctions:
-    """Of a measure alone, or with its gradient."""
+    """Functions of a measure alone, or with its gradient."""
     import warp as wp
 
     if gradient is None:
@@ -530,7 +532,7 @@ def _of_measure(name: str, n: int, potential: Potential, measure: Any, gradient:
 @cache
 @no_type_check
 def _of_angle(name: str, n: int, measure: Any, gradient: Any) -> KernelFunctions:
-    """Of an angle, by its cosine and sine."""
+    """Functions of an angle, by its cosine and sine."""
     import warp as wp
 
     whole = _of_measure(name, n, periodic(), measure, gradient).linearised

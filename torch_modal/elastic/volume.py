@@ -87,12 +87,25 @@ def kernels() -> SimpleNamespace:
             found = centre[s]
         return found
 
+    @wp.func
+    def enclosed(face: wp.vec3i, v: int, x: wp.array[vec3], middle: vec3, normal: wp.array[vec3]):
+        """The volume between a face and the middle; its gradient, with a fixed middle, is added if wanted."""
+        p = x[place(v, face[0])] - middle
+        q = x[place(v, face[1])] - middle
+        r = x[place(v, face[2])] - middle
+        to_p = sixth * wp.cross(q, r)
+        if normal:
+            wp.atomic_add(normal, place(v, face[0]), to_p)
+            wp.atomic_add(normal, place(v, face[1]), sixth * wp.cross(r, p))
+            wp.atomic_add(normal, place(v, face[2]), sixth * wp.cross(p, q))
+        return wp.dot(p, to_p)
+
     @wp.kernel(module=module, enable_backward=False)
     def sizes(
-        faces: wp.array[wp.vec3i], n_vertices: int, x: wp.array[vec3], centre: wp.array[vec3], volume: wp.array[real],
-        area: wp.array[real], normal: wp.array[vec3], threads: int,
+        faces: wp.array[wp.vec3i], n_vertices: int, x: wp.array[vec3], centre: wp.array[vec3],
+        volume: wp.array[real], area: wp.array[real], normal: wp.array[vec3], threads: int,
     ):  # fmt: skip
-        """The volume; the area, and the gradient of the volume with a fixed centre, where there are arrays for them."""
+        """The volume, and its gradient; the area. The latter two are left out where there are no arrays for them."""
         i = wp.tid()
         s = i // threads
         v = s * n_vertices
@@ -101,17 +114,11 @@ def kernels() -> SimpleNamespace:
         surface = real(0.0)
         for k in range(i - s * threads, faces.shape[0], threads):
             face = faces[place(k, 0)]
-            p = x[place(v, face[0])] - middle
-            q = x[place(v, face[1])] - middle
-            r = x[place(v, face[2])] - middle
-            to_p = sixth * wp.cross(q, r)
-            inside += wp.dot(p, to_p)
+            inside += enclosed(face, v, x, middle, normal)
             if area:
-                surface += half * length_of(wp.cross(q - p, r - p))
-            if normal:
-                wp.atomic_add(normal, place(v, face[0]), to_p)
-                wp.atomic_add(normal, place(v, face[1]), sixth * wp.cross(r, p))
-                wp.atomic_add(normal, place(v, face[2]), sixth * wp.cross(p, q))
+                p = x[place(v, face[0])]
+                q = x[place(v, face[1])]
+                surface += half * length_of(wp.cross(q - p, x[place(v, face[2])] - p))
         wp.atomic_add(volume, s, inside)
         if area:
             wp.atomic_add(area, s, surface)
@@ -160,4 +167,4 @@ def kernels() -> SimpleNamespace:
         if to_centre:
             wp.atomic_add(to_centre, s, -received)
 
-    return SimpleNamespace(module=module, sizes=sizes, sizes_back=sizes_back)
+    return SimpleNamespace(module=module, sizes=sizes, sizes_back=sizes_back, middle_of=middle_of, enclosed=enclosed)

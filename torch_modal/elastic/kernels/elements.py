@@ -15,6 +15,7 @@ import warp as wp
 
 from torch_modal.elastic.bend import LEAST_FULLNESS
 from torch_modal.elastic.term import KernelFunctions
+from torch_modal.elastic.volume import kernels as volume_kernels
 
 real = wp.float64
 vec3 = wp.vec3d
@@ -105,7 +106,7 @@ def _common(f: KernelFunctions) -> SimpleNamespace:
 
         @wp.struct
         class Factors:
-            """Of products with the convex Hessian."""
+            """Factors of products with the convex Hessian."""
 
             gradient: vectors
             along: real
@@ -123,7 +124,7 @@ def _common(f: KernelFunctions) -> SimpleNamespace:
 
         @wp.func
         def product(h: Factors, e: vectors):
-            """What an element gives, and the product of that with its change."""
+            """Forces of an element, and their product with its change."""
             rate = inner(h.gradient, e)
             push = h.along * rate
             return push * h.gradient, push * rate
@@ -250,17 +251,20 @@ def convex(f: KernelFunctions, rider: KernelFunctions | None) -> SimpleNamespace
     corners, edge_vectors, add, Factors, record = c.corners, c.edge_vectors, c.add, c.Factors, potential.record
     factors_of, stiffness, product_of, other = c.factors, c.stiffness, c.product, _rider(rider)
     kernel = wp.kernel(enable_backward=False, module=module)
+    of_faces = volume_kernels()
+    middle_of, enclosed = of_faces.middle_of, of_faces.enclosed
 
     @kernel
     def linearise(
         elements: wp.array[corners], own: wp.array[wp.int32], n_own: int, n_vertices: int, x: wp.array[vec3],
         rests: wp.array[record], others: wp.array[other.record], n_references: int, total: wp.array[real],
         gradient: wp.array[vec3], diagonal: wp.array[symmetric], factors: wp.array[Factors],
-        other_factors: wp.array[other.Factors], threads: int,
+        other_factors: wp.array[other.Factors], faces: wp.array[wp.vec3i], centre: wp.array[vec3],
+        inside: wp.array[real], normal: wp.array[vec3], threads: int,
     ):  # fmt: skip
-        """Energy, gradient, and blocks and factors of the convex Hessian; those without arrays are left out.
+        """Energy, gradient, and blocks and factors of the convex Hessian; volume and its gradient.
 
-        References come round where there are fewer than shapes.
+        What has no arrays is left out. References come round where there are fewer than shapes.
         """
         i = wp.tid()
         s = i // threads
@@ -306,6 +310,12 @@ def convex(f: KernelFunctions, rider: KernelFunctions | None) -> SimpleNamespace
                 if at >= 0:
                     found += potential.energy(f.measure(e), rests[place(r * n_own, at)])
         wp.atomic_add(total, s, found)
+        if faces:
+            middle = middle_of(x, v, centre, s, faces[0][0])
+            volume = real(0.0)
+            for k in range(i - s * threads, faces.shape[0], threads):
+                volume += enclosed(faces[place(k, 0)], v, x, middle, normal)
+            wp.atomic_add(inside, s, volume)
 
     @kernel
     def product(
@@ -531,7 +541,7 @@ def backward(f: KernelFunctions) -> SimpleNamespace:
 
     @wp.func
     def of_measure(m: kind, to: record, to_energy: real, to_slope: real, to_along: real, to_across: real):
-        """What follows from the measure, times what each of that receives."""
+        """Results that follow from the measure, times what each of them receives."""
         slope = potential.slope(m, to)
         along, across = stiffness(m, slope, real(2.0) * to.weight)
         return to_energy * potential.energy(m, to) + to_slope * slope + to_along * along + to_across * across
@@ -541,6 +551,14 @@ def backward(f: KernelFunctions) -> SimpleNamespace:
         """The gradient of the measure along a direction: its own gradient is a product with a Hessian."""
         _m, g = f.linearised(e)
         return inner(g, received)
+
+    turned = f.turned
+    if turned is None:
+
+        @wp.func
+        def turned(e: vectors, received: vectors):
+            found, _unused = wp.grad(of_gradient)(e, received)
+            return found
 
     @wp.kernel(module=module)
     def linearise(
@@ -582,7 +600,7 @@ def backward(f: KernelFunctions) -> SimpleNamespace:
                     to_along += HALF * wp.dot(of_own, g[j])
                     to_across += own[0] + own[3] + own[5]
                     to_g[j] = to_g[j] + along * (of_first + of_own)
-                turned = vectors()
+                both = vectors()
                 for p in range(n_products):
                     direction = edge_vectors(fields, ((n_products + p) * n_samples + s) * n_vertices, q)
                     push = edge_vectors(pushed, (p * n_samples + s) * n_vertices, q)
@@ -590,14 +608,13 @@ def backward(f: KernelFunctions) -> SimpleNamespace:
                     rate_of_push = inner(g, push)
                     to_along += rate * rate_of_push
                     to_across += inner(direction, push)
-                    turned += rate_of_push * direction + rate * push
-                to_g += along * turned
+                    both += rate_of_push * direction + rate * push
+                to_g += along * both
             to_energy = real(0.0)
             if to_total:
                 to_energy = to_total[s]
             to_m, received, _0, _1, _2, _3 = wp.grad(of_measure)(m, to, to_energy, inner(g, d), to_along, to_across)
-            to_e, _4 = wp.grad(of_gradient)(e, to_g)
-            to_e += potential.rate(m, to_m) * g
+            to_e = turned(e, to_g) + potential.rate(m, to_m) * g
             add(to_x, v, q, to_e)
             to_rests[at] = to_rests[at] + packed(received)
 
@@ -621,8 +638,7 @@ def backward(f: KernelFunctions) -> SimpleNamespace:
             for j in range(3 * n):
                 unit = vectors()
                 unit[j // 3, j % 3] = slope
-                of_unit, _1 = wp.grad(of_gradient)(e, unit)
-                out[place(3 * n * at, j)] = of_unit + (beyond * g[j // 3, j % 3]) * g
+                out[place(3 * n * at, j)] = turned(e, unit) + (beyond * g[j // 3, j % 3]) * g
 
     merge = _merging_back(f, module) if f.weight is not None else None
     return SimpleNamespace(module=module, linearise=linearise, hessians=hessians, merge=merge)

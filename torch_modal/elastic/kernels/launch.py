@@ -164,7 +164,7 @@ class Entry(NamedTuple):
 
 @cache
 def _entries(kernel: Any) -> list[Entry | None]:
-    """Of each argument that is an array; None for others."""
+    """Entries of each argument that is an array; None for others."""
     import warp as wp
 
     found: list[Entry | None] = []
@@ -228,11 +228,13 @@ class _Command:
         pairs = list(zip(entries, given, strict=True))
         self.others = {i: x for i, (entry, x) in enumerate(pairs) if entry is None}
         self.arrays = [
-            [(i, wp.from_torch(torch.zeros(1), return_ctype=True), *entry) for i, entry in enumerate(entries) if entry]
+            [(i, array := wp.from_torch(torch.zeros(1), return_ctype=True), array.shape, *entry[:2])
+             for i, entry in enumerate(entries) if entry]
             for _ in range(1 + back)
-        ]
-        for _, array, *_, n_bytes in chain(*self.arrays):
-            array.data, array.strides[0] = 0, n_bytes
+        ]  # fmt: skip
+        for i, array, *_ in chain(*self.arrays):
+            entry: Any = entries[i]
+            array.data, array.strides[0] = 0, entry.n_bytes
         plain = [x.on(device) if isinstance(x, Constants) else x for x in given]
         first, *adjoint = (
             [dict((i, a) for i, a, *_ in own).get(i, x) for i, x in enumerate(plain)] for own in self.arrays
@@ -256,16 +258,16 @@ class _Command:
             else:
                 self.recorded.set_param_at_index_from_ctype(i, x)
         for arrays, tensors in zip(self.arrays, (given, adjoints), strict=False):
-            for i, array, width, dtype, _ in arrays:
+            for i, array, shape, width, dtype in arrays:
                 x = tensors[i] if i < len(tensors) else None  # not all have an adjoint
                 if x is None:
-                    array.data = array.shape[0] = 0
+                    array.data = shape[0] = 0
                     continue
                 if x.dtype is not dtype or not x.is_contiguous():
                     raise RuntimeError(
                         f"a kernel needs a contiguous tensor of {dtype}; got {x.dtype}, strides {x.stride()}"
                     )
-                array.shape[0] = length = x.numel() // width
+                shape[0] = length = x.numel() // width
                 array.data = x.data_ptr()
                 if length > MOST_ENTRIES:
                     raise ValueError(
