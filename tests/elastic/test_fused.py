@@ -439,7 +439,8 @@ class TestLayers:
 
     @torch.no_grad()
     def test_kernels_of_a_term_of_ones_own(self, case: Case) -> None:
-        """Energy, gradient and Hessian of one term are those of torch."""
+        """Energy, gradient and Hessian of one term are those of torch; a volume alone is torch's."""
+        assert KernelEnergy.of(Energy(case.mesh, [Volume()]), case.mesh) is None
         energy = Energy(case.mesh, [fibres()(1e3)])
         own = KernelEnergy.of(energy, case.mesh)
         start, first, second, t, *_ = case.given

@@ -10,7 +10,6 @@ from typing import Any, Literal, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from torch_modal import trees
 from torch_modal.elastic import volume
 from torch_modal.elastic.bend import NEEDLE, NEEDLE_OF_STEPS
 from torch_modal.elastic.energy import Energy, OnMesh, Reference, RestShapes
@@ -89,12 +88,11 @@ class KernelTerm(nn.Module):
         """The record, and the energy that remains. *Shape:* ``(B, M, R), (B,)``."""
         more = () if start is None or self.functions.fullness is None else (start,)
         operation, given = _Merged(self, relative and bool(more)), (rests.shapes, rests.weights, stiffness, *more)
-        own = (
-            operation.by_torch(*(x.double() for x in given))
-            if self.functions.weight is None
-            else fused(operation, *given)
-        )
-        return own[0], own[1]
+        if self.functions.weight is None:
+            record, left = operation.by_torch(*(x.double() for x in given))
+        else:
+            record, left = fused(operation, *given)
+        return record, left
 
 
 class KernelVolume(nn.Module):
@@ -282,14 +280,14 @@ class KernelEnergy(nn.Module):
 
     @classmethod
     def of(cls, energy: Energy, mesh: Mesh) -> "KernelEnergy | None":
-        """An energy by kernels; None where they do not serve all of its terms."""
+        """An energy by kernels; None where they do not serve all of its terms, or it is a volume alone."""
         parts = by_kernels(energy, mesh)
         found = [part for part in parts if part is not None]
-        return cls(energy, found) if len(found) == len(parts) else None
+        serves = len(found) == len(parts) and any(isinstance(part, KernelTerm) for part in found)
+        return cls(energy, found) if serves else None
 
     def reference(self, rests: RestShapes, start: Tensor | None = None, relative: bool = False) -> Reference:
         """Merge rest shapes into one reference (Eq. 8); arguments as :meth:`RestShapes.reference`."""
-        rests = trees.mapped(rests, Tensor.double)
         pairs = zip(self.parts, rests.stiffness, strict=True)
         records, left = zip(*(part.reference(rests, own, start, relative) for part, own in pairs), strict=True)
         return Reference(records, sum(left, start=torch.zeros_like(left[0])))

@@ -246,7 +246,7 @@ class KernelModalEnergy(ModalEnergy):
 
     def _plain(self, placement: Placement) -> Placement | None:
         """The placement for torch; None where it is for kernels."""
-        serves = not torch.is_grad_enabled() and plain(placement.base, *trees.leaves(placement.reference))
+        serves = not torch.is_grad_enabled() and plain(placement.base, *placement.reference.records)
         return None if serves else self.by_torch(placement)
 
     def _shapes(self, a: Tensor, base: Tensor) -> Tensor:
