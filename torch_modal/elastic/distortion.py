@@ -144,7 +144,7 @@ def kernels() -> SimpleNamespace:
     """Kernel of :class:`KernelDistortion`."""
     import warp as wp
 
-    from torch_modal.elastic.kernels.elements import place
+    from torch_modal.elastic.kernels.types import place
 
     real, vec2, vec3, module = wp.float64, wp.vec2d, wp.vec3d, wp.get_module("torch_modal.elastic.kernels.distortion")
     largest_strain, largest_weight = wp.constant(real(LARGEST_STRAIN)), wp.constant(real(LARGEST_WEIGHT))

@@ -61,6 +61,9 @@ class KernelTerm(nn.Module):
         self.part, self.functions = part, functions
         self.forward_kernels = self.backward_kernels = None
         self.register_buffer("elements", part.corners.T.int().contiguous(), persistent=False)
+        self.n_elements = len(self.elements)
+        #: Numbers of elements, and of the factors of each.
+        self.size_of_factors = self.n_elements, 3 * functions.n + 1 + (functions.across is not None)
 
     def __getstate__(self) -> dict[str, Any]:  # Warp's functions and kernels are no data
         return {**self.__dict__, "functions": None, "forward_kernels": None, "backward_kernels": None}
@@ -69,18 +72,13 @@ class KernelTerm(nn.Module):
         super().__setstate__(state)
         self.functions = self.part.term.kernel_functions(len(self.part.corners) - 1)
 
-    @property
-    def size_of_factors(self) -> tuple[int, int]:
-        """Numbers of elements, and of the factors of each."""
-        return len(self.elements), 3 * self.functions.n + 1 + (self.functions.across is not None)
-
     def launch(self, name: str, dim: int, *given: Any, back: bool = False) -> None:
         """Run a kernel over the elements of so many samples."""
         which: Literal["forward", "backward"] = "backward" if back else "forward"
         kernels = self.__dict__[f"{which}_kernels"]
         if kernels is None:
             kernels = self.__dict__[f"{which}_kernels"] = of_elements(which, self.functions)
-        launch(getattr(kernels, name), (dim, len(self.elements)), [self.elements, *given])
+        launch(getattr(kernels, name), (dim, self.n_elements), [self.elements, *given])
 
     def reference(
         self, rests: RestShapes, stiffness: Tensor, start: Tensor | None, relative: bool
@@ -205,6 +203,7 @@ class Pass(nn.Module):
             alone = torch.cat([edges, edges[:, :1].expand(-1, n - 2)], 1)
             elements = torch.where((own < 0)[:, None], alone, elements[own.clamp_min(0)]).contiguous()
         self.kernels = None
+        self.n_elements, self.n_own = len(elements), self.term.n_elements
         self.register_buffer("elements", elements, persistent=False)
         self.register_buffer("own", None if own is None else own.int(), persistent=False)
 
@@ -215,8 +214,8 @@ class Pass(nn.Module):
         if self.kernels is None:
             rider = None if self.rider is None else self.rider.functions
             self.kernels = of_elements("convex", self.term.functions, rider)
-        dims, n_own = (dim, len(self.elements)), len(self.term.elements)
-        launch(getattr(self.kernels, name), dims, [self.elements, self.own, n_own, *given])
+        kernel = getattr(self.kernels, name)
+        launch(kernel, (dim, self.n_elements), [self.elements, self.own, self.n_own, *given])
 
     def linearise(
         self,
@@ -266,6 +265,9 @@ class KernelEnergy(nn.Module):
         parts: Its terms.
     """
 
+    volume: KernelVolume | None
+    in_passes: list[Pass]
+
     def __init__(self, energy: Energy, parts: Sequence[KernelTerm | KernelVolume]) -> None:
         super().__init__()
         self.energy = energy
@@ -275,6 +277,9 @@ class KernelEnergy(nn.Module):
         self.volumes = [i for i, part in enumerate(parts) if isinstance(part, KernelVolume)]
         #: The terms in passes over elements, each alone or with another that rides on it.
         self.passes: Any = nn.ModuleList(_passes(parts, energy.n_vertices))
+        # Lists of modules are slow to index, and this is done at every evaluation.
+        self.__dict__["volume"] = parts[self.volumes[0]] if self.volumes else None
+        self.__dict__["in_passes"] = [*self.passes]
         #: Whether kernels know the adjoints of all terms.
         self.exact = all(part.functions.exact for part in parts if isinstance(part, KernelTerm))
 
@@ -299,10 +304,10 @@ class KernelEnergy(nn.Module):
         (energy, inside), factors = x.new_zeros(2, len(x)).unbind(), []
         if diagonal is not None:
             factors = [x.new_empty(len(x), *part.size_of_factors) for part in self.parts]
-        n_references, volume = len(to.constant), self.parts[self.volumes[0]] if self.volumes else None
+        n_references, volume = len(to.constant), self.volume
         # The volume comes with the first pass.
         more: tuple[Any, ...] = (None,) * 4 if volume is None else (volume.faces, volume.centre(x), inside, normal)
-        for one in self.passes:
+        for one in self.in_passes:
             one.linearise(x, to.records, (n_references, energy, gradient, diagonal), factors, more)
             more = (None,) * 4
         if volume is None:
@@ -342,7 +347,7 @@ class KernelEnergy(nn.Module):
 
         Fields, results and scalars begin at the given places of their arrays.
         """
-        for one in self.passes:
+        for one in self.in_passes:
             one.product(dim, (fields, start), factors, (out, out_start, scalars, first))
 
     def back(
@@ -411,8 +416,8 @@ class _Merged:
         if term.functions.uses_mean:
             means = shapes.new_zeros(shapes.shape[:2])
             term.launch("total", means.numel(), shapes.shape[2], shapes.flatten(0, 1), means)
-            means /= max(len(term.elements), 1)
-        record = shapes.new_empty(len(shapes), len(term.elements), term.functions.potential.n_rows)
+            means /= max(term.n_elements, 1)
+        record = shapes.new_empty(len(shapes), term.n_elements, term.functions.potential.n_rows)
         constant = shapes.new_zeros(len(shapes))
         self._launch(means, given, [record, constant], False)
         if kept is not None:

@@ -74,7 +74,7 @@ def kernels() -> SimpleNamespace:
     """Volumes as above, with their gradients, and the adjoint."""
     import warp as wp
 
-    from torch_modal.elastic.kernels.elements import length_of, place
+    from torch_modal.elastic.kernels.types import length_of, place
 
     real, vec3, module = wp.float64, wp.vec3d, wp.get_module("torch_modal.elastic.kernels.volume")
     half, sixth = wp.constant(real(0.5)), wp.constant(real(1 / 6))

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from torch_modal.elastic.kernels.elements import place, real, vec3
+from torch_modal.elastic.kernels.types import place, real, vec3
 
 MARGIN = wp.constant(real(1e-12))
 """Of the cube of the largest length in a determinant: more than its rounding error."""

@@ -14,61 +14,9 @@ from types import SimpleNamespace
 import warp as wp
 
 from torch_modal.elastic.bend import LEAST_FULLNESS
+from torch_modal.elastic.kernels.types import HALF, block, from_square, place, real, symmetric, vec3, wide
 from torch_modal.elastic.term import KernelFunctions
 from torch_modal.elastic.volume import kernels as volume_kernels
-
-real = wp.float64
-vec3 = wp.vec3d
-vec4 = wp.vec4d
-symmetric = wp.types.vector(length=6, dtype=real)
-"""Entries ``xx, xy, xz, yy, yz, zz`` of a symmetric matrix."""
-wide = wp.types.vector(length=8, dtype=real)
-"""A row's entries of eight columns."""
-
-TINY = wp.constant(real(1.4916681462400413e-154))  # vectors.tiny of float64
-TINIEST = wp.constant(real(2.2250738585072014e-308))
-HALF = wp.constant(real(0.5))
-LARGEST = wp.constant(0x7FFFFFFF)
-
-
-@wp.func
-def place(start: int, i: int):
-    """Index of the i-th element of a row. The mask shows Warp that it is not negative (it would count from the end)."""
-    return (start + i) & LARGEST
-
-
-@wp.func
-def length_of(e: vec3):
-    return wp.sqrt(wp.max(wp.dot(e, e), TINY))
-
-
-@wp.func
-def block(along: real, g: vec3, across: real):
-    """``along * g gᵀ + across`` times the identity."""
-    h = along * g
-    return symmetric(
-        h[0] * g[0] + across, h[0] * g[1], h[0] * g[2], h[1] * g[1] + across, h[1] * g[2], h[2] * g[2] + across
-    )
-
-
-@wp.func
-def applied(m: symmetric, g: vec3):
-    return vec3(
-        m[0] * g[0] + m[1] * g[1] + m[2] * g[2],
-        m[1] * g[0] + m[3] * g[1] + m[4] * g[2],
-        m[2] * g[0] + m[4] * g[1] + m[5] * g[2],
-    )
-
-
-@wp.func
-def from_square(d: symmetric, g: vec3):
-    """Gradient in a vector of the entries of its square."""
-    two = real(2.0)
-    return vec3(
-        two * d[0] * g[0] + d[1] * g[1] + d[2] * g[2],
-        d[1] * g[0] + two * d[3] * g[1] + d[4] * g[2],
-        d[2] * g[0] + d[4] * g[1] + two * d[5] * g[2],
-    )
 
 
 @cache

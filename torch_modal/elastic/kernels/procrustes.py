@@ -2,8 +2,8 @@
 
 import warp as wp
 
-from torch_modal.elastic.kernels.elements import HALF, TINIEST, real, vec3
 from torch_modal.elastic.kernels.rotations import about, half_turn, quaternion
+from torch_modal.elastic.kernels.types import HALF, TINIEST, real, vec3
 
 EPSILON = wp.constant(real(64 * 2.0**-52))
 

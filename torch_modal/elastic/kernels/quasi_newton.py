@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from torch_modal.elastic.kernels.elements import HALF, place, real
+from torch_modal.elastic.kernels.types import HALF, place, real
 
 
 @wp.kernel(enable_backward=False)

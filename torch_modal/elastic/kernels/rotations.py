@@ -4,7 +4,7 @@ from math import factorial
 
 import warp as wp
 
-from torch_modal.elastic.kernels.elements import HALF, TINIEST, TINY, length_of, place, real, vec3, vec4
+from torch_modal.elastic.kernels.types import HALF, TINIEST, TINY, length_of, place, real, vec3, vec4
 from torch_modal.geometry import rotations, triangle_frames
 
 packed_turn = wp.types.matrix(shape=(4, 3), dtype=real)

@@ -7,8 +7,8 @@ own adjoint, which Warp then warns of, nobody asks for.
 import warp as wp
 
 from torch_modal.elastic.kernels import procrustes, rotations
-from torch_modal.elastic.kernels.elements import HALF, place, real, vec3
 from torch_modal.elastic.kernels.rotations import FaceTables, corners, pulled, quaternion, to_corners, triangle
+from torch_modal.elastic.kernels.types import HALF, place, real, vec3
 
 mean_pose = wp.kernel(procrustes.mean_pose.func, module=__name__)
 trajectory_edges = wp.kernel(rotations.trajectory_edges.func, module=__name__)

@@ -9,7 +9,7 @@ in the opposite order; for each product with ``H`` there is one more, with a fie
 import warp as wp
 
 from torch_modal.elastic import steps as relax
-from torch_modal.elastic.kernels.elements import applied, place, real, symmetric, vec3
+from torch_modal.elastic.kernels.types import applied, place, real, symmetric, vec3
 
 RIDGE = wp.constant(real(relax.RIDGE))
 
