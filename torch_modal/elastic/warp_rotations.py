@@ -23,7 +23,6 @@ class WarpRotations(LocalRotations):
     """
 
     shares: Tensor
-    around: Tensor
 
     def __init__(self, mesh: Connectivity, references: Tensor) -> None:
         super().__init__(mesh, references)
@@ -33,8 +32,7 @@ class WarpRotations(LocalRotations):
             depth = depth + depth[above]
         areas, around = self.areas.repeat_interleave(3), self.sides.view(3, -1).T.flatten()
         total = areas.new_zeros(self.n_edges).index_add(0, around, areas)
-        #: Edges of the sides of each triangle, and parts of the sides in them. *Shape:* ``(3F,)``.
-        self.register_buffer("around", around, persistent=False)
+        #: Parts of the sides of each triangle in their edges. *Shape:* ``(3F,)``.
         self.register_buffer("shares", areas / total[around].clamp_min(torch.finfo(total.dtype).tiny), persistent=False)
         #: The surface as the first argument of kernels.
         self.constants = Constants(
@@ -95,7 +93,7 @@ class _Turned:
     def run(self, kept: list[Any] | None, shapes: Tensor, weights: Tensor) -> tuple[Tensor, ...]:
         own, pulls = self.rotations, torch.zeros_like(shapes[:, 0])
         quaternions, sign, frames = own.turned(shapes)
-        given = [own.constants, quaternions, sign, frames, weights, self._stiffness(), pulls]
+        given = [own.constants, quaternions, sign, frames, weights, *self._stiffness(), pulls]
         launch(kernels("rotations").part_turned, (len(shapes), len(own.faces)), given)
         if kept is not None:
             kept.append(sign)
@@ -104,15 +102,15 @@ class _Turned:
     def back(self, kept: list[Any], grads: Sequence[Tensor], shapes: Tensor, weights: Tensor) -> tuple[Tensor, ...]:
         own, found = self.rotations, (torch.zeros_like(shapes), torch.zeros_like(weights))
         sign = kept[0] if kept else own.turned(shapes)[1]
-        given = [own.constants, shapes, weights, sign, self._stiffness(), grads[0], *found]
+        given = [own.constants, shapes, weights, sign, *self._stiffness(), grads[0], *found]
         launch(kernels("rotations_adjoint").part_turned, (len(shapes), len(own.faces)), given)
         return found
 
     def by_torch(self, shapes: Tensor, weights: Tensor) -> tuple[Tensor, ...]:
         return (LocalRotations.pulls(self.rotations, shapes, weights, self.poisson),)
 
-    def _stiffness(self) -> Tensor:
-        return self.rotations.shares.double() * self.poisson.weights.double().index_select(0, self.rotations.around)
+    def _stiffness(self) -> tuple[Tensor, Tensor]:
+        return self.rotations.shares.double(), self.poisson.weights.double()
 
 
 @dataclass(frozen=True, eq=False)

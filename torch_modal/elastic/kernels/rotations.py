@@ -192,6 +192,13 @@ def pulls_between(at: packed_turn, q: vec4, w: wp.vec2d, c: vec3):
 
 
 @wp.func
+def at_sides(surface: FaceTables, shares: wp.array[vec3], stiffness: wp.array[real], k: int):
+    """Parts of the stiffnesses of edges that the sides of a triangle have."""
+    e = surface.sides[place(k, 0)]
+    return wp.cw_mul(shares[place(k, 0)], vec3(stiffness[e[0]], stiffness[e[1]], stiffness[e[2]]))
+
+
+@wp.func
 def pulled(at: packed_turn, q: vec4, w: wp.vec2d, stiffness: vec3, to: wp.mat33d):
     return wp.ddot(pulls_between(at, q, w, stiffness), to)
 
@@ -199,14 +206,17 @@ def pulled(at: packed_turn, q: vec4, w: wp.vec2d, stiffness: vec3, to: wp.mat33d
 @wp.kernel(enable_backward=False)
 def part_turned(
     surface: FaceTables, quaternions: wp.array[vec4], sign: wp.array[real], given: wp.array[packed_turn],
-    weights: wp.array[wp.vec2d], stiffness: wp.array[vec3], pulls: wp.array[vec3], threads: int,
+    weights: wp.array[wp.vec2d], shares: wp.array[vec3], stiffness: wp.array[real], pulls: wp.array[vec3],
+    threads: int,
 ):  # fmt: skip
     """Pulls of the edge vectors between two shapes on their vertices, of turns whose signs are known."""
     i = wp.tid()
     s = i // threads
     for k in range(i - s * threads, surface.faces.shape[0], threads):
         at = place(s * surface.faces.shape[0], k)
-        found = pulls_between(given[at], sign[at] * quaternions[at], weights[s], stiffness[place(k, 0)])
+        found = pulls_between(
+            given[at], sign[at] * quaternions[at], weights[s], at_sides(surface, shares, stiffness, k)
+        )
         for j in range(3):
             wp.atomic_add(pulls, place(s * surface.n_vertices, surface.faces[place(k, 0)][j]), found[j])
 

@@ -7,7 +7,15 @@ own adjoint, which Warp then warns of, nobody asks for.
 import warp as wp
 
 from torch_modal.elastic.kernels import procrustes, rotations
-from torch_modal.elastic.kernels.rotations import FaceTables, corners, pulled, quaternion, to_corners, triangle
+from torch_modal.elastic.kernels.rotations import (
+    FaceTables,
+    at_sides,
+    corners,
+    pulled,
+    quaternion,
+    to_corners,
+    triangle,
+)
 from torch_modal.elastic.kernels.types import HALF, place, real, vec3
 
 mean_pose = wp.kernel(procrustes.mean_pose.func, module=__name__)
@@ -34,8 +42,8 @@ def gradients(first: wp.mat33d, second: wp.mat33d, sign: real, w: wp.vec2d, stif
 @wp.kernel
 def part_turned(
     surface: FaceTables, shapes: wp.array[vec3], weights: wp.array[wp.vec2d], sign: wp.array[real],
-    stiffness: wp.array[vec3], to_pulls: wp.array[vec3], to_shapes: wp.array[vec3], to_weights: wp.array[wp.vec2d],
-    threads: int,
+    shares: wp.array[vec3], stiffness: wp.array[real], to_pulls: wp.array[vec3], to_shapes: wp.array[vec3],
+    to_weights: wp.array[wp.vec2d], threads: int,
 ):  # fmt: skip
     """Adjoint of ``rotations.part_turned``: adds the gradients of both shapes and the weights."""
     i = wp.tid()
@@ -47,7 +55,8 @@ def part_turned(
         b = corners(surface, shapes, v + surface.n_vertices, k)
         to = corners(surface, to_pulls, s * surface.n_vertices, k)
         own = sign[place(s * surface.faces.shape[0], k)]
-        first, second, to_own = gradients(a, b, own, weights[s], stiffness[place(k, 0)], to)
+        sides = at_sides(surface, shares, stiffness, k)
+        first, second, to_own = gradients(a, b, own, weights[s], sides, to)
         to_w += to_own
         for j in range(3):
             f = place(v, surface.faces[place(k, 0)][j])
