@@ -111,7 +111,7 @@ def test_what_only_touches_does_not_cross(apart: float, search: str) -> None:
     kernels = None
     if search == "warp":
         pytest.importorskip("warp")
-        from torch_modal.elastic.warp_crossings import WarpPairs
+        from torch_modal.elastic.crossings import WarpPairs
 
         kernels = WarpPairs(mesh, points[None])
     assert len(Crossings(mesh, points[None], search=kernels).pairs(points)) == 0
@@ -125,7 +125,7 @@ def test_what_only_touches_does_not_cross(apart: float, search: str) -> None:
 @pytest.mark.parametrize("n_faces", [1, 2, 3, 20, 500])
 def test_kernels_find_the_triangles_that_cross(n_faces: int, generator: torch.Generator) -> None:
     pytest.importorskip("warp")
-    from torch_modal.elastic import warp_crossings as fused_crossings
+    from torch_modal.elastic import crossings as fused_crossings
 
     corners = torch.stack([torch.randperm(n_faces + 3, generator=generator)[:3] for _ in range(n_faces)]).numpy()
     mesh = Connectivity(corners, n_faces + 3)

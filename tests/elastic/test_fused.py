@@ -28,12 +28,12 @@ from torch_modal.elastic.kernel_steps import KernelFineEnergy, KernelProblem, _R
 from torch_modal.elastic.kernels import launch
 from torch_modal.elastic.kernels.function import fused as fused_operation
 from torch_modal.elastic.modal import KernelModalEnergy, ModalEnergy, Placement
+from torch_modal.elastic.procrustes import mean_pose
+from torch_modal.elastic.rotations import WarpRotations
 from torch_modal.elastic.steps import FineEnergy, SumOfEnergies, TermsTowards, descend
 from torch_modal.elastic.stretch import Stretch
 from torch_modal.elastic.term import Mesh
 from torch_modal.elastic.volume import Volume
-from torch_modal.elastic.warp_procrustes import mean_pose
-from torch_modal.elastic.warp_rotations import WarpRotations
 from torch_modal.errors import MissingPackageError
 from torch_modal.geometry import procrustes
 from torch_modal.geometry.canonical import CANONICAL_SIZE

@@ -20,11 +20,11 @@ from torch_modal.elastic.kernel_energy import KernelEnergy, KernelVolume, _Merge
 from torch_modal.elastic.kernel_steps import _Relaxed
 from torch_modal.elastic.kernels.function import fused
 from torch_modal.elastic.modal import KernelModalEnergy, _Gradient
+from torch_modal.elastic.procrustes import mean_pose
+from torch_modal.elastic.rotations import WarpRotations
 from torch_modal.elastic.stretch import Stretch
 from torch_modal.elastic.term import Mesh, Term
 from torch_modal.elastic.volume import Volume
-from torch_modal.elastic.warp_procrustes import mean_pose
-from torch_modal.elastic.warp_rotations import WarpRotations
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.local_rotations import Trajectory
 from torch_modal.geometry.poisson import Poisson

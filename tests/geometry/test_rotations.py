@@ -14,7 +14,7 @@ from torch import Tensor
 import torch_modal as tm
 from torch_modal.data.samples import load_sample
 from torch_modal.elastic.backend import TorchBackend, choose
-from torch_modal.elastic.warp_rotations import WarpRotations
+from torch_modal.elastic.rotations import WarpRotations
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.local_rotations import LocalRotations
 from torch_modal.geometry.poisson import Poisson

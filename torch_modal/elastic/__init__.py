@@ -1,1 +1,1 @@
-"""The shell energy (Eq. 5) and its derivatives."""
+"""Eq. 5 and terms of one's own, in torch and by kernels, and the minimisers."""

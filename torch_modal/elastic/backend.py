@@ -14,18 +14,18 @@ import torch
 from torch import Tensor
 
 from torch_modal.arrays import FloatArray, IntArray
+from torch_modal.elastic.crossings import WarpPairs
 from torch_modal.elastic.distortion import Distortion, KernelDistortion
 from torch_modal.elastic.energy import Energy
 from torch_modal.elastic.kernel_energy import KernelEnergy
 from torch_modal.elastic.kernel_steps import KernelFineEnergy
 from torch_modal.elastic.kernels.launch import kernels, launch, load_kernels
 from torch_modal.elastic.modal import KernelModalEnergy, ModalEnergy
+from torch_modal.elastic.procrustes import mean_pose as mean_pose_by_kernel
+from torch_modal.elastic.quasi_newton import update
+from torch_modal.elastic.rotations import WarpRotations
 from torch_modal.elastic.steps import FineEnergy
 from torch_modal.elastic.term import Mesh, Term
-from torch_modal.elastic.warp_crossings import WarpPairs
-from torch_modal.elastic.warp_procrustes import mean_pose as mean_pose_by_kernel
-from torch_modal.elastic.warp_quasi_newton import update
-from torch_modal.elastic.warp_rotations import WarpRotations
 from torch_modal.errors import MissingPackageError
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.local_rotations import LocalRotations

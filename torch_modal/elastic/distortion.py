@@ -149,6 +149,7 @@ def kernels() -> SimpleNamespace:
     real, vec2, vec3, module = wp.float64, wp.vec2d, wp.vec3d, wp.get_module("torch_modal.elastic.kernels.distortion")
     largest_strain, largest_weight = wp.constant(real(LARGEST_STRAIN)), wp.constant(real(LARGEST_WEIGHT))
     edge, hinge = stretch.kernel_functions(), bend.kernel_functions()
+    potential = hinge.potential
 
     @wp.func
     def length_of(x: wp.array[vec3], at: int, q: wp.vec2i):
@@ -184,10 +185,9 @@ def kernels() -> SimpleNamespace:
                 phase = hinge.measure(e)
                 factor = weights[r] * beta[place(s * n_beta, wp.min(k, n_beta - 1))]
                 factor *= wp.min(hinge.weight(e, phase, real(0.0)), largest_weight)
+                to = potential.merged(potential.moments(phase, factor), real(1.0))
                 for j in range(n_shapes):
-                    turn = hinge.measure(hinge_of(x, (j * n_samples + s) * n_vertices, q4)) - phase
-                    versine = real(0.5) * wp.dot(turn, turn)
-                    found = factor * versine * (real(2.0) + versine / real(3.0))
+                    found = potential.energy(hinge.measure(hinge_of(x, (j * n_samples + s) * n_vertices, q4)), to)
                     wp.atomic_add(out, place(j * n_samples, s), vec2(real(0.0), found))
 
     return SimpleNamespace(module=module, distortion=distortion)

@@ -1,9 +1,5 @@
 """Kernels of a term, made from its functions of one element.
 
-Arrays are flat: entry ``s * n + i`` is the i-th of the n vertices or elements of sample ``s``. A thread takes all
-elements of a sample on a CPU, where what is the same for all of them is then worked out once, and every so many-th on a
-GPU; what elements sum up, a thread adds once (:func:`torch_modal.elastic.kernels.launch.launch`).
-
 Derivatives of the functions come from ``wp.grad``. In a kernel without ``enable_backward`` it would lose those of
 functions that call others, in silence: the kernels of :func:`backward` have it, though nothing differentiates them.
 """
