@@ -48,7 +48,7 @@ def warn(text: str, number: int, category: type[Warning]) -> None:
 @cache
 def _pool(n: int) -> ThreadPoolExecutor:
     # The number of torch's threads is set for one thread alone. Threads stay: launches of kernels are kept by thread.
-    return ThreadPoolExecutor(n, "torch_modal", torch.set_num_threads, (1,))
+    return ThreadPoolExecutor(n, "in-betweens", torch.set_num_threads, (1,))
 
 
 if hasattr(os, "register_at_fork"):
