@@ -203,10 +203,6 @@ def kernel_functions() -> KernelFunctions:
         flat: bool
 
     @wp.func
-    def length_of(e: vec3):
-        return wp.sqrt(wp.max(wp.dot(e, e), tiny_square))
-
-    @wp.func
     def hinge_of(x: mat33):
         h = Hinge()
         e = x[0]
@@ -276,11 +272,16 @@ def kernel_functions() -> KernelFunctions:
 
     @wp.func
     def weight(x: mat33, q: vec2, mean: real):
-        h = hinge_of(x)
+        e = x[0]  # without hinge_of(), whose adjoint would be computed, too
+        n1 = wp.cross(e, x[1])
+        n2 = wp.cross(x[2], e)
+        base = wp.dot(e, e)
+        square1 = wp.dot(n1, n1)
+        square2 = wp.dot(n2, n2)
+        bound = flatness * base
         found = real(0.0)
-        if not h.flat:
-            area = real(0.5) * (length_of(h.n1) + length_of(h.n2))
-            found = wp.min(wp.dot(x[0], x[0]) / area, ratio)
+        if wp.min(square1, square2) > bound * bound + tiny_square:
+            found = wp.min(real(2.0) * base / (wp.sqrt(square1) + wp.sqrt(square2)), ratio)
         return found
 
     @wp.func

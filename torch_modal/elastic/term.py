@@ -471,27 +471,23 @@ def periodic() -> Potential:
             to.across = factor * (c2 * m[4] - s2 * m[3])
         return to
 
-    @wp.func
-    def versine(q: vec2, to: Periodic):
-        off = q - vec2(to.c, to.s)
-        return real(0.5) * wp.dot(off, off)
-
-    @wp.func
-    def sine(q: vec2, to: Periodic):
-        return to.c * q[1] - to.s * q[0]
-
+    # Written out twice: the adjoint of a function that calls another computes that one once more.
     @wp.func
     def energy(q: vec2, to: Periodic):
-        v = versine(q, to)
-        s = sine(q, to)
-        twice = to.along * s - to.across * (real(1.0) - v)
-        return third * (real(8.0) * to.once * v - s * twice)
+        x = q[0] - to.c
+        y = q[1] - to.s
+        v = real(0.5) * (x * x + y * y)
+        s = to.c * q[1] - to.s * q[0]
+        return third * (real(8.0) * to.once * v - s * (to.along * s - to.across * (real(1.0) - v)))
 
     @wp.func
     def slope(q: vec2, to: Periodic):
-        s = sine(q, to)
-        s2 = real(2.0) * s * (real(1.0) - versine(q, to))
-        return third * (real(8.0) * to.once * s - to.along * s2 + to.across * (real(1.0) - real(2.0) * s * s))
+        x = q[0] - to.c
+        y = q[1] - to.s
+        cosine = real(1.0) - real(0.5) * (x * x + y * y)
+        s = to.c * q[1] - to.s * q[0]
+        twice = real(2.0) * s * (to.along * cosine + to.across * s)
+        return third * (real(8.0) * to.once * s - twice + to.across)
 
     @wp.func
     def rate(q: vec2, gradient: vec2):

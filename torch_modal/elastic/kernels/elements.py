@@ -408,7 +408,7 @@ def _merging_back(f: KernelFunctions, module: "wp.Module") -> "wp.Kernel":
     c, potential = _common(f), f.potential
     corners, edge_vectors, add, sums = c.corners, c.edge_vectors, c.add, potential.sums
     fullness, softness, contribution = c.fullness, c.softness, c.contribution
-    packed, row = potential.packed, potential.row
+    packed, row, weight_of = potential.packed, potential.row, f.weight
 
     @wp.func
     def of_record(m: sums, factor: real, received: row):
@@ -417,10 +417,6 @@ def _merging_back(f: KernelFunctions, module: "wp.Module") -> "wp.Kernel":
     @wp.func
     def of_measure(m: potential.kind, pull: real, received: sums):
         return wp.dot(potential.moments(m, pull), received)
-
-    @wp.func
-    def of_weight(e: c.vectors, m: potential.kind, mean: real, received: real):
-        return f.weight(e, m, mean) * received
 
     @wp.kernel(module=module)
     def merge(
@@ -463,13 +459,15 @@ def _merging_back(f: KernelFunctions, module: "wp.Module") -> "wp.Kernel":
                 m, g = f.linearised(e)
                 weight = f.weight(e, m, means[r])
                 to_m, to_weight, _3 = wp.grad(of_measure)(m, pulls[r] * weight, to_sums)
-                to_e, more, _4, _5 = wp.grad(of_weight)(e, m, means[r], pulls[r] * to_weight)
+                of_e, of_m, _4 = wp.grad(weight_of)(e, m, means[r])
+                received_weight = pulls[r] * to_weight
+                to_e = received_weight * of_e
                 to_pull = weight * to_weight
                 if to_usual != real(0.0):
                     of_full, _6 = wp.grad(fullness)(e, altitude)
                     to_e += (pulls[r] * to_usual) * of_full
                     to_pull += to_usual * fullness(e, altitude)
-                add(to_x, r * n_vertices, q, to_e + potential.rate(m, to_m + more) * g)
+                add(to_x, r * n_vertices, q, to_e + potential.rate(m, to_m + received_weight * of_m) * g)
                 wp.atomic_add(to_pulls, r, to_pull)
 
     return merge
