@@ -76,8 +76,12 @@ def fibres() -> type[Term]:
     edge = wp.types.matrix(shape=(1, 3), dtype=wp.float64)
 
     @wp.func
+    def squared(edge_vectors: edge):  # type: ignore[no-untyped-def, valid-type]
+        return wp.dot(edge_vectors[0], edge_vectors[0])  # type: ignore[index]
+
+    @wp.func
     def length(edge_vectors: edge):  # type: ignore[no-untyped-def, valid-type]
-        return wp.length(edge_vectors[0])  # type: ignore[index]
+        return wp.sqrt(squared(edge_vectors))  # type: ignore[no-untyped-call]
 
     @wp.func
     def direction(edge_vectors: edge):  # type: ignore[no-untyped-def, valid-type]

@@ -4,6 +4,7 @@ Derivatives of the functions come from ``wp.grad``. In a kernel without ``enable
 functions that call others, in silence: the kernels of :func:`backward` have it, though nothing differentiates them.
 """
 
+from collections.abc import Callable
 from functools import cache
 from types import SimpleNamespace
 
@@ -134,6 +135,11 @@ def _module(f: KernelFunctions, part: str) -> "wp.Module":
     return wp.get_module(f"{__name__}.{f.name}.{part}")
 
 
+def _kernel(f: KernelFunctions, module: "wp.Module") -> Callable[[Callable[..., None]], "wp.Kernel"]:
+    """The decorator of kernels that are not differentiated, but for gradients of a measure by ``wp.grad``."""
+    return wp.kernel(enable_backward=not f.exact, module=module)
+
+
 @cache
 def _rider(f: KernelFunctions | None) -> SimpleNamespace:
     """Functions of a term of edges that rides on one of larger elements, on their first edge vectors; or of none."""
@@ -194,7 +200,7 @@ def convex(f: KernelFunctions, rider: KernelFunctions | None) -> SimpleNamespace
     )
     corners, edge_vectors, add, Factors, record = c.corners, c.edge_vectors, c.add, c.Factors, potential.record
     factors_of, stiffness, product_of, other = c.factors, c.stiffness, c.product, _rider(rider)
-    kernel = wp.kernel(enable_backward=False, module=module)
+    kernel = _kernel(f, module) if rider is None or rider.exact else _kernel(rider, module)
     of_faces = volume_kernels()
     middle_of, enclosed = of_faces.middle_of, of_faces.enclosed
 
@@ -301,7 +307,7 @@ def forward(f: KernelFunctions) -> SimpleNamespace:
     """Merged rest shapes, and the Jacobian along columns of a space."""
     c, potential, module, n = _common(f), f.potential, _module(f, "forward"), f.n
     corners, edge_vectors, record = c.corners, c.edge_vectors, potential.record
-    kernel = wp.kernel(enable_backward=False, module=module)
+    kernel = _kernel(f, module)
 
     @kernel
     def jacobian(
@@ -355,7 +361,7 @@ def _merging(f: KernelFunctions, module: "wp.Module") -> dict[str, "wp.Kernel"]:
     """Kernels that merge the rest shapes of a term into records (Eq. 8), where it has weights for them."""
     c, potential = _common(f), f.potential
     corners, edge_vectors, record, sums = c.corners, c.edge_vectors, potential.record, potential.sums
-    kernel = wp.kernel(enable_backward=False, module=module)
+    kernel = _kernel(f, module)
     fullness, softness, contribution = c.fullness, c.softness, c.contribution
 
     @kernel

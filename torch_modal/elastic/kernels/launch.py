@@ -82,12 +82,21 @@ def _load(module: Any) -> None:
     """Compile a module and those below it, several at a time, or take them from Warp's cache."""
     import warp as wp
 
-    before, wp.config.log_level = wp.config.log_level, wp.LOG_ERROR
-    try:
+    with _quietly():
         with _without_line(NO_DRIVER):
             wp.init()
         with ProgressReport(1, "compiling kernels (once for this machine)", unit="module"):
             wp.load_module(module, device="cpu", recursive=True, max_workers=os.cpu_count())
+
+
+@contextmanager
+def _quietly() -> Iterator[None]:
+    """Warp without its messages while it compiles, such as that ``wp.grad`` is not differentiated."""
+    import warp as wp
+
+    before, wp.config.log_level = wp.config.log_level, wp.LOG_ERROR
+    try:
+        yield
     finally:
         wp.config.log_level = before
 
@@ -240,9 +249,10 @@ class _Command:
             [dict((i, a) for i, a, *_ in own).get(i, x) for i, x in enumerate(plain)] for own in self.arrays
         )
         own = wp.device_from_torch(device)
-        self.recorded = wp.launch(
-            kernel, 1, first, adj_inputs=[*chain(*adjoint)], device=own, adjoint=back, record_cmd=True
-        )
+        with _quietly():  # on a GPU, it compiles now
+            self.recorded = wp.launch(
+                kernel, 1, first, adj_inputs=[*chain(*adjoint)], device=own, adjoint=back, record_cmd=True
+            )
         for number, arrays in enumerate(self.arrays):
             for i, array, *_ in arrays:
                 self.recorded.set_param_at_index_from_ctype(i, array, adjoint=number > 0)
