@@ -17,7 +17,7 @@ from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.elastic.crossings import WarpPairs
 from torch_modal.elastic.distortion import Distortion, KernelDistortion
 from torch_modal.elastic.energy import Energy
-from torch_modal.elastic.kernel_energy import KernelEnergy
+from torch_modal.elastic.kernel_energy import KernelEnergy, volumes_by_kernel
 from torch_modal.elastic.kernel_steps import KernelFineEnergy
 from torch_modal.elastic.kernels.launch import kernels, launch, load_kernels
 from torch_modal.elastic.modal import KernelModalEnergy, ModalEnergy
@@ -31,6 +31,7 @@ from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.local_rotations import LocalRotations
 from torch_modal.geometry.poisson import Poisson
 from torch_modal.geometry.procrustes import mean_pose
+from torch_modal.geometry.rigid import signed_volumes
 
 
 class TorchBackend:
@@ -43,7 +44,7 @@ class TorchBackend:
     quasi_newton: Callable[..., Any] | None = None
     """Does what :func:`torch_modal.elastic.minimise.updated` does."""
 
-    mean_pose = staticmethod(mean_pose)
+    mean_pose, signed_volumes = staticmethod(mean_pose), staticmethod(signed_volumes)
 
     def load(self) -> None:
         """Load what takes long, so that nobody waits for it later."""
@@ -81,6 +82,7 @@ class WarpBackend(TorchBackend):
     """
 
     quasi_newton, mean_pose = staticmethod(update), staticmethod(mean_pose_by_kernel)
+    signed_volumes = staticmethod(volumes_by_kernel)
 
     def __init__(self) -> None:
         if importlib.util.find_spec("warp") is None:

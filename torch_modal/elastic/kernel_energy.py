@@ -10,6 +10,7 @@ from typing import Any, Literal, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from torch_modal.autograd import plain
 from torch_modal.elastic import volume
 from torch_modal.elastic.bend import NEEDLE, NEEDLE_OF_STEPS
 from torch_modal.elastic.energy import Energy, OnMesh, Reference, RestShapes
@@ -17,6 +18,7 @@ from torch_modal.elastic.kernels.function import fused
 from torch_modal.elastic.kernels.launch import launch, made, of_elements
 from torch_modal.elastic.term import KernelFunctions, Mesh
 from torch_modal.elastic.volume import MIN_RELATIVE_VOLUME, Volume
+from torch_modal.geometry.rigid import signed_volumes
 from torch_modal.geometry.vectors import cross, inverse, norm, pick
 
 
@@ -171,10 +173,21 @@ def by_kernels(energy: Energy, mesh: Mesh) -> list[KernelTerm | KernelVolume | N
         if type(term) is Volume and not any(isinstance(each, KernelVolume) for each in found):
             found.append(KernelVolume(part, mesh, energy.used))
             continue
-        plain = term.anchors is None and 1 <= n <= 3 and bool((part.corners < mesh.n_vertices).all())
-        functions = term.kernel_functions(n) if plain and not energy.sampled else None
+        fits = term.anchors is None and 1 <= n <= 3 and bool((part.corners < mesh.n_vertices).all())
+        functions = term.kernel_functions(n) if fits and not energy.sampled else None
         found.append(None if functions is None else KernelTerm(part, functions))
     return found
+
+
+def volumes_by_kernel(x: Tensor, corners: Tensor) -> Tensor:
+    """:func:`torch_modal.geometry.rigid.signed_volumes` in one pass, without a gradient."""
+    if not plain(x):
+        return signed_volumes(x, corners)
+    faces, own = corners.T.int().contiguous(), x.detach().double().contiguous()
+    found = own.new_zeros(x.shape[:-2])
+    given = faces, x.shape[-2], own, None, found, None, None
+    launch(made(volume.kernels).sizes, (found.numel(), len(faces)), given)
+    return found.to(x)
 
 
 class Pass(nn.Module):

@@ -11,7 +11,7 @@ from torch_modal.elastic.backend import TorchBackend
 from torch_modal.errors import MeshWarning
 from torch_modal.geometry.canonical import CANONICAL_SIZE, size
 from torch_modal.geometry.connectivity import Connectivity, vertex_areas
-from torch_modal.geometry.rigid import best_rotation, centroid, looks_mirrored, signed_volumes
+from torch_modal.geometry.rigid import best_rotation, centroid, looks_mirrored
 
 # A key-frame smaller than this part of the reference is a point.
 SMALLEST_SIZE = 1e-6
@@ -49,7 +49,7 @@ class KeyframeAlignment(nn.Module):
 
     def __init__(self, references: Tensor, mesh: Connectivity, backend: TorchBackend) -> None:
         super().__init__()
-        self.mean_pose = backend.mean_pose
+        self.mean_pose, self.signed_volumes = backend.mean_pose, backend.signed_volumes
         sizes = torch.tensor([size(x.numpy(), mesh.faces) for x in references], dtype=references.dtype)
         scale = CANONICAL_SIZE / sizes.mean()
         areas = torch.stack([torch.from_numpy(vertex_areas(x.numpy(), mesh.faces)) for x in references])
@@ -135,7 +135,7 @@ class KeyframeAlignment(nn.Module):
         """True for mirror images of the heaviest, of closed surfaces. *Shape:* ``(B, K, V, 3), (B, K) -> (B, K)``."""
         if not self.closed:
             return torch.zeros_like(weights, dtype=torch.bool)
-        volumes, heaviest = signed_volumes(shapes, self.corners), weights.argmax(1, keepdim=True)
+        volumes, heaviest = self.signed_volumes(shapes, self.corners), weights.argmax(1, keepdim=True)
         turned = volumes * volumes.gather(1, heaviest) < 0
         if plain(turned) and not turned.any():
             return turned
