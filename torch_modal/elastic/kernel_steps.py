@@ -28,12 +28,14 @@ class KernelFineEnergy(FineEnergy):
 
     def __init__(self, mesh: Mesh, terms: Sequence[Term]) -> None:
         super().__init__(mesh, terms)
-        served = [part is not None for part in by_kernels(self.energy, mesh)]
+        parts = by_kernels(self.energy, mesh)
         #: Numbers of the terms that kernels serve, and of the others.
-        self.own, self.others = ([i for i, one in enumerate(served) if one is kind] for kind in (True, False))
+        self.own, self.others = (
+            [i for i, one in enumerate(parts) if (one is not None) is kind] for kind in (True, False)
+        )
         shell = Energy(mesh, [terms[i] for i in self.own]) if self.others else self.energy
         self.further = Energy(mesh, [terms[i] for i in self.others]) if self.others else None
-        self.kernels: Any = KernelEnergy.of(shell, mesh)
+        self.kernels = KernelEnergy(shell, [part for part in parts if part is not None])
 
     def relax_chunk(
         self, x: Tensor, rests: RestShapes, stages: Sequence[tuple[int, int]], beside: Sequence[FreeEnergy]

@@ -46,6 +46,13 @@ def _common(f: KernelFunctions) -> SimpleNamespace:
             found += wp.dot(a[j], b[j])
         return found
 
+    @wp.func
+    def pushed(gradient: vectors, along: real, e: vectors):
+        """Forces of an element along its gradient, and their product with its change."""
+        rate = inner(gradient, e)
+        push = along * rate
+        return push * gradient, push * rate
+
     kind = f.potential.kind
     if f.across is None:
 
@@ -69,10 +76,7 @@ def _common(f: KernelFunctions) -> SimpleNamespace:
 
         @wp.func
         def product(h: Factors, e: vectors):
-            """Forces of an element, and their product with its change."""
-            rate = inner(h.gradient, e)
-            push = h.along * rate
-            return push * h.gradient, push * rate
+            return pushed(h.gradient, h.along, e)
 
     else:
 
@@ -97,9 +101,8 @@ def _common(f: KernelFunctions) -> SimpleNamespace:
 
         @wp.func
         def product(h: TenseFactors, e: vectors):
-            rate = inner(h.gradient, e)
-            push = h.along * rate
-            return push * h.gradient + h.across * e, push * rate + h.across * inner(e, e)
+            forces, form = pushed(h.gradient, h.along, e)
+            return forces + h.across * e, form + h.across * inner(e, e)
 
         Factors = TenseFactors
 
