@@ -437,6 +437,20 @@ class TestLayers:
         for got, wanted, to in zip(*found, (1e-11, 1e-11, 1e-9), strict=True):
             torch.testing.assert_close(got, wanted, rtol=0, atol=to * float(wanted.abs().max()))
 
+    @pytest.mark.parametrize("name", ["measure alone", "beside the kernels"])
+    def test_gradients_in_the_stiffness_alone(self, bars: Shapes, name: str) -> None:
+        """Without modes and with constant key-frames, nothing but the stiffness has a gradient."""
+        kind, found = Area if name == "beside the kernels" else fibres(), []
+        kind.kernel_gradient = None
+        for backend_name in ("warp", "torch"):
+            stiffness = torch.nn.Parameter(torch.tensor([1e3], dtype=DOUBLE))
+            objective, solver = tm.Objective(terms=(kind(stiffness),)), tm.Solver(backend=backend_name)
+            layer = tm.InBetween(bars.keyframes[:2], bars.faces, objective=objective, solver=solver)
+            shape = layer(*bars.keyframes[:2], 0.3)
+            found.append(torch.autograd.grad((shape * torch.arange(3)).sum(), stiffness)[0])
+        assert float(found[1].abs()) > 0
+        torch.testing.assert_close(*found, rtol=1e-8, atol=0)
+
     @torch.no_grad()
     def test_kernels_of_a_term_of_ones_own(self, case: Case) -> None:
         """Energy, gradient and Hessian of one term are those of torch; a volume alone is torch's."""

@@ -21,10 +21,10 @@ import torch
 import torch_modal as tm
 
 BOUNDS = {
-    "lines": 27909,
-    "lines of code": 17839,
+    "lines": 27916,
+    "lines of code": 17845,
     "files": 189,
-    "functions": 1624,
+    "functions": 1625,
     "named tuples": 54,
     "docstrings that begin with no noun": 6,
     "functions of in-between": 158,

@@ -1,11 +1,12 @@
 """Steps of all vertices by kernels, tested against those in torch."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
+from torch_modal import trees
 from torch_modal.autograd import plain
 from torch_modal.elastic.energy import Energy, Reference, RestShapes
 from torch_modal.elastic.kernel_energy import KernelEnergy, KernelPoint, by_kernels
@@ -42,7 +43,9 @@ class KernelFineEnergy(FineEnergy):
     ) -> Tensor:
         """Overrides the base class. With further terms or energies, gradients are left to torch."""
         alone = self.further is None and not beside
-        if not (alone and self.kernels.exact) and ((torch.is_grad_enabled() and x.requires_grad) or not plain(x)):
+        given = trees.leaves((x, *rests))  # the start may have no gradient where stiffnesses have one
+        recorded = torch.is_grad_enabled() and any(value.requires_grad for value in given)
+        if not (alone and self.kernels.exact) and (recorded or not plain(*given)):
             return super().relax_chunk(x, rests, stages, beside)
         others = [*beside, *([] if self.further is None else [TermsTowards.among(self.further, self.others, rests)])]
         to = self.kernels.reference(rests._replace(stiffness=[rests.stiffness[i] for i in self.own]), x, relative=True)
@@ -76,7 +79,6 @@ class KernelProblem:
 
     def __init__(self, kernels: KernelEnergy, to: Reference, beside: Sequence[FreeEnergy] = ()) -> None:
         self.kernels, self.to, self.beside = kernels, to, beside
-        self.products: list[Callable[[Tensor], Tensor]] = []
 
     def value(self, x: Tensor) -> Tensor:
         """*Shape:* ``(B, V, 3) -> (B,)``."""
