@@ -4,6 +4,9 @@ from . import losses as losses
 from .codec.selection import select_keyframes as select_keyframes
 from .codec.sequence import ModalSequence as ModalSequence
 from .codec.sequence import encode as encode
+from .completion.complete import Completion as Completion
+from .completion.complete import complete as complete
+from .completion.observation import Observation as Observation
 from .contact.self_contacts import SelfContacts as SelfContacts
 from .contact.self_contacts import self_contacts as self_contacts
 from .data.augmentation import AugmentationSequential as AugmentationSequential

@@ -35,6 +35,7 @@ FLOORS = [
     "motion",
     "registration",
     "statistics",
+    "completion",
     "losses",
     "codec",
     "data",

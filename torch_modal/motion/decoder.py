@@ -81,15 +81,12 @@ class ModalDecoder(nn.Module):
             self.register_buffer(name, x.detach().double().cpu().clone())
         self._build()
         modes = modes.detach().double().cpu()
-        rms = modes.square().sum(-1).mean(1).sqrt().clamp_min(torch.finfo(torch.float64).tiny)
-        displaced = (modes * (UNIT * self.size / rms)[:, None, None]).movedim(-1, 0).contiguous()
-        own = frames(sides(self.reference.T[:, None].contiguous(), self.faces))
-        turn, strain = bend(sides(displaced, self.faces), own)
+        displaced = scaled(modes, self.size)
         #: What an amplitude of 1 does to each triangle. *Shape:* ``(k, 6, F)``.
-        self.register_buffer("columns", _bounded(torch.cat([own.coordinates(turn), strain]), own))
+        self.register_buffer("columns", bending_columns(self.reference, self.faces, displaced))
         #: What it does to the centres of loose pieces, if there are several. *Shape:* ``(k, 3V)``, or none.
         several = int(self._mesh.vertex_pieces.max()) > 0
-        centres = self.spline.poisson.centres(displaced.movedim(0, -1)) * self.spline.alignment.scale
+        centres = self.spline.poisson.centres(displaced) * self.spline.alignment.scale
         self.register_buffer("moves", centres.flatten(1)[:, : centres[0].numel() if several else 0].contiguous())
         self.register_load_state_dict_post_hook(ModalDecoder._build)
 
@@ -203,6 +200,19 @@ def _finite(name: str, x: Tensor, n_dimensions: int, keyframes: Tensor) -> Tenso
     if not bool(x.isfinite().all()):
         raise ValueError(f"{name} has entries that are not finite")
     return x
+
+
+def scaled(modes: Tensor, size: Tensor | float) -> Tensor:
+    """Modes that move the vertices by :data:`UNIT` of a size in the root mean square. *Shape:* ``(k, V, 3)``."""
+    rms = modes.square().sum(-1).mean(1).sqrt().clamp_min(torch.finfo(torch.float64).tiny)
+    return modes * (UNIT * size / rms)[:, None, None]
+
+
+def bending_columns(reference: Tensor, faces: Tensor, displaced: Tensor) -> Tensor:
+    """Turns and strains of the triangles by displacements. *Shape:* ``(V, 3), (F, 3), (k, V, 3) -> (k, 6, F)``."""
+    own = frames(sides(reference.T[:, None].contiguous(), faces))
+    turn, strain = bend(sides(displaced.movedim(-1, 0).contiguous(), faces), own)
+    return _bounded(torch.cat([own.coordinates(turn), strain]), own)
 
 
 def _bounded(columns: Tensor, own: Frames) -> Tensor:

@@ -1,0 +1,1 @@
+"""A motion from whole, partial and noisy samples."""

@@ -1,0 +1,445 @@
+r"""A motion from whole, partial and noisy samples.
+
+The shapes :math:`x_i` at the times of the observations minimise
+
+.. math:: \sum_i \sum_p \frac{w_p}{\sigma_p^2} \rho(x_i - q_p)^2 + \sum_i \sum_k s_{ik} d(\bar x_{ik}, x_i)
+
+with the distances of observed points from the places that they are paired with, and the energy of Eq. 5 towards whole
+shapes and neighbours in time. Poses and amplitudes of modes come first, then all vertices.
+"""
+
+import warnings
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from torch_modal.arrays import BoolArray, FloatArray
+from torch_modal.autograd import lasting
+from torch_modal.completion.bending import ModalBending, Pose
+from torch_modal.completion.energy import PointEnergy
+from torch_modal.completion.observation import Observation, checked
+from torch_modal.completion.pairs import Cloud, Pairs, Surface, rows
+from torch_modal.completion.search import PoseSearch
+from torch_modal.elastic.backend import choose
+from torch_modal.elastic.bend import Bend
+from torch_modal.elastic.energy import RestShapes
+from torch_modal.elastic.shell import ALPHA, BETA, GAMMA
+from torch_modal.elastic.steps import FineEnergy
+from torch_modal.elastic.stretch import Stretch
+from torch_modal.elastic.term import Mesh
+from torch_modal.elastic.volume import Volume, encloses
+from torch_modal.errors import MeshWarning
+from torch_modal.geometry.canonical import placed
+from torch_modal.geometry.rigid import best_fit
+from torch_modal.geometry.triangle_frames import frames_of, mirrored_sides
+from torch_modal.keyframes.arrays import checked_times
+from torch_modal.keyframes.check import checked_arrays
+from torch_modal.modes.coarsening import Coarsening, coarsen
+from torch_modal.modes.extract import extract_bases
+from torch_modal.motion.decoder import scaled
+from torch_modal.motion.path import Path
+from torch_modal.progress import Progress, ProgressReport
+
+N_MODES = 60
+"""Modes of the first shape in which poses are searched."""
+COARSE_FACES = 2500
+"""Faces of the mesh on which they are searched; of fewer, it is the caller's."""
+SHIFTS = (-0.17, 0.17)
+"""Times at which a motion may be instead of where its neighbours say, in parts of the gap between these."""
+
+OWN, WHOLE = 0.5, 0.2
+"""Weights of the shape by modes, and of whole shapes, in Eq. 5; that of neighbours in time is the rest."""
+STIFFNESS = 2.0
+"""Of a point with a noise of 1, at a size of 100."""
+NOISES = 0.1, 2.0
+"""Least noise, and the largest that is estimated, at a size of 100."""
+ROUNDS, STEPS, PRODUCTS = 12, 2, 20
+"""Rounds of new pairs, in each of which all vertices take steps, each with iterations of conjugate gradients."""
+OUTLIERS = 4.0
+"""Distance, in standard deviations of the noise, at which a point loses three quarters of its weight."""
+
+NEAR = 2.5
+"""Distance from an observed point within which a vertex counts as seen, at a size of 100."""
+NEIGHBOURS = 0.45
+"""Confidence of what a neighbour in time saw."""
+UNITS = 8.0
+"""Observations that extend over more or less than the shapes by this factor are in other units."""
+DOUBTFUL = 0.5
+"""Part of the points that a shape has to explain."""
+
+
+class Completion(NamedTuple):
+    """A motion through whole shapes, which are exact, and completed ones."""
+
+    times: Tensor
+    """Of the observations, each once, ascending. *Shape:* ``(T,)``."""
+    shapes: Tensor
+    """The shapes then. *Shape:* ``(T, V, 3)``."""
+    confidence: Tensor
+    """Near 1 where the surface was seen then, about a half where only neighbours in time saw it, near 0 where it is
+    inferred. *Shape:* ``(T, V)``."""
+    misses: list[Tensor]
+    """Of each observation, in the order given, the distance of its points from the shape. *Shape of each:* ``(n,)``."""
+    trust: list[Tensor]
+    """What each point counts for: 1, or less for outliers. *Shape of each:* ``(n,)``."""
+    knots: Tensor
+    """Whole and completed shapes in the order of time. *Shape:* ``(K, V, 3)``."""
+    path: Path | None
+    """The motion through the knots; None where there is only one."""
+
+    def __call__(self, t: Tensor | float) -> Tensor:
+        """Shapes at times between the first and the last knot. *Shape:* ``(...) -> (..., V, 3)``.
+
+        Raises:
+            ValueError: A time is before or after these.
+        """
+        if self.path is not None:
+            return self.path(self.knots, t)
+        t = torch.as_tensor(t, dtype=self.times.dtype, device=self.knots.device)
+        if not bool((t == self.times[0]).all()):
+            raise ValueError(f"one shape alone is known, at {float(self.times[0]):g}; pass observations of more times")
+        return self.knots[0].expand(*t.shape, -1, -1)
+
+
+class ModalFit(NamedTuple):
+    """A frame by modes."""
+
+    x: Tensor
+    base: Tensor
+    pose: Pose
+    score: float
+    """How much it leaves unexplained."""
+
+
+class _Sample(NamedTuple):
+    """An observation at a size of 100."""
+
+    observation: Observation
+    number: int
+    seen: Cloud | Pairs
+    noise: float
+    """Its standard deviation; 0 where it is not known yet."""
+
+    def off(self, surface: Surface) -> tuple[FloatArray, BoolArray]:
+        """Distances of the points from their places, and if normals agree. *Shape:* ``(n,)``."""
+        if isinstance(self.seen, Cloud):
+            return self.seen.closest(surface)[2:]
+        off = np.linalg.norm(self.seen.places @ surface.vertices - self.seen.points, axis=1)
+        return off, np.ones(len(off), bool)
+
+
+class _Frame:
+    """What was seen at one time."""
+
+    def __init__(self, time: float, samples: list[_Sample]) -> None:
+        self.time, self.samples = time, samples
+        self.clouds = [one.seen for one in samples if isinstance(one.seen, Cloud)]
+        self.markers = [one.seen for one in samples if isinstance(one.seen, Pairs)]
+
+
+@lasting
+@torch.no_grad()
+def complete(
+    keyframes: Tensor,
+    faces: Tensor,
+    observations: Sequence[Observation],
+    *,
+    times: Tensor | Sequence[float] | None = None,
+    progress: Progress = None,
+) -> Completion:
+    """A motion through whole key-frames and partial, noisy samples.
+
+    Modal poses of all frames are found first, by pairs of points and places on the surface, from far to near, outward
+    in time from what is known; points that nothing explains are tried on the limbs nearby. Then all vertices minimise
+    the distances together with Eq. 5 towards neighbours in time and whole shapes (docs/completion.md).
+
+    Args:
+        keyframes: Whole shapes, which are exact, *shape* ``(K, V, 3)``, or one rest shape of no time, ``(V, 3)``.
+        faces: Vertex indices. *Shape:* ``(F, 3)``.
+        observations: What was seen, at any times, in any order; several may have the same time.
+        times: Of the key-frames, ascending; 0, 1, 2 and so on by default. *Shape:* ``(K,)``.
+        progress: A bar, :data:`torch_modal.progress.Progress`.
+
+    Returns:
+        The motion, in the dtype and on the device of the key-frames; a constant of the autograd graph.
+
+    Raises:
+        ValueError: Key-frames, times or observations do not fit, or the points are in other units.
+    """
+    whole = torch.as_tensor(keyframes)
+    is_template = whole.dim() == 2
+    if is_template and times is not None:
+        raise ValueError("a template of the shape (V, 3) has no time; pass key-frames (1, V, 3) that have one")
+    like, shapes, indices = checked_arrays(whole[None] if is_template else whole, faces)
+    given = checked(observations, shapes.shape[1])
+    at = np.zeros(0) if is_template else _times(times, len(shapes))
+    solver = _Completer(shapes, torch.from_numpy(indices), at, given, [list(observations).index(one) for one in given])
+    with ProgressReport(len(solver.frames) * (3 + ROUNDS), "completing", progress) as report:
+        solver.search(report)
+        solver.refine(report)
+    return solver.result(like)
+
+
+def _times(times: Tensor | Sequence[float] | None, n: int) -> FloatArray:
+    if n == 1:
+        return np.array([0.0 if times is None else float(torch.as_tensor(times).reshape(-1)[0])])
+    return checked_times(times, n, False).numpy()
+
+
+class _Completer:
+    """The solver, at a size of 100 in the axes of the first shape."""
+
+    def __init__(
+        self, shapes: FloatArray, faces: Tensor, times: FloatArray, given: list[Observation], order: list[int]
+    ) -> None:
+        self.faces, self.times, self.n = faces, times, len(given)
+        _, self.axes, self.centre, self.scale = placed(shapes[0], faces.numpy())
+        self.whole = torch.from_numpy((shapes - self.centre) @ self.axes.T * self.scale)
+        self.template = self.whole[0]
+        samples = [self._sample(one, i) for one, i in zip(given, order, strict=True)]
+        every = sorted({one.time for one in given})
+        self.frames = [_Frame(t, [one for one in samples if one.observation.time == t]) for t in every]
+        mesh = Mesh.of(faces, shapes.shape[1])
+        closed = all(encloses(x, mesh.connectivity) for x in self.whole)
+        self.stiffness = ALPHA, BETA, GAMMA if closed else 0.0
+        self.fine: FineEnergy = choose("auto").fine_energy(mesh, [Stretch(ALPHA), Bend(BETA), Volume(GAMMA)])
+        basis = extract_bases(self.template[None], faces, N_MODES)[0]
+        modes = scaled(basis.modes, 100.0)
+        self.bending = ModalBending(self.template, faces, modes)
+        self.coarse: Coarsening | None = None
+        coarse_bending = self.bending
+        if len(faces) > COARSE_FACES:
+            self.coarse = coarsen(self.whole.numpy(), faces.numpy(), COARSE_FACES, range(len(self.whole)), {})
+            restricted = [torch.from_numpy(self.coarse.restrict(x.numpy())) for x in (self.template, modes)]
+            coarse_bending = ModalBending(restricted[0], torch.from_numpy(self.coarse.faces), restricted[1])
+        self.poses = PoseSearch(coarse_bending, basis.eigenvalues)
+        self.x: list[Tensor] = []
+
+    # ------------------------------------------------------------------------------------------------------- the input
+    def _placed(self, x: Tensor, direction: bool = False) -> FloatArray:
+        points = x.detach().cpu().double().numpy()
+        return points @ self.axes.T if direction else (points - self.centre) @ self.axes.T * self.scale
+
+    def _sample(self, one: Observation, number: int) -> _Sample:
+        """An observation at a size of 100; raises where it is in other units."""
+        points, own = self._placed(one.points), self.template.numpy()[np.unique(self.faces.numpy())]
+        weights = np.ones(len(points)) if one.weights is None else one.weights.cpu().double().numpy()
+        seen: Cloud | Pairs
+        if one.is_cloud:
+            normals, view = (None if x is None else self._placed(x, True) for x in (one.normals, one.view))
+            seen = Cloud(points, normals, weights, view)
+        else:
+            corners, barycentric = one.places()
+            places = rows(corners.cpu().numpy(), barycentric.cpu().double().numpy(), len(self.template))
+            seen, own = Pairs(places, points, None, weights / weights.sum()), places @ self.template.numpy()
+        extent, usual = (float(np.median(np.linalg.norm(x - np.median(x, 0), axis=1))) for x in (points, own))
+        if not usual / UNITS <= extent <= usual * UNITS:
+            raise ValueError(
+                f"{one}: the points extend over {extent / self.scale:.3g} around their middle, the first shape over "
+                f"{usual / self.scale:.3g}: they are in other units, or of something else; scale them to its units"
+            )
+        return _Sample(one, number, seen, 0.0 if one.noise is None else max(one.noise * self.scale, NOISES[0]))
+
+    # ------------------------------------------------------------------------------------------------- poses of frames
+    def search(self, report: ProgressReport) -> None:
+        """Modal poses of all frames, outward in time from what is known, and once more between their neighbours."""
+        n, whole = len(self.frames), list(zip(self.times, self.whole, strict=False))
+        left, found = list(range(n)), dict[int, ModalFit]()
+        if not whole:
+            rigid = [self._placed_rigidly(i) for i in left]
+            first = left.pop(int(np.argmin([score for _, score in rigid])))
+            found[first] = self._search(first, [(self.template, rigid[first][0])])
+            report.update()
+
+        def known(i: int) -> list[tuple[float, Tensor]]:
+            others = [(self.frames[j].time, one.x) for j, one in found.items() if j != i]
+            return sorted([*whole, *others], key=lambda one: one[0])
+
+        while left:
+            times = [t for t, _ in known(-1)]
+            gaps = [min(abs(self.frames[i].time - t) for t in times) for i in left]
+            i = left.pop(int(np.argmin(gaps)))
+            found[i] = self._search(i, self._starts(self.frames[i].time, known(i)))
+            report.update()
+        for i in sorted(range(n), key=lambda i: -found[i].score):
+            if known(i):
+                again = self._search(i, self._starts(self.frames[i].time, known(i)))
+                found[i] = min(found[i], again, key=lambda one: one.score)
+            report.update()
+        for i in range(n):
+            frame, one = self.frames[i], found[i]
+            pose = self.poses.stiffened(self._coarsened(one.base), one.pose, frame.clouds, self._markers(frame))
+            self.x.append(self.bending.shape(one.base, pose))
+            report.update()
+
+    def _starts(self, t: float, known: list[tuple[float, Tensor]]) -> list[tuple[Tensor, Pose]]:
+        """Shapes from which a search at a time starts."""
+        times, shapes = np.array([own for own, _ in known]), torch.stack([x for _, x in known])
+        if t in times:
+            return [(shapes[int(np.argmin(np.abs(times - t)))], self.bending.still())]
+        if len(known) > 1 and times[0] < t < times[-1]:
+            path = Path(shapes, self.faces, times=times.tolist())
+            after = int(np.searchsorted(times, t))
+            gap = times[after] - times[after - 1]
+            base = path(shapes, t)
+            found = [base]
+            for shift in SHIFTS:
+                other = path(shapes, float(np.clip(t + shift * gap, times[0], times[-1])))
+                found.append(best_fit(other, base).apply(other))
+        else:
+            nearest = np.argsort(np.abs(times - t))
+            found = [shapes[nearest[0]]]
+            if len(known) > 1:
+                found.append(self._beyond(shapes[nearest[1]], shapes[nearest[0]]))
+        return [(x, self.bending.still()) for x in found]
+
+    def _beyond(self, before: Tensor, last: Tensor) -> Tensor:
+        """The shape as far after the last one as that is after the one before."""
+        motion = best_fit(before, last)
+        sides = mirrored_sides(frames_of(last[None], self.faces), frames_of(motion.apply(before)[None], self.faces))
+        x = self.bending.reconstruction(sides, last.T[:, None].contiguous())[:, 0].T
+        x = best_fit(x, last).apply(x)
+        middle = last.mean(0)
+        return (x - middle) @ motion.rotation.mT + 2 * middle - before.mean(0)
+
+    def _placed_rigidly(self, i: int) -> tuple[Pose, float]:
+        """The pose of the template in a frame, and how much it leaves unexplained."""
+        frame, base = self.frames[i], self._coarsened(self.template)
+        pose = self.poses.rigid(base, frame.clouds, self._markers(frame))
+        return pose, self.poses.score(base, pose, frame.clouds, self._markers(frame))
+
+    def _search(self, i: int, starts: Sequence[tuple[Tensor, Pose]]) -> ModalFit:
+        """A frame by modes."""
+        frame, own = self.frames[i], [(self._coarsened(x), pose) for x, pose in starts]
+        k, pose, score = self.poses.fit(own, frame.clouds, self._markers(frame))
+        base = starts[k][0]
+        return ModalFit(self.bending.shape(base, pose), base, pose, score)
+
+    def _markers(self, frame: _Frame) -> list[Pairs]:
+        return [self._restricted(pairs) for pairs in frame.markers]
+
+    def _coarsened(self, x: Tensor) -> Tensor:
+        return x if self.coarse is None else torch.from_numpy(self.coarse.restrict(x.numpy()))
+
+    def _restricted(self, pairs: Pairs) -> Pairs:
+        """Known places on the coarse mesh."""
+        if self.coarse is None:
+            return pairs
+        rows = pairs.places.tocoo()
+        cluster = np.maximum(self.coarse.clusters[rows.col], 0)
+        shape = len(pairs.points), self.coarse.n_vertices
+        return pairs._replace(places=type(rows)((rows.data, (rows.row, cluster)), shape=shape).tocsr())
+
+    # ---------------------------------------------------------------------------------------------------- all vertices
+    def refine(self, report: ProgressReport) -> None:
+        """Steps of all vertices of all frames, with new pairs and new neighbours in each round."""
+        x = torch.stack(self.x)
+        for frame, own in zip(self.frames, self.x, strict=True):
+            surface = Surface(own.numpy(), self.faces.numpy())
+            frame.samples = [self._with_noise(one, surface) for one in frame.samples]
+        stiffness = [x.new_full((1, 1), value) for value in self.stiffness]
+        for _ in range(ROUNDS):
+            shapes, weights = self._rests(x)
+            for i, frame in enumerate(self.frames):
+                some = slice(i, i + 1)
+                energy = self._points(frame, x[i])
+                rests = RestShapes(shapes[some], weights[some], stiffness)
+                x[some] = self.fine.relax(x[some], rests, ((STEPS, PRODUCTS),), lambda *_, own=energy: [own])
+                report.update()
+        self.x = list(x)
+
+    @staticmethod
+    def _with_noise(one: _Sample, surface: Surface) -> _Sample:
+        """A sample with its noise, estimated where it is not known: from the median of distances with such an error."""
+        if one.noise:
+            return one
+        median = float(np.median(one.off(surface)[0])) / (0.6745 if isinstance(one.seen, Cloud) else 1.538)
+        return one._replace(noise=float(np.clip(median, *NOISES)))
+
+    def _rests(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Whole shapes and neighbours in time of each frame, and their weights. *Shape:* ``(T, 4, V, 3), (T, 4)``."""
+        at, rows, weights = np.array([frame.time for frame in self.frames]), [], []
+        times = np.concatenate([self.times, at])
+        every = torch.cat([self.whole, x]) if len(self.times) else x
+        for i, t in enumerate(at):
+            others = np.arange(len(times)) != len(self.times) + i
+            row, parts = [self.x[i]], [OWN]
+            for share, pool, shapes in (
+                (WHOLE, self.times, self.whole),
+                (1 - OWN - WHOLE, times[others], every[others]),
+            ):
+                if not len(pool):
+                    row, parts = [*row, self.template, self.template], [*parts, share / 2, share / 2]
+                    continue
+                before = int(np.searchsorted(np.sort(pool), t, side="right")) - 1
+                order = np.argsort(pool, kind="stable")
+                first, last = max(before, 0), min(before + 1, len(pool) - 1)
+                gap = pool[order[last]] - pool[order[first]]
+                u = float(np.clip((t - pool[order[first]]) / gap, 0, 1)) if gap > 0 else 0.0
+                row, parts = [*row, shapes[order[first]], shapes[order[last]]], [*parts, share * (1 - u), share * u]
+            rows.append(torch.stack(row))
+            weights.append(parts)
+        return torch.stack(rows), torch.tensor(weights, dtype=torch.float64)
+
+    def _points(self, frame: _Frame, x: Tensor) -> PointEnergy:
+        """The energy of what was seen at a frame."""
+        surface, found = Surface(x.numpy(), self.faces.numpy()), []
+        for sample in frame.samples:
+            for one in sample.seen.pairs(surface) if isinstance(sample.seen, Cloud) else [sample.seen]:
+                counts = robust(np.linalg.norm(one.places @ surface.vertices - one.points, axis=1), sample.noise)
+                stiffness = STIFFNESS / sample.noise**2 * len(sample.observation.points)
+                found.append(one._replace(weights=stiffness * one.weights * counts))
+        return PointEnergy(found)
+
+    # ---------------------------------------------------------------------------------------------------------- result
+    def result(self, like: Tensor) -> Completion:
+        """The motion in the caller's coordinates."""
+        x = torch.stack(self.x)
+        misses: list[Tensor] = [like.new_zeros(0)] * self.n
+        trust, seen, poor = list(misses), x.new_zeros(x.shape[:2]), []
+        for i, frame in enumerate(self.frames):
+            surface = Surface(x[i].numpy(), self.faces.numpy())
+            for one in frame.samples:
+                off, agree = one.off(surface)
+                counts = agree * robust(off, one.noise)
+                misses[one.number] = torch.from_numpy(off / self.scale).to(like)
+                trust[one.number] = torch.from_numpy(counts).to(like)
+                points = self._placed(one.observation.points)
+                gaps, nearest = cKDTree(points).query(surface.vertices, 3)
+                close = (counts[nearest] * np.exp(-0.5 * (gaps / NEAR) ** 2)).max(1)
+                part = float(counts.mean())
+                if part < DOUBTFUL:
+                    poor.append(f"{frame.time:g} ({100 * part:.0f} %)")
+                seen[i] = torch.maximum(seen[i], min(1.0, part / DOUBTFUL) * torch.from_numpy(close))
+        if poor:
+            warnings.warn(
+                f"the shapes at {', '.join(poor[:8])} explain less than {100 * DOUBTFUL:.0f} % of the points seen "
+                "then: they are doubtful, and their confidence is low. Do the points show this body, in its units?",
+                MeshWarning,
+                stacklevel=4,
+            )
+        for order in (range(1, len(x)), range(len(x) - 2, -1, -1)):
+            for i in order:
+                seen[i] = torch.maximum(seen[i], NEIGHBOURS * seen[i - order.step])
+        at = [frame.time for frame in self.frames]
+        exact = dict(zip(self.times.tolist(), like, strict=False))
+        done = [exact.get(t, self._restored(own).to(like)) for t, own in zip(at, x, strict=True)]
+        knots = exact | dict(zip(at, done, strict=True))
+        times = sorted(knots)
+        stacked = torch.stack([knots[t] for t in times])
+        path = Path(stacked, self.faces, times=times) if len(times) > 1 else None
+        moments = torch.tensor(at, dtype=torch.float64, device=like.device)
+        return Completion(moments, torch.stack(done), seen.to(like), misses, trust, stacked, path)
+
+    def _restored(self, x: Tensor) -> Tensor:
+        return (x / self.scale) @ torch.from_numpy(self.axes) + torch.from_numpy(self.centre)
+
+
+def robust(off: FloatArray, noise: float) -> FloatArray:
+    """What points at distances count for (Geman and McClure)."""
+    counts: FloatArray = 1 / (1 + (off / (OUTLIERS * noise)) ** 2) ** 2
+    return counts

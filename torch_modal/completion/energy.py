@@ -1,0 +1,62 @@
+"""The energy of observed points: of the vertices that they are paired with."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from scipy import sparse
+from torch import Tensor
+
+from torch_modal.completion.pairs import Pairs
+from torch_modal.elastic.steps import Point
+
+# Part of the stiffness of a pair with a normal that is left along the surface.
+SLIDE = 0.3
+
+
+class PointEnergy:
+    r"""Springs between places on a surface and points, weaker along it where there are normals.
+
+    :math:`\sum_i w_i (s |p_i - q_i|^2 + (1 - s) (n_i \cdot (p_i - q_i))^2)`, with s of 1 where there is no normal.
+
+    Args:
+        pairs: The places, each between three vertices at most, at one shape.
+    """
+
+    def __init__(self, pairs: Sequence[Pairs]) -> None:
+        matrices = [one.places.tocsr() for one in pairs]
+        self.places = sparse.vstack(matrices).tocsr()
+        self.points = torch.from_numpy(np.concatenate([one.points for one in pairs]))
+        eye, blocks = torch.eye(3, dtype=torch.float64), []
+        for one in pairs:
+            block = eye.expand(len(one.points), 3, 3)
+            if one.normals is not None:
+                normals = torch.from_numpy(one.normals)
+                block = SLIDE * eye + (1 - SLIDE) * normals[:, :, None] * normals[:, None]
+            blocks.append(torch.from_numpy(one.weights)[:, None, None] * block)
+        #: Stiffness of each pair. *Shape:* ``(n, 3, 3)``.
+        self.stiffness = torch.cat(blocks)
+        squares = self.places.multiply(self.places).tocsr()
+        upper = self.stiffness.flatten(1)[:, [0, 1, 2, 4, 5, 8]]
+        self.diagonal = 2 * torch.from_numpy(squares.T @ upper.numpy())
+
+    def _forces(self, field: Tensor, points: Tensor | float = 0.0) -> tuple[Tensor, Tensor]:
+        """Differences from the points, and the forces on them. *Shape:* ``(1, V, 3) -> (n, 3), (n, 3)``."""
+        off = torch.from_numpy(self.places @ field[0].numpy()) - points
+        return off, (self.stiffness @ off[..., None])[..., 0]
+
+    def _spread(self, forces: Tensor) -> Tensor:
+        return 2 * torch.from_numpy(self.places.T @ forces.numpy())[None]
+
+    def value(self, x: Tensor) -> Tensor:
+        """*Shape:* ``(1, V, 3) -> (1,)``."""
+        off, forces = self._forces(x, self.points)
+        return (off * forces).sum()[None]
+
+    def at(self, x: Tensor) -> Point:
+        """*Shape:* ``(1, V, 3)``."""
+        off, forces = self._forces(x, self.points)
+        gradient = self._spread(forces)
+        return Point(
+            (off * forces).sum()[None], gradient, self.diagonal[None], lambda d: self._spread(self._forces(d)[1])
+        )

@@ -1,0 +1,156 @@
+"""Pairs of observed points and places on a surface: by position and normal, in both directions, robust."""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy import sparse
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from torch_modal.arrays import BoolArray, FloatArray, IntArray
+from torch_modal.geometry.closest import closest_on_triangles, dot
+
+# Places of each triangle that are candidates: its middle, and one near each corner.
+_PLACES = np.array([[2, 2, 2], [4, 1, 1], [1, 4, 1], [1, 1, 4]]) / 6
+
+# Weight of normals: at a size of 100, a distance of 3 counts as much as 60 degrees.
+LEAN = 3.0
+# Smallest cosine between the normals of a pair.
+ALIKE = 0.3
+# Cells of the picture in which surfaces hide others, the depth below which they do not, cosine of grazing sight.
+CELL, DEPTH, GRAZING = 2.0, 3.0, 0.15
+# Neighbours of a point of a cloud, and how many of their usual distances are a gap.
+N_NEIGHBOURS, GAP = 8, 3.0
+
+
+class Pairs(NamedTuple):
+    """Places on a surface that belong to points."""
+
+    places: sparse.csr_matrix
+    """*Shape:* ``(n, V)``."""
+    points: FloatArray
+    """*Shape:* ``(n, 3)``."""
+    normals: FloatArray | None
+    """Where the places may slide across these. *Shape:* ``(n, 3)``."""
+    weights: FloatArray
+    """*Shape:* ``(n,)``."""
+
+
+def rows(corners: IntArray, barycentric: FloatArray, n_vertices: int) -> sparse.csr_matrix:
+    """Places between three vertices as a matrix. *Shape:* ``(n, 3), (n, 3) -> (n, V)``."""
+    n = len(corners)
+    where = np.repeat(np.arange(n), 3), corners.reshape(-1)
+    return sparse.csr_matrix((barycentric.reshape(-1), where), shape=(n, n_vertices))
+
+
+class Surface:
+    """A shape at a size of 100, with places on its faces that may be paired. *Shape:* ``(V, 3), (F, 3)``."""
+
+    def __init__(self, vertices: FloatArray, faces: IntArray) -> None:
+        self.vertices, self.faces = vertices, faces
+        corners = vertices[faces]
+        across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        self.normals = across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-300)
+        self.samples = (_PLACES @ corners).reshape(-1, 3)
+        self.sample_faces = np.arange(len(faces)).repeat(len(_PLACES))
+
+    def featured(self, points: FloatArray, normals: FloatArray | None) -> FloatArray:
+        """Points with their normals, as places of which near ones are alike."""
+        return points if normals is None else np.hstack([points, LEAN * normals])
+
+    def closest(
+        self, points: FloatArray, normals: FloatArray | None
+    ) -> tuple[IntArray, FloatArray, FloatArray, BoolArray]:
+        """Face and coordinates of the place that looks most like each point, the distance, and if normals agree."""
+        own = None if normals is None else self.normals[self.sample_faces]
+        tree = cKDTree(self.featured(self.samples, own))
+        face = self.sample_faces[tree.query(self.featured(points, normals))[1]]
+        barycentric, distances = closest_on_triangles(points, self.vertices[self.faces[face]])
+        agree = np.ones(len(points), bool) if normals is None else dot(self.normals[face], normals) > ALIKE
+        return face, barycentric, distances, agree
+
+    def visible(self, view: FloatArray) -> IntArray:
+        """The samples that are seen from a direction. *Shape:* ``(m,)``."""
+        axes = np.linalg.svd(view[None])[2][1:]
+        depth, cells = self.samples @ view, np.floor(self.samples @ axes.T / CELL).astype(np.int64)
+        cells -= cells.min(0)
+        _, cell = np.unique(cells @ [1, cells[:, 0].max() + 1], return_inverse=True)
+        nearest = np.full(cell.max() + 1, -np.inf)
+        np.maximum.at(nearest, cell.ravel(), depth)
+        front = self.normals[self.sample_faces] @ view > GRAZING
+        return np.flatnonzero(front & (nearest[cell.ravel()] - depth < DEPTH))
+
+
+class Cloud:
+    """A cloud at the scale of the solver, thinned to some of its points."""
+
+    def __init__(
+        self, points: FloatArray, normals: FloatArray | None, weights: FloatArray, view: FloatArray | None
+    ) -> None:
+        self.points, self.normals, self.weights, self.view = points, normals, weights, view
+
+    def thinned(self, n: int) -> "Cloud":
+        """So many of the points, chosen at random, always the same."""
+        if len(self.points) <= n:
+            return self
+        kept = np.random.default_rng(0).permutation(len(self.points))[:n]
+        normals = None if self.normals is None else self.normals[kept]
+        return Cloud(self.points[kept], normals, self.weights[kept], self.view)
+
+    def closest(self, surface: Surface) -> tuple[IntArray, FloatArray, FloatArray, BoolArray]:
+        """:meth:`Surface.closest` of its points."""
+        return surface.closest(self.points, self.normals)
+
+    def pairs(self, surface: Surface, released: BoolArray | None = None) -> list[Pairs]:
+        """Places for the points, and, where the view is known, points for the visible places."""
+        face, barycentric, _, agree = self.closest(surface)
+        n = len(surface.vertices)
+        if released is not None:
+            agree &= ~released[surface.faces[face]].any(1)
+        kept = np.flatnonzero(agree)
+        normals = None if self.normals is None else self.normals[kept]
+        share = self.weights[kept] / self.weights.sum()
+        found = [Pairs(rows(surface.faces[face[kept]], barycentric[kept], n), self.points[kept], normals, share)]
+        if self.view is None or self.normals is None:
+            return found
+        seen = surface.visible(self.view)
+        seen = seen[:: max(1, len(seen) // len(self.points))]
+        faces = surface.sample_faces[seen]
+        queries = surface.featured(surface.samples[seen], surface.normals[faces])
+        nearest = cKDTree(surface.featured(self.points, self.normals)).query(queries)[1]
+        agree = dot(surface.normals[faces], self.normals[nearest]) > ALIKE
+        if released is not None:
+            agree &= ~released[surface.faces[faces]].any(1)
+        seen, faces, nearest = seen[agree], faces[agree], nearest[agree]
+        if len(seen):
+            places = rows(surface.faces[faces], _PLACES[seen % len(_PLACES)], n)
+            found.append(Pairs(places, self.points[nearest], self.normals[nearest], np.full(len(seen), 1 / len(seen))))
+        return found
+
+    def missed(self, surface: Surface, unit: float) -> FloatArray:
+        """Squared distances of the points in a unit; infinite where normals disagree. *Shape:* ``(n,)``."""
+        _, _, distances, agree = self.closest(surface)
+        return np.where(agree, (distances / unit) ** 2, np.inf)
+
+    def score(self, surface: Surface, unit: float) -> float:
+        """Part of the cloud that the surface leaves out, and of the visible surface that the cloud leaves out."""
+        off = self.missed(surface, unit)
+        total = float((self.weights * np.where(np.isfinite(off), off / (1 + off), 1)).sum() / self.weights.sum())
+        if self.view is not None:
+            seen = surface.samples[surface.visible(self.view)]
+            gap = (cKDTree(self.points).query(seen)[0] / (3 * unit)) ** 2
+            total += float((gap / (1 + gap)).mean()) if len(seen) else 1.0
+        return total
+
+    def unexplained(self, surface: Surface, reach: float, least: int) -> list[IntArray]:
+        """Connected groups of points that are far from the surface."""
+        off = np.flatnonzero(self.missed(surface, reach) > 1)
+        if len(off) < least:
+            return []
+        tree = cKDTree(self.points)
+        usual = np.median(tree.query(self.points, min(N_NEIGHBOURS, len(self.points)))[0][:, -1])
+        pairs = cKDTree(self.points[off]).query_pairs(GAP / 2 * usual, output_type="ndarray")
+        graph = sparse.coo_matrix((np.ones(len(pairs)), pairs.T), shape=(len(off), len(off)))
+        labels = connected_components(graph, directed=False)[1]
+        groups = [off[labels == label] for label in np.unique(labels)]
+        return sorted((g for g in groups if len(g) >= least), key=len, reverse=True)

@@ -1,0 +1,215 @@
+"""Poses and amplitudes of modes that bring a shape near to what was seen, from far to near."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from scipy import sparse
+from scipy.sparse.csgraph import dijkstra
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from torch_modal.arrays import BoolArray, FloatArray, IntArray
+from torch_modal.completion.bending import ModalBending, Pose
+from torch_modal.completion.pairs import Cloud, Pairs, Surface
+from torch_modal.geometry.closest import dot
+
+# Steps, and the distance from which on pairs lose weight at the first and the last; stiffness of the modes likewise.
+STEPS, FAR, NEAR = 12, 20.0, 2.0
+# Points of a cloud, and visible places of a surface, that take part in a step.
+N_POINTS = 800
+STIFF, SOFT, STIFFER = 1e-2, 3e-5, (1e-4, 1e-3, 1e-2)
+# Stiffness of a turn and a move of the whole.
+OF_MOTIONS = 1e-2
+# Part of the pull of a pair that is left along the surface.
+SLIDE = 0.3
+# Largest move of a vertex in one step.
+LARGEST_STEP = 6.0
+
+# Weight of the modes' energy beside what is left unexplained: limbs that crossed explain points as well.
+PRIOR = 3e-5
+# Distance at which half of a miss counts, and points are unexplained; parts of a cloud that make a group.
+HALF, REACH, PART_OF_GROUP = 1.0, 2.0, 300
+# Ends of limbs that are tried for a group, of how many, how far away, with which weight; rounds of such trials; and the
+# gain that they need.
+N_TRIED, N_TIPS, MOST_AWAY, WEIGHT, ROUNDS, GAIN = 3, 12, 40.0, 3.0, 3, 1e-3
+# Smallest and largest length of a limb that is tried.
+LIMBS = 8.0, 30.0
+
+
+class PoseSearch:
+    """Fits modal deformations of shapes, at a size of 100, to clouds and to known places.
+
+    Args:
+        bending: The deformations.
+        eigenvalues: Of the modes. *Shape:* ``(k,)``.
+    """
+
+    def __init__(self, bending: ModalBending, eigenvalues: Tensor) -> None:
+        self.bending, self.faces = bending, bending.faces.numpy()
+        relative = eigenvalues / eigenvalues[:1]
+        self.stiffness = torch.cat([relative, relative.new_full((6,), OF_MOTIONS)])
+        self.tips, self.from_tips = _tips(bending.reference.numpy(), bending.reconstruction.edges.numpy())
+
+    def surface(self, base: Tensor, pose: Pose) -> Surface:
+        """The deformed shape."""
+        return Surface(self.bending.shape(base, pose).numpy(), self.faces)
+
+    def score(self, base: Tensor, pose: Pose, clouds: Sequence[Cloud], markers: Sequence[Pairs] = ()) -> float:
+        """How much is left unexplained, from 0 on."""
+        surface = self.surface(base, pose)
+        total = PRIOR * float(self.stiffness[:-6] @ pose.amplitudes**2)
+        for own in markers:
+            off = (np.linalg.norm(own.places @ surface.vertices - own.points, axis=1) / HALF) ** 2
+            total += float(own.weights @ (off / (1 + off)))
+        return total + sum(cloud.score(surface, HALF) for cloud in clouds)
+
+    def rigid(self, base: Tensor, clouds: Sequence[Cloud], markers: Sequence[Pairs]) -> Pose:
+        """The pose alone, from the centroid of what was seen on."""
+        points = np.concatenate([*(own.points for own in clouds), *(own.points for own in markers)])
+        pose = self.bending.still()
+        pose.move = torch.from_numpy(np.median(points, 0)) - base.median(0).values
+        for far in np.geomspace(2 * FAR, FAR, STEPS):
+            pose, _ = self._step(base, pose, clouds, markers, float(far), 1.0, rigid=True)
+        return pose
+
+    def descend(
+        self,
+        base: Tensor,
+        pose: Pose,
+        clouds: Sequence[Cloud],
+        markers: Sequence[Pairs] = (),
+        n_steps: int = STEPS,
+        far: float = FAR,
+        stiff: float = STIFF,
+        soft: float = SOFT,
+    ) -> Pose:
+        """Gauss-Newton steps, each with new pairs, from far to near and from stiff to soft."""
+        distances, stiffnesses = np.geomspace(far, NEAR, n_steps), np.geomspace(stiff, soft, n_steps)
+        clouds, fields = [cloud.thinned(N_POINTS) for cloud in clouds], None
+        for k, (distance, stiffness) in enumerate(zip(distances, stiffnesses, strict=True)):
+            known = fields if k % 2 else None
+            pose, fields = self._step(base, pose, clouds, markers, float(distance), float(stiffness), known=known)
+        return pose
+
+    def fit(
+        self, starts: Sequence[tuple[Tensor, Pose]], clouds: Sequence[Cloud], markers: Sequence[Pairs]
+    ) -> tuple[int, Pose, float]:
+        """The number of the best of several starts, its pose after limbs were tried, and its score."""
+        poses = [self.descend(*one, clouds, markers) for one in starts]
+        scores = [self.score(base, pose, clouds, markers) for (base, _), pose in zip(starts, poses, strict=True)]
+        k = int(np.argmin(scores))
+        base, pose, best = starts[k][0], poses[k], scores[k]
+        for _ in range(ROUNDS):
+            tried = [self._tried(base, pose, clouds, markers, *one) for one in self._limbs(base, pose, clouds)]
+            scores = [self.score(base, other, clouds, markers) for other in tried]
+            if not tried or min(scores) > best - GAIN:
+                break
+            best, pose = min(scores), tried[int(np.argmin(scores))]
+        return k, pose, best
+
+    def stiffened(self, base: Tensor, pose: Pose, clouds: Sequence[Cloud], markers: Sequence[Pairs]) -> Pose:
+        """The pose of the stiffest modes that explain as much: where little moves, soft ones would follow the noise."""
+        best = self.score(base, pose, clouds, markers)
+        for soft in STIFFER:
+            other = self.descend(base, pose, clouds, markers, STEPS // 3, 2 * NEAR, soft, soft)
+            score = self.score(base, other, clouds, markers)
+            if score <= best + GAIN:
+                best, pose = min(best, score), other
+        return pose
+
+    def _limbs(self, base: Tensor, pose: Pose, clouds: Sequence[Cloud]) -> list[tuple[Cloud, FloatArray, int]]:
+        """Groups of points that nothing explains, each with the end of a limb that might."""
+        surface, found = self.surface(base, pose), []
+        for cloud in clouds:
+            for group in cloud.unexplained(surface, REACH, max(4, len(cloud.points) // PART_OF_GROUP))[:2]:
+                points = cloud.points[group]
+                away = np.linalg.norm(surface.vertices[self.tips] - points.mean(0), axis=1)
+                nearest = np.argsort(away)[:N_TRIED]
+                found += [(cloud, points, int(tip)) for tip in nearest if away[tip] < MOST_AWAY]
+        return found
+
+    def _tried(
+        self,
+        base: Tensor,
+        pose: Pose,
+        clouds: Sequence[Cloud],
+        markers: Sequence[Pairs],
+        cloud: Cloud,
+        points: FloatArray,
+        tip: int,
+    ) -> Pose:
+        """A pose in which a limb explains points that nothing explained; its former pairs are released."""
+        extent = 2 * float(np.percentile(np.linalg.norm(points - points.mean(0), axis=1), 90))
+        limb = self.from_tips[tip] < np.clip(extent, *LIMBS)
+        vertices = np.flatnonzero(limb)
+        x = self.bending.shape(base, pose).numpy()[vertices]
+        shift, fields, thinned = points.mean(0) - x.mean(0), None, [one.thinned(N_POINTS) for one in clouds]
+        for k in range(STEPS // 2):
+            nearest = vertices[cKDTree(x + (shift if k == 0 else 0)).query(points)[1]]
+            places = sparse.csr_matrix(
+                (np.ones(len(points)), (np.arange(len(points)), nearest)), shape=(len(points), len(limb))
+            )
+            own = Pairs(places, points, None, np.full(len(points), WEIGHT / len(cloud.points)))
+            known = fields if k % 2 else None
+            pose, fields = self._step(base, pose, thinned, [*markers, own], MOST_AWAY, SOFT, limb, known=known)
+            x = self.bending.shape(base, pose).numpy()[vertices]
+        return self.descend(base, pose, clouds, markers, STEPS // 2, FAR / 3, 10 * SOFT)
+
+    def _step(
+        self,
+        base: Tensor,
+        pose: Pose,
+        clouds: Sequence[Cloud],
+        markers: Sequence[Pairs],
+        far: float,
+        stiffness: float,
+        released: BoolArray | None = None,
+        rigid: bool = False,
+        known: Tensor | None = None,
+    ) -> tuple[Pose, Tensor]:
+        """A Gauss-Newton step towards pairs, found here, and markers; no vertex moves far. Also its derivatives.
+
+        Those of the step before, where they are given, do nearly as well.
+        """
+        if known is None:
+            x, fields = self.bending.linearised(base, pose, rigid)
+        else:
+            x, fields = self.bending.shape(base, pose), known
+        n, surface, columns = len(fields), Surface(x.numpy(), self.faces), fields.movedim(0, -1).numpy()  # (V, 3, n)
+        rows, gaps = [], []
+        for own in [*(pairs for cloud in clouds for pairs in cloud.pairs(surface, released)), *markers]:
+            off = own.places @ surface.vertices - own.points
+            root = (own.weights**0.5 / (1 + (off**2).sum(1) / far**2))[:, None]
+            moved = [root * (own.places @ columns[:, i]) for i in range(3)]
+            off = root * off
+            if own.normals is not None:
+                across = sum(own.normals[:, i, None] * moved[i] for i in range(3))
+                rows.append((1 - SLIDE) ** 0.5 * across)
+                gaps.append((1 - SLIDE) ** 0.5 * dot(own.normals, off))
+                moved, off = [SLIDE**0.5 * part for part in moved], SLIDE**0.5 * off
+            rows += moved
+            gaps += list(off.T)
+        amplitudes = torch.cat([pose.amplitudes, pose.amplitudes.new_zeros(6)])[-n:]
+        prior, row, gap = stiffness * self.stiffness[-n:], torch.from_numpy(np.concatenate(rows)), np.concatenate(gaps)
+        matrix, slope = row.mT @ row, row.mT @ torch.from_numpy(gap) + prior * amplitudes
+        matrix.diagonal().add_(prior + 1e-9 * matrix.diagonal().mean())
+        step = -torch.linalg.solve(matrix, slope)
+        largest = float((fields.movedim(0, -1) @ step).norm(dim=-1).max()) / LARGEST_STEP
+        return self.bending.stepped(pose, step / max(1.0, largest), x.mean(0)), fields
+
+
+def _tips(x: FloatArray, edges: IntArray) -> tuple[IntArray, FloatArray]:
+    """Vertices far from each other along the surface, ends of limbs first, and the distances from each.
+
+    *Shape:* ``(n,), (n, V)``.
+    """
+    i, j = edges.T
+    lengths = np.maximum(np.linalg.norm(x[i] - x[j], axis=1), 1e-9)
+    graph = sparse.coo_matrix((lengths, (i, j)), shape=(len(x), len(x))).tocsr()
+    nearest, tips, rows = dijkstra(graph, directed=False, indices=int(i[0])), [], []
+    for _ in range(N_TIPS):
+        tips.append(int(np.where(np.isfinite(nearest), nearest, -1).argmax()))
+        rows.append(dijkstra(graph, directed=False, indices=tips[-1]))
+        nearest = np.min(rows, 0)
+    return np.array(tips), np.stack(rows)
