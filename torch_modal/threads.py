@@ -148,7 +148,10 @@ def by_chunks(compute: Callable[[Any], Any], samples: Any, n_vertices: int, clos
         return list(zip(parts, run([partial(result, part) for part in parts]), strict=True))
 
     with alone():
-        if closed and torch.is_grad_enabled() and any(x.requires_grad for x in given):
+        recording = closed and torch.is_grad_enabled() and any(x.requires_grad for x in given)
+        if len(sizes) == 1 and not recording:
+            return compute(samples)
+        if recording:
             found = _Chunks.apply(results, sizes, *given)
         else:
             found = [_joined(each) for each in zip(*(own for _, own in results(*given)), strict=True)]

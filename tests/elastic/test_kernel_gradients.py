@@ -16,7 +16,7 @@ from torch import Tensor
 import torch_modal as tm
 from torch_modal.elastic.bend import Bend
 from torch_modal.elastic.energy import Energy, Reference, RestShapes
-from torch_modal.elastic.kernel_energy import KernelEnergy, KernelVolume, _Merged, _Sizes
+from torch_modal.elastic.kernel_energy import KernelEnergy, _Merged
 from torch_modal.elastic.kernel_steps import _Relaxed
 from torch_modal.elastic.kernels.function import fused
 from torch_modal.elastic.modal import KernelModalEnergy, _Gradient
@@ -149,15 +149,12 @@ def elastic(request: pytest.FixtureRequest, small_bars: Shapes) -> Elastic:
 
 @pytest.mark.parametrize("relative", [False, True])
 def test_merged_rest_shapes(elastic: Elastic, relative: bool) -> None:
-    given = [elastic.shapes, elastic.weights]
-    for part, stiffness in zip(elastic.kernels.parts, elastic.stiffness, strict=True):
-        if isinstance(part, KernelVolume):
-            assert_differences(lambda x, own=part: fused(_Sizes(own), x)[0], given[:1])
-            assert_differences(lambda x, own=part: fused(_Sizes(own), x)[1], given[:1])
-        elif part.functions.weight is not None:
-            start = [elastic.start] if part.functions.fullness is not None else []
-            operation = _Merged(part, relative and bool(start))
-            assert_differences(lambda *x, own=operation: fused(own, *x)[0], [*given, stiffness, *start])
+    for i in elastic.kernels.weighed:
+        operation, given = _Merged(elastic.kernels, [i], relative), [elastic.shapes, elastic.weights]
+        start = [] if elastic.kernels.parts[i].functions.fullness is None else [elastic.start]
+        given += [elastic.stiffness[i], *start]
+        sizes = operation.by_torch(*given)[0].abs().amax((0, 1))
+        assert_differences(lambda *x, own=operation, sizes=sizes: fused(own, *x)[0] / sizes, given)
 
 
 def test_gradients_in_amplitudes(elastic: Elastic) -> None:

@@ -180,15 +180,18 @@ def kernels() -> SimpleNamespace:
                     wp.atomic_add(out, place(j * n_samples, s), vec2(found, real(0.0)))
         for k in range(i - s * threads, hinges.shape[0], threads):
             q4 = hinges[place(k, 0)]
+            sums = potential.sums()
             for r in range(s * n_rests, (s + 1) * n_rests):
                 e = hinge_of(rests, r * n_vertices, q4)
                 phase = hinge.measure(e)
-                factor = weights[r] * beta[place(s * n_beta, wp.min(k, n_beta - 1))]
-                factor *= wp.min(hinge.weight(e, phase, real(0.0)), largest_weight)
-                to = potential.merged(potential.moments(phase, factor), real(1.0))
-                for j in range(n_shapes):
-                    found = potential.energy(hinge.measure(hinge_of(x, (j * n_samples + s) * n_vertices, q4)), to)
-                    wp.atomic_add(out, place(j * n_samples, s), vec2(real(0.0), found))
+                pull = weights[r] * wp.min(hinge.weight(e, phase, real(0.0)), largest_weight)
+                sums += potential.moments(phase, pull)
+            factor = beta[place(s * n_beta, wp.min(k, n_beta - 1))]
+            to = potential.merged(sums, factor)
+            left = potential.left(sums, factor, to)
+            for j in range(n_shapes):
+                found = potential.energy(hinge.measure(hinge_of(x, (j * n_samples + s) * n_vertices, q4)), to)
+                wp.atomic_add(out, place(j * n_samples, s), vec2(real(0.0), found + left))
 
     return SimpleNamespace(module=module, distortion=distortion)
 

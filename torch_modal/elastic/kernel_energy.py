@@ -14,12 +14,12 @@ from torch_modal.autograd import plain
 from torch_modal.elastic import volume
 from torch_modal.elastic.bend import NEEDLE, NEEDLE_OF_STEPS
 from torch_modal.elastic.energy import Energy, OnMesh, Reference, RestShapes
-from torch_modal.elastic.kernels.function import fused
+from torch_modal.elastic.kernels.function import by_torch, fused
 from torch_modal.elastic.kernels.launch import launch, made, of_elements
 from torch_modal.elastic.term import KernelFunctions, Mesh
-from torch_modal.elastic.volume import MIN_RELATIVE_VOLUME, Volume
+from torch_modal.elastic.volume import Volume
 from torch_modal.geometry.rigid import signed_volumes
-from torch_modal.geometry.vectors import cross, inverse, norm, pick
+from torch_modal.geometry.vectors import inverse
 
 
 class KernelPoint(NamedTuple):
@@ -31,8 +31,8 @@ class KernelPoint(NamedTuple):
     """But for the volume. *Shape:* ``(B, V, 3)``."""
     diagonal: Any
     """Blocks of the convex Hessian's diagonal, packed, if wanted. *Shape:* ``(B, V, 6)``."""
-    factors: list[Tensor]
-    """Of each term; none of the volume. *Shape of each:* ``(B, M, f)``."""
+    factors: list[Any]
+    """Of each pass those of the term, and of the other that rides on it. *Shape of each:* ``(B, M, f)``."""
     normal: Tensor
     """Gradient of the volume. *Shape:* ``(B, V, 3)``."""
     moment: Tensor
@@ -53,16 +53,18 @@ class KernelTerm(nn.Module):
     Args:
         part: The term.
         functions: What the kernels are made from.
+        elements: Those of the term, unless others are given. *Shape:* ``(M, n)``.
     """
 
     elements: Tensor
     functions: Any
 
-    def __init__(self, part: OnMesh, functions: KernelFunctions) -> None:
+    def __init__(self, part: OnMesh, functions: KernelFunctions, elements: Tensor | None = None) -> None:
         super().__init__()
         self.part, self.functions = part, functions
         self.forward_kernels = self.backward_kernels = None
-        self.register_buffer("elements", part.corners.T.int().contiguous(), persistent=False)
+        own = part.corners.T if elements is None else elements
+        self.register_buffer("elements", own.int().contiguous(), persistent=False)
         self.n_elements = len(self.elements)
         #: Numbers of elements, and of the factors of each.
         self.size_of_factors = self.n_elements, 3 * functions.n + 1 + (functions.across is not None)
@@ -82,21 +84,20 @@ class KernelTerm(nn.Module):
             kernels = self.__dict__[f"{which}_kernels"] = of_elements(which, self.functions)
         launch(getattr(kernels, name), (dim, self.n_elements), [self.elements, *given])
 
-    def reference(
-        self, rests: RestShapes, stiffness: Tensor, start: Tensor | None, relative: bool
-    ) -> tuple[Tensor, Tensor]:
-        """The record, and the energy that remains. *Shape:* ``(B, M, R), (B,)``."""
-        more = () if start is None or self.functions.fullness is None else (start,)
-        operation, given = _Merged(self, relative and bool(more)), (rests.shapes, rests.weights, stiffness, *more)
-        if self.functions.weight is None:
-            record, left = operation.by_torch(*(x.double() for x in given))
-        else:
-            record, left = fused(operation, *given)
-        return record, left
+    def seen(self, shapes: Tensor) -> tuple[Tensor, Tensor | None]:
+        """The shapes that elements are merged of, and all measures together, where their mean counts.
+
+        *Shape:* ``(N, V, 3) -> (N, n, 3), (N,)``.
+        """
+        if not self.functions.uses_mean:
+            return shapes, None
+        total = shapes.new_zeros(len(shapes))
+        self.launch("total", len(shapes), shapes.shape[1], shapes, total)
+        return shapes, total
 
 
-class KernelVolume(nn.Module):
-    """The volume of a mesh, by kernels.
+class KernelVolume(KernelTerm):
+    """The volume of a mesh, by kernels; rest shapes are merged as elements of volume and area.
 
     Args:
         part: The term.
@@ -106,11 +107,9 @@ class KernelVolume(nn.Module):
 
     faces: Tensor
     used: Tensor
-    size_of_factors = (0,)
 
     def __init__(self, part: OnMesh, mesh: Mesh, used: Tensor) -> None:
-        super().__init__()
-        self.part = part
+        super().__init__(part, volume.kernel_functions(), torch.tensor([[0, 1]]))
         self.closed = len(mesh.connectivity.boundary_chain) == 0
         self.register_buffer("faces", mesh.faces.int(), persistent=False)
         self.register_buffer("used", used, persistent=False)
@@ -132,40 +131,36 @@ class KernelVolume(nn.Module):
         if not self.closed:
             self._spread(-normal.sum(1), normal)
 
-    def _launch(self, name: str, x: Tensor, *given: Tensor | None) -> None:
+    def _launch(self, name: str, x: Tensor, *given: Any) -> None:
         kernel = getattr(made(volume.kernels), name)
         launch(kernel, (len(x), len(self.faces)), [self.faces, x.shape[1], x, self.centre(x), *given])
 
-    def at(self, x: Tensor, normal: Tensor | None = None, area: Tensor | None = None) -> Tensor:
-        """Volumes. The gradient, and the area, are added where they are wanted. *Shape:* ``(B, V, 3) -> (B,)``."""
-        found = x.new_zeros(len(x))
-        self._launch("sizes", x, found, area, normal)
+    def at(self, x: Tensor, normal: Tensor | None = None, area: bool = False) -> Tensor:
+        """Volumes, and areas if wanted, as the first two components of the second vertex of an element.
+
+        Gradients are added where they are wanted. *Shape:* ``(B, V, 3) -> (B, 2, 3)``.
+        """
+        found = x.new_zeros(len(x), 2, 3)
+        self._launch("sizes", x, found, int(area), normal)
         if normal is not None:
             self.through_centre(normal)
         return found
 
-    def back(
-        self, x: Tensor, to_volume: Tensor, to_area: Tensor | None, to_normal: Tensor | None, to_x: Tensor
-    ) -> None:
+    def seen(self, shapes: Tensor) -> tuple[Tensor, Tensor | None]:
+        """Overrides the base class."""
+        return self.at(shapes, area=True), None
+
+    def back(self, x: Tensor, to_sizes: Tensor, to_normal: Tensor | None, to_x: Tensor) -> None:
         """Adjoint of :meth:`at`: adds the gradient."""
         if to_normal is not None and not self.closed:
             to_normal = (to_normal - self.mean(to_normal)[:, None]).contiguous()
         to_centre = None if self.closed else x.new_zeros(len(x), 3)
-        self._launch("sizes_back", x, to_volume.contiguous(), to_area, to_normal, to_x, to_centre)
+        self._launch("sizes_back", x, to_sizes, to_normal, to_x, to_centre)
         if to_centre is not None:
             self._spread(to_centre, to_x)
 
-    def reference(
-        self, rests: RestShapes, stiffness: Tensor, start: Tensor | None, relative: bool
-    ) -> tuple[Tensor, Tensor]:
-        """The record, and the energy that remains. *Shape:* ``(B, 1, 2), (B,)``."""
-        volumes, areas = fused(_Sizes(self), rests.shapes)
-        weights = torch.maximum(volumes.abs(), MIN_RELATIVE_VOLUME * areas**1.5) ** -2
-        record, left = self.part.term.merged(volumes[..., None], (rests.weights * weights)[..., None], stiffness)
-        return record.mT, left.squeeze(-1)
 
-
-def by_kernels(energy: Energy, mesh: Mesh) -> list[KernelTerm | KernelVolume | None]:
+def by_kernels(energy: Energy, mesh: Mesh) -> list[KernelTerm | None]:
     """The terms of an energy by kernels; None for one that torch computes: all but one volume, for example."""
     found: list[Any] = []
     for part in energy.parts:
@@ -179,15 +174,16 @@ def by_kernels(energy: Energy, mesh: Mesh) -> list[KernelTerm | KernelVolume | N
     return found
 
 
-def volumes_by_kernel(x: Tensor, corners: Tensor) -> Tensor:
-    """:func:`torch_modal.geometry.rigid.signed_volumes` in one pass, without a gradient."""
+def volumes_by_kernel(x: Tensor, faces: Tensor) -> Tensor:
+    """:func:`torch_modal.geometry.rigid.signed_volumes` in one pass, without a gradient; of faces of int32."""
     if not plain(x):
-        return signed_volumes(x, corners)
-    faces, own = corners.T.int().contiguous(), x.detach().double().contiguous()
-    found = own.new_zeros(x.shape[:-2])
-    given = faces, x.shape[-2], own, None, found, None, None
-    launch(made(volume.kernels).sizes, (found.numel(), len(faces)), given)
-    return found.to(x)
+        return signed_volumes(x, faces)
+    own = x.detach().double().contiguous()
+    found = own.new_zeros(*x.shape[:-2], 2, 3)
+    launch(
+        made(volume.kernels).sizes, (found.numel() // 6, len(faces)), [faces, x.shape[-2], own, None, found, 0, None]
+    )
+    return found[..., 1, 0].to(x)
 
 
 class Pass(nn.Module):
@@ -231,31 +227,24 @@ class Pass(nn.Module):
         launch(kernel, (dim, self.n_elements), [self.elements, self.own, self.n_own, *given])
 
     def linearise(
-        self,
-        x: Tensor,
-        records: Sequence[Tensor],
-        given: tuple[Any, ...],
-        factors: Sequence[Tensor],
-        volume: tuple[Tensor | None, ...],
-    ) -> None:
-        """Energy and derivatives are added; arguments of the kernel, of which records and factors are of all terms."""
-        own, other = self._mine(records)
-        own_factors, other_factors = self._mine(factors) if factors else (None, None)
-        self._launch("linearise", len(x), x.shape[1], x, own, other, *given, own_factors, other_factors, *volume)
+        self, x: Tensor, records: Sequence[Tensor], given: tuple[Any, ...], hessian: bool, volume: tuple[Any, ...]
+    ) -> tuple[Tensor | None, ...]:
+        """Energy and derivatives are added; arguments of the kernel. The factors, if wanted."""
+        own = x.new_empty(len(x), *self.term.size_of_factors) if hessian else None
+        other = x.new_empty(len(x), *self.rider.size_of_factors) if hessian and self.rider is not None else None
+        others = None if self.other is None else records[self.other]
+        given = x.shape[1], x, records[self.number], others, *given, own, other, *volume
+        self._launch("linearise", len(x), *given)
+        return own, other
 
-    def product(
-        self, dim: tuple[int, int], field: tuple[Tensor, int], factors: Sequence[Tensor], out: tuple[Any, ...]
-    ) -> None:
+    def product(self, dim: tuple[int, int], *given: Any) -> None:
         """Likewise."""
-        self._launch("product", dim[0], dim[1], *field, *self._mine(factors), *out)
-
-    def _mine(self, of_all: Sequence[Tensor]) -> tuple[Tensor, Tensor | None]:
-        return of_all[self.number], None if self.other is None else of_all[self.other]
+        self._launch("product", dim[0], dim[1], *given)
 
 
 def _passes(parts: Sequence[Any], n_vertices: int) -> list[Pass]:
     """The terms but the volume in as few passes as may be: edges ride on elements that begin with them."""
-    terms = [(i, part) for i, part in enumerate(parts) if isinstance(part, KernelTerm)]
+    terms = [(i, part) for i, part in enumerate(parts) if not isinstance(part, KernelVolume)]
     ends = torch.tensor([n_vertices, 1])
     for edges in (term for term in terms if term[1].functions.even):
         keys = edges[1].elements.long().sort(1)[0] @ ends
@@ -281,47 +270,56 @@ class KernelEnergy(nn.Module):
     volume: KernelVolume | None
     in_passes: list[Pass]
 
-    def __init__(self, energy: Energy, parts: Sequence[KernelTerm | KernelVolume]) -> None:
+    def __init__(self, energy: Energy, parts: Sequence[KernelTerm]) -> None:
         super().__init__()
         self.energy = energy
         self.parts: Any = nn.ModuleList(parts)
-        #: Numbers of the terms with factors, and of the volume.
-        self.terms = [i for i, part in enumerate(parts) if isinstance(part, KernelTerm)]
+        #: Numbers of the volume, and of the other terms.
         self.volumes = [i for i, part in enumerate(parts) if isinstance(part, KernelVolume)]
+        self.terms = [i for i in range(len(parts)) if i not in self.volumes]
+        #: Numbers of the terms whose rest shapes are merged by kernels, and by torch.
+        self.weighed = [i for i, part in enumerate(parts) if part.functions.weight is not None]
+        self.unweighed = [i for i in range(len(parts)) if i not in self.weighed]
         #: The terms in passes over elements, each alone or with another that rides on it.
         self.passes: Any = nn.ModuleList(_passes(parts, energy.n_vertices))
         # Lists of modules are slow to index, and this is done at every evaluation.
         self.__dict__["volume"] = parts[self.volumes[0]] if self.volumes else None
         self.__dict__["in_passes"] = [*self.passes]
         #: Whether kernels know the adjoints of all terms.
-        self.exact = all(part.functions.exact for part in parts if isinstance(part, KernelTerm))
+        self.exact = all(part.functions.exact for part in parts)
 
     @classmethod
     def of(cls, energy: Energy, mesh: Mesh) -> "KernelEnergy | None":
         """An energy by kernels; None where they do not serve all of its terms, or it is a volume alone."""
         parts = by_kernels(energy, mesh)
         found = [part for part in parts if part is not None]
-        serves = len(found) == len(parts) and any(isinstance(part, KernelTerm) for part in found)
+        serves = len(found) == len(parts) and not all(isinstance(part, KernelVolume) for part in found)
         return cls(energy, found) if serves else None
 
     def reference(self, rests: RestShapes, start: Tensor | None = None, relative: bool = False) -> Reference:
         """Merge rest shapes into one reference (Eq. 8); arguments as :meth:`RestShapes.reference`."""
-        pairs = zip(self.parts, rests.stiffness, strict=True)
-        records, left = zip(*(part.reference(rests, own, start, relative) for part, own in pairs), strict=True)
-        return Reference(records, sum(left, start=torch.zeros_like(left[0])))
+        records: dict[int, Tensor] = {}
+        constant = rests.weights.new_zeros(len(rests.weights), dtype=torch.float64)
+        for numbers, run in ((self.weighed, fused), (self.unweighed, by_torch)):
+            if numbers:
+                given = [rests.shapes, rests.weights, *(rests.stiffness[i] for i in numbers)]
+                given += [] if start is None else [start]
+                *found, left = run(_Merged(self, numbers, relative), *given)
+                records.update(zip(numbers, found, strict=True))
+                constant = constant + left
+        return Reference(tuple(records[i] for i in range(len(self.parts))), constant)
 
     def _linearised(
         self, x: Tensor, to: Reference, gradient: Tensor | None, normal: Tensor | None, diagonal: Tensor | None = None
-    ) -> tuple[Tensor, Tensor, Tensor, list[Tensor]]:
+    ) -> tuple[Tensor, Tensor, Tensor, list[Any]]:
         """The energy but for its constant; the volume's moment and stiffness; factors. Derivatives are added."""
-        (energy, inside), factors = x.new_zeros(2, len(x)).unbind(), []
-        if diagonal is not None:
-            factors = [x.new_empty(len(x), *part.size_of_factors) for part in self.parts]
+        (energy, inside), factors = x.new_zeros(2, len(x)), []
         n_references, volume = len(to.constant), self.volume
         # The volume comes with the first pass.
         more: tuple[Any, ...] = (None,) * 4 if volume is None else (volume.faces, volume.centre(x), inside, normal)
         for one in self.in_passes:
-            one.linearise(x, to.records, (n_references, energy, gradient, diagonal), factors, more)
+            given = n_references, energy, gradient, diagonal
+            factors.append(one.linearise(x, to.records, given, diagonal is not None, more))
             more = (None,) * 4
         if volume is None:
             return energy, inside, inside, factors
@@ -353,15 +351,15 @@ class KernelEnergy(nn.Module):
         return self._linearised(x, to, None, None)[0].flatten()
 
     def product(
-        self, factors: Sequence[Tensor], dim: tuple[int, int], fields: Tensor, start: int, out: Tensor, out_start: int,
+        self, factors: Sequence[Any], dim: tuple[int, int], fields: Tensor, start: int, out: Tensor, out_start: int,
         scalars: Tensor | None = None, first: int = 0,
     ) -> None:  # fmt: skip
         """The convex Hessian but for the volume's part times fields of so many samples and vertices.
 
         Fields, results and scalars begin at the given places of their arrays.
         """
-        for one in self.in_passes:
-            one.product(dim, (fields, start), factors, (out, out_start, scalars, first))
+        for one, own in zip(self.in_passes, factors, strict=True):
+            one.product(dim, fields, start, *own, out, out_start, scalars, first)
 
     def back(
         self,
@@ -404,79 +402,66 @@ class KernelEnergy(nn.Module):
             to_volume, to_weight = to_volume + at.moment * to_energy, to_weight + off**2 * to_energy
         own = at.moment[:, None, None] * to_gradient
         own = own if to_normal is None else own.add_(to_normal)
-        self.parts[i].back(x, to_volume, None, own, to_x)
+        to_sizes = x.new_zeros(b, 2, 3)
+        to_sizes[:, 1, 0] = to_volume
+        self.parts[i].back(x, to_sizes, own, to_x)
         to_records[i].add_(torch.stack([to_weight, -to_volume], -1)[:, None])
 
 
 class _Merged:
-    """Rest shapes, weights, the stiffness of elements, and perhaps a start as a record, and what remains."""
+    """Rest shapes, weights, the stiffnesses of some terms, and perhaps a start as records, and what remains."""
 
-    n_results, n_differentiable = 2, 1
+    def __init__(self, energy: KernelEnergy, numbers: Sequence[int], relative: bool) -> None:
+        self.energy, self.parts, self.relative = energy, [energy.parts[i] for i in numbers], relative
+        self.n_differentiable = len(numbers)
+        self.n_results = self.n_differentiable + 1
 
-    def __init__(self, term: KernelTerm, relative: bool) -> None:
-        self.term, self.relative = term, relative
+    def _parted(self, given: Sequence[Tensor]) -> tuple[Tensor, Tensor, Sequence[Tensor], Tensor | None]:
+        shapes, weights, *more = given
+        n = len(self.parts)
+        return shapes, weights, more[:n], more[n] if len(more) > n else None
 
-    def _launch(self, means: Tensor, given: tuple[Tensor, ...], results: Sequence[Tensor | None], back: bool) -> None:
-        shapes, weights, stiffness, *start = given
-        needle = NEEDLE_OF_STEPS if self.relative else NEEDLE
-        first = shapes.shape[2], shapes.flatten(0, 1), weights, means, stiffness, start[0] if start else None
-        sizes = needle**2, int(self.relative), shapes.shape[1], stiffness.shape[1]
-        self.term.launch("merge", len(shapes), *first, *sizes, *results, back=back)
+    def _launch(
+        self, i: int, seen: tuple[Tensor, Tensor | None], given: Sequence[Tensor], results: Sequence[Tensor | None],
+        back: bool = False,
+    ) -> None:  # fmt: skip
+        (x, total), (shapes, weights, stiffness, start), part = seen, self._parted(given), self.parts[i]
+        soft = None if part.functions.fullness is None else start
+        relative = self.relative and soft is not None
+        sizes = (NEEDLE_OF_STEPS if relative else NEEDLE) ** 2, int(relative), shapes.shape[1], stiffness[i].shape[1]
+        first = x.shape[1], x, weights, total, stiffness[i], soft
+        part.launch("merge", len(shapes), *first, *sizes, *results, back=back)
 
     def run(self, kept: list[Any] | None, *given: Tensor) -> tuple[Tensor, ...]:
         """See :class:`~torch_modal.elastic.kernels.function.Operation`."""
-        (shapes, means), term = given[:2], self.term
-        if term.functions.uses_mean:
-            means = shapes.new_zeros(shapes.shape[:2])
-            term.launch("total", means.numel(), shapes.shape[2], shapes.flatten(0, 1), means)
-            means /= max(term.n_elements, 1)
-        record = shapes.new_empty(len(shapes), term.n_elements, term.functions.potential.n_rows)
+        shapes, records = given[0], []
         constant = shapes.new_zeros(len(shapes))
-        self._launch(means, given, [record, constant], False)
-        if kept is not None:
-            kept.append(means)
-        return record, constant
+        for i, part in enumerate(self.parts):
+            seen = part.seen(shapes.flatten(0, 1))
+            records.append(shapes.new_empty(len(shapes), part.n_elements, part.functions.potential.n_rows))
+            self._launch(i, seen, given, [records[i], constant])
+            if kept is not None:
+                kept.append(seen)
+        return *records, constant
 
     def back(self, kept: list[Any], grads: Sequence[Tensor], *given: Tensor) -> tuple[Tensor | None, ...]:
         """See :class:`~torch_modal.elastic.kernels.function.Operation`."""
         if not kept:
             self.run(kept, *given)
         found = tuple(torch.zeros_like(each) for each in given)
-        self._launch(kept[0], given, [grads[0], *found, *[None] * (4 - len(found))], True)
+        to_shapes, to_weights, to_stiffness, to_start = self._parted(found)
+        for i, part in enumerate(self.parts):
+            to_seen = torch.zeros_like(kept[i][0]) if isinstance(part, KernelVolume) else to_shapes
+            self._launch(i, kept[i], given, [grads[i], to_seen, to_weights, to_stiffness[i], to_start], True)
+            if isinstance(part, KernelVolume):
+                part.back(given[0].flatten(0, 1), to_seen, None, to_shapes.flatten(0, 1))
         return found
 
-    def by_torch(
-        self, shapes: Tensor, weights: Tensor, stiffness: Tensor, start: Tensor | None = None
-    ) -> tuple[Tensor, ...]:
+    def by_torch(self, *given: Tensor) -> tuple[Tensor, ...]:
         """See :class:`~torch_modal.elastic.kernels.function.Operation`."""
-        begin = None if start is None else start.movedim(-1, 0)
-        record, left = self.term.part.merged(shapes.movedim(-1, 0), weights, stiffness, begin, self.relative)
-        return record.mT.contiguous(), left.sum(-1)
-
-
-class _Sizes:
-    """Volumes and areas of shapes. *Shape:* ``(B, K, V, 3) -> (B, K), (B, K)``."""
-
-    n_results = n_differentiable = 2
-
-    def __init__(self, volume: KernelVolume) -> None:
-        self.volume = volume
-
-    def run(self, kept: list[Any] | None, shapes: Tensor) -> tuple[Tensor, ...]:
-        """See :class:`~torch_modal.elastic.kernels.function.Operation`."""
-        area = shapes.new_zeros(shapes.shape[:2])
-        return self.volume.at(shapes.flatten(0, 1), None, area).view_as(area), area
-
-    def back(self, kept: list[Any], grads: Sequence[Tensor], shapes: Tensor) -> tuple[Tensor | None, ...]:
-        """See :class:`~torch_modal.elastic.kernels.function.Operation`."""
-        found = torch.zeros_like(shapes)
-        to_volume, to_area = (each.flatten() for each in grads)
-        self.volume.back(shapes.flatten(0, 1), to_volume, to_area, None, found.flatten(0, 1))
-        return (found,)
-
-    def by_torch(self, shapes: Tensor) -> tuple[Tensor, ...]:
-        """See :class:`~torch_modal.elastic.kernels.function.Operation`."""
-        part, rows = self.volume.part, shapes.movedim(-1, 0)
-        centre = pick(rows, self.volume.used).mean(-1, keepdim=True)
-        p, q, r = part.edge_vectors(torch.cat([rows, centre], -1))
-        return (p * cross(q, r)).sum((0, -1)) / 6, 0.5 * norm(cross(q - p, r - p)).sum(-1)
+        shapes, weights, stiffness, start = self._parted(given)
+        extend = self.energy.energy.extend
+        rows, begin = extend(shapes.movedim(-1, 0)), None if start is None else extend(start.movedim(-1, 0))
+        pairs = zip(self.parts, stiffness, strict=True)
+        found = [part.part.merged(rows, weights, own, begin, self.relative) for part, own in pairs]
+        return *(record.mT.contiguous() for record, _ in found), torch.stack([own.sum(-1) for _, own in found]).sum(0)

@@ -300,7 +300,7 @@ class KernelModalEnergy(ModalEnergy):
         stiffness, value = totals.unbind(1)
         for i in kernels.volumes:
             normal = torch.zeros_like(x)
-            off = kernels.parts[i].at(x, normal) - to.records[i][:, 0, 1]
+            off = kernels.parts[i].at(x, normal)[:, 1, 0] - to.records[i][:, 0, 1]
             weight = to.records[i][:, 0, 0]
             last = jacobian[:, -1]
             last[:, :n], last[:, n] = normal.flatten(1) @ self.flat.double().mT, off

@@ -7,7 +7,7 @@ from typing import no_type_check
 import torch
 from torch import Tensor
 
-from torch_modal.elastic.term import Mesh, Term
+from torch_modal.elastic.term import KernelFunctions, Mesh, Term, square
 from torch_modal.geometry.connectivity import Connectivity, double_areas
 from torch_modal.geometry.inspect import OPEN, open_part, signed_volume
 from torch_modal.geometry.vectors import cross, norm
@@ -57,6 +57,10 @@ class Volume(Term):
         rows = (none, r, -q), (-r, none, p), (q, -p, none)
         return torch.stack([torch.stack(row, 1) for row in rows])
 
+    def kernel_functions(self, n: int) -> KernelFunctions | None:
+        """Functions of rest shapes; of a class that inherits from this one, none."""
+        return kernel_functions() if type(self) is Volume else None
+
 
 def encloses(x: Tensor, mesh: Connectivity) -> bool:
     """True for a shape that encloses a volume: it has small holes at most, and is not flat. *Shape:* ``(V, 3)``."""
@@ -66,6 +70,31 @@ def encloses(x: Tensor, mesh: Connectivity) -> bool:
     area = double_areas(points, mesh.faces).sum() / 2
     volume = signed_volume(points - points[mesh.used].mean(0), mesh.faces)
     return bool(abs(volume) > MIN_RELATIVE_VOLUME * area**1.5)
+
+
+@cache
+@no_type_check
+def kernel_functions() -> KernelFunctions:
+    """Weights at rest, for kernels, of elements whose edge vector consists of volume and area."""
+    import warp as wp
+
+    real, edge = wp.float64, wp.types.matrix(shape=(1, 3), dtype=wp.float64)
+    least = wp.constant(real(MIN_RELATIVE_VOLUME))
+
+    @wp.func
+    def measure(x: edge):
+        return x[0, 0]
+
+    @wp.func
+    def linearised(x: edge):
+        return x[0, 0], wp.matrix_from_rows(wp.vec3d(real(1.0), real(0.0), real(0.0)))
+
+    @wp.func
+    def weight(x: edge, volume: real, mean: real):
+        size = wp.max(wp.abs(volume), least * wp.pow(x[0, 1], real(1.5)))
+        return real(1.0) / (size * size)
+
+    return KernelFunctions("volume", 1, square(), measure, linearised, weight=weight)
 
 
 @cache
@@ -88,24 +117,32 @@ def kernels() -> SimpleNamespace:
         return found
 
     @wp.func
-    def enclosed(face: wp.vec3i, v: int, x: wp.array[vec3], middle: vec3, normal: wp.array[vec3]):
+    def enclosed(face: wp.vec3i, v: int, x: wp.array[vec3], middle: vec3, closed: bool, normal: wp.array[vec3]):
         """The volume between a face and the middle; its gradient, with a fixed middle, is added if wanted."""
         p = x[place(v, face[0])] - middle
         q = x[place(v, face[1])] - middle
         r = x[place(v, face[2])] - middle
-        to_p = sixth * wp.cross(q, r)
+        to_p = sixth * wp.cross(q - p, r - p)
+        found = wp.dot(p, to_p)
         if normal:
+            # Where the surface is closed, what the normal of a face lacks of the gradient adds up to nothing.
+            to_q = to_p
+            to_r = to_p
+            if not closed:
+                to_p = sixth * wp.cross(q, r)
+                to_q = sixth * wp.cross(r, p)
+                to_r = sixth * wp.cross(p, q)
             wp.atomic_add(normal, place(v, face[0]), to_p)
-            wp.atomic_add(normal, place(v, face[1]), sixth * wp.cross(r, p))
-            wp.atomic_add(normal, place(v, face[2]), sixth * wp.cross(p, q))
-        return wp.dot(p, to_p)
+            wp.atomic_add(normal, place(v, face[1]), to_q)
+            wp.atomic_add(normal, place(v, face[2]), to_r)
+        return found
 
     @wp.kernel(module=module, enable_backward=False)
     def sizes(
         faces: wp.array[wp.vec3i], n_vertices: int, x: wp.array[vec3], centre: wp.array[vec3],
-        volume: wp.array[real], area: wp.array[real], normal: wp.array[vec3], threads: int,
+        found: wp.array[vec3], area: int, normal: wp.array[vec3], threads: int,
     ):  # fmt: skip
-        """The volume, and its gradient; the area. The latter two are left out where there are no arrays for them."""
+        """The volume, and the area if wanted, of each shape in the second of two; and the volume's gradient."""
         i = wp.tid()
         s = i // threads
         v = s * n_vertices
@@ -114,14 +151,12 @@ def kernels() -> SimpleNamespace:
         surface = real(0.0)
         for k in range(i - s * threads, faces.shape[0], threads):
             face = faces[place(k, 0)]
-            inside += enclosed(face, v, x, middle, normal)
-            if area:
+            inside += enclosed(face, v, x, middle, not centre, normal)
+            if area > 0:
                 p = x[place(v, face[0])]
                 q = x[place(v, face[1])]
                 surface += half * length_of(wp.cross(q - p, x[place(v, face[2])] - p))
-        wp.atomic_add(volume, s, inside)
-        if area:
-            wp.atomic_add(area, s, surface)
+        wp.atomic_add(found, 2 * s + 1, vec3(inside, surface, real(0.0)))
 
     @wp.func
     def area_of(p: vec3, q: vec3, r: vec3, factor: real):
@@ -130,15 +165,16 @@ def kernels() -> SimpleNamespace:
     @wp.kernel(module=module)
     def sizes_back(
         faces: wp.array[wp.vec3i], n_vertices: int, x: wp.array[vec3], centre: wp.array[vec3],
-        to_volume: wp.array[real], to_area: wp.array[real], to_normal: wp.array[vec3], to_x: wp.array[vec3],
-        to_centre: wp.array[vec3], threads: int,
+        to_sizes: wp.array[vec3], to_normal: wp.array[vec3], to_x: wp.array[vec3], to_centre: wp.array[vec3],
+        threads: int,
     ):  # fmt: skip
-        """Adds the gradients; what the area or the normals receive may be left out."""
+        """Adds the gradients; what the normals receive may be left out."""
         i = wp.tid()
         s = i // threads
         v = s * n_vertices
         middle = middle_of(x, v, centre, s, faces[0][0])
-        inside = to_volume[s]
+        inside = to_sizes[2 * s + 1][0]
+        surface = to_sizes[2 * s + 1][1]
         to_p = vec3()
         to_q = vec3()
         to_r = vec3()
@@ -155,8 +191,8 @@ def kernels() -> SimpleNamespace:
             of_p = sixth * (inside * wp.cross(q, r) + wp.cross(to_q, r) + wp.cross(q, to_r))
             of_q = sixth * (inside * wp.cross(r, p) + wp.cross(to_r, p) + wp.cross(r, to_p))
             of_r = sixth * (inside * wp.cross(p, q) + wp.cross(to_p, q) + wp.cross(p, to_q))
-            if to_area:
-                more_p, more_q, more_r, _0 = wp.grad(area_of)(p, q, r, to_area[s])
+            if surface != real(0.0):
+                more_p, more_q, more_r, _0 = wp.grad(area_of)(p, q, r, surface)
                 of_p += more_p
                 of_q += more_q
                 of_r += more_r

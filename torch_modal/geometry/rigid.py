@@ -135,11 +135,11 @@ def looks_mirrored(first: Tensor, second: Tensor, faces: Tensor) -> Tensor:
     return gain > MIRRORED * total
 
 
-def signed_volumes(x: Tensor, corners: Tensor) -> Tensor:
+def signed_volumes(x: Tensor, faces: Tensor) -> Tensor:
     """Volumes of closed shapes: heights of their faces over a plane, times areas in it.
 
-    *Shape:* ``(..., V, 3), (3, F) -> (...)``.
+    *Shape:* ``(..., V, 3), (F, 3) -> (...)``.
     """
-    x, y, z = x.mT.contiguous().unbind(-2)
+    corners, (x, y, z) = faces.T.long(), x.mT.contiguous().unbind(-2)
     (xa, xb, xc), (ya, yb, yc), (za, zb, zc) = ([pick(row, corner) for corner in corners] for row in (x, y, z))
     return ((za + zb + zc) * ((xb - xa) * (yc - ya) - (xc - xa) * (yb - ya))).sum(-1) / 6

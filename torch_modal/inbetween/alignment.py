@@ -45,7 +45,7 @@ class KeyframeAlignment(nn.Module):
     roots: Tensor
     rooted: Tensor
     extent: Tensor
-    corners: Tensor
+    faces: Tensor
 
     def __init__(self, references: Tensor, mesh: Connectivity, backend: TorchBackend) -> None:
         super().__init__()
@@ -70,8 +70,7 @@ class KeyframeAlignment(nn.Module):
         extent = (self.reference.amax(0) - self.reference.amin(0)).norm()
         #: Diagonal of the bounding box of the first reference.
         self.register_buffer("extent", extent, persistent=False)
-        #: Of the faces. *Shape:* ``(3, F)``.
-        self.register_buffer("corners", torch.tensor(mesh.faces).T.contiguous(), persistent=False)
+        self.register_buffer("faces", torch.tensor(mesh.faces).int(), persistent=False)
         self.closed = len(mesh.boundary_edges) == 0
         self.size_warned = False
 
@@ -97,7 +96,7 @@ class KeyframeAlignment(nn.Module):
         x, usable = self.checked(keyframes.mT.contiguous())
         turned, pose = self._aligned(x, weights)
         shapes = turned.mT.contiguous()
-        usable = usable & ~self.mirrored(turned.detach().mT, weights)
+        usable = usable & ~self.mirrored(shapes.detach(), weights)
         return shapes, pose, ((usable | (weights == 0)) & known).all(1)
 
     def checked(self, keyframes: Tensor) -> tuple[Tensor, Tensor]:
@@ -135,13 +134,13 @@ class KeyframeAlignment(nn.Module):
         """True for mirror images of the heaviest, of closed surfaces. *Shape:* ``(B, K, V, 3), (B, K) -> (B, K)``."""
         if not self.closed:
             return torch.zeros_like(weights, dtype=torch.bool)
-        volumes, heaviest = self.signed_volumes(shapes, self.corners), weights.argmax(1, keepdim=True)
+        volumes, heaviest = self.signed_volumes(shapes, self.faces), weights.argmax(1, keepdim=True)
         turned = volumes * volumes.gather(1, heaviest) < 0
         if plain(turned) and not turned.any():
             return turned
         first = shapes.take_along_dim(heaviest[..., None, None], 1).expand_as(shapes)
         own, of = first.flatten(0, 1), shapes.flatten(0, 1)
-        return turned & looks_mirrored(own, of, self.corners.T).view_as(turned)
+        return turned & looks_mirrored(own, of, self.faces.long()).view_as(turned)
 
     def _warn_of_size(self, sizes: Tensor) -> None:
         """Say, once for a layer, that key-frames and bases seem to be in different units."""

@@ -115,6 +115,18 @@ def _common(f: KernelFunctions) -> SimpleNamespace:
         m = f.measure(e)
         return potential.moments(m, pull * f.weight(e, m, mean))
 
+    if f.uses_mean:
+
+        @wp.func
+        def mean_of(whole: wp.array[real], r: int, n_elements: int):
+            return whole[r] / real(n_elements)
+
+    else:
+
+        @wp.func
+        def mean_of(whole: wp.array[real], r: int, n_elements: int):
+            return real(0.0)
+
     if fullness is None:
 
         @wp.func
@@ -267,7 +279,7 @@ def convex(f: KernelFunctions, rider: KernelFunctions | None) -> SimpleNamespace
             middle = middle_of(x, v, centre, s, faces[0][0])
             volume = real(0.0)
             for k in range(i - s * threads, faces.shape[0], threads):
-                volume += enclosed(faces[place(k, 0)], v, x, middle, normal)
+                volume += enclosed(faces[place(k, 0)], v, x, middle, not centre, normal)
             wp.atomic_add(inside, s, volume)
 
     @kernel
@@ -365,11 +377,11 @@ def _merging(f: KernelFunctions, module: "wp.Module") -> dict[str, "wp.Kernel"]:
     c, potential = _common(f), f.potential
     corners, edge_vectors, record, sums = c.corners, c.edge_vectors, potential.record, potential.sums
     kernel = _kernel(f, module)
-    fullness, softness, contribution = c.fullness, c.softness, c.contribution
+    fullness, softness, contribution, mean_of = c.fullness, c.softness, c.contribution, c.mean_of
 
     @kernel
     def merge(
-        elements: wp.array[corners], n_vertices: int, x: wp.array[vec3], pulls: wp.array[real], means: wp.array[real],
+        elements: wp.array[corners], n_vertices: int, x: wp.array[vec3], pulls: wp.array[real], whole: wp.array[real],
         stiffness: wp.array[real], start: wp.array[vec3], altitude: real, relative: int, n_shapes: int,
         n_stiffness: int, out: wp.array[record], constant: wp.array[real], threads: int,
     ):  # fmt: skip
@@ -383,7 +395,7 @@ def _merging(f: KernelFunctions, module: "wp.Module") -> dict[str, "wp.Kernel"]:
             usual = real(0.0)
             for r in range(s * n_shapes, (s + 1) * n_shapes):
                 e = edge_vectors(x, r * n_vertices, q)
-                found += contribution(e, pulls[r], means[r])
+                found += contribution(e, pulls[r], mean_of(whole, r, elements.shape[0]))
                 if relative > 0:
                     usual += pulls[r] * fullness(e, altitude)
             factor = stiffness[place(s * n_stiffness, wp.min(k, n_stiffness - 1))]
@@ -416,7 +428,7 @@ def _merging_back(f: KernelFunctions, module: "wp.Module") -> "wp.Kernel":
     """The adjoint of ``merge``."""
     c, potential = _common(f), f.potential
     corners, edge_vectors, add, sums = c.corners, c.edge_vectors, c.add, potential.sums
-    fullness, softness, contribution = c.fullness, c.softness, c.contribution
+    fullness, softness, contribution, mean_of = c.fullness, c.softness, c.contribution, c.mean_of
     packed, row, weight_of = potential.packed, potential.row, f.weight
 
     @wp.func
@@ -429,7 +441,7 @@ def _merging_back(f: KernelFunctions, module: "wp.Module") -> "wp.Kernel":
 
     @wp.kernel(module=module)
     def merge(
-        elements: wp.array[corners], n_vertices: int, x: wp.array[vec3], pulls: wp.array[real], means: wp.array[real],
+        elements: wp.array[corners], n_vertices: int, x: wp.array[vec3], pulls: wp.array[real], whole: wp.array[real],
         stiffness: wp.array[real], start: wp.array[vec3], altitude: real, relative: int, n_shapes: int,
         n_stiffness: int, to_out: wp.array[row], to_x: wp.array[vec3], to_pulls: wp.array[real],
         to_stiffness: wp.array[real], to_start: wp.array[vec3], threads: int,
@@ -443,7 +455,7 @@ def _merging_back(f: KernelFunctions, module: "wp.Module") -> "wp.Kernel":
             usual = real(0.0)
             for r in range(s * n_shapes, (s + 1) * n_shapes):
                 e = edge_vectors(x, r * n_vertices, q)
-                found += contribution(e, pulls[r], means[r])
+                found += contribution(e, pulls[r], mean_of(whole, r, elements.shape[0]))
                 if relative > 0:
                     usual += pulls[r] * fullness(e, altitude)
             at = place(s * n_stiffness, wp.min(k, n_stiffness - 1))
@@ -466,9 +478,10 @@ def _merging_back(f: KernelFunctions, module: "wp.Module") -> "wp.Kernel":
             for r in range(s * n_shapes, (s + 1) * n_shapes):
                 e = edge_vectors(x, r * n_vertices, q)
                 m, g = f.linearised(e)
-                weight = f.weight(e, m, means[r])
+                mean = mean_of(whole, r, elements.shape[0])
+                weight = f.weight(e, m, mean)
                 to_m, to_weight, _3 = wp.grad(of_measure)(m, pulls[r] * weight, to_sums)
-                of_e, of_m, _4 = wp.grad(weight_of)(e, m, means[r])
+                of_e, of_m, _4 = wp.grad(weight_of)(e, m, mean)
                 received_weight = pulls[r] * to_weight
                 to_e = received_weight * of_e
                 to_pull = weight * to_weight

@@ -38,6 +38,11 @@ def fused(operation: Operation, *given: Tensor) -> tuple[Tensor, ...]:
     return tuple(applied(_Fused, operation, [] if keep else None, *given))
 
 
+def by_torch(operation: Operation, *given: Tensor) -> tuple[Tensor, ...]:
+    """Likewise, without kernels."""
+    return operation.by_torch(*(x.double() for x in given))
+
+
 class _Fused(torch.autograd.Function):
     @staticmethod
     def forward(operation: Operation, kept: list[Any] | None, *given: Tensor) -> tuple[Tensor, ...]:

@@ -67,10 +67,10 @@ def load_kernels() -> None:
     """Load those of in-betweens without gradients, so that nobody waits for it later."""
     with _LOADING:
         elements, *_ = (importlib.import_module(f"{PACKAGE}.{name}") for name in ("elements", *IN_BETWEENS))
-        own = stretch.kernel_functions(), bend.kernel_functions()
-        for functions in own:
+        own = bend.kernel_functions(), stretch.kernel_functions()
+        for functions in (*own, volume.kernel_functions()):
             elements.forward(functions)
-        elements.convex(*reversed(own))
+        elements.convex(*own)
         volume.kernels()
         importlib.import_module("torch_modal.elastic.distortion").kernels()
         _load(PACKAGE)
