@@ -21,16 +21,16 @@ import torch
 import torch_modal as tm
 
 BOUNDS = {
-    "lines": 27960,
-    "lines of code": 17876,
+    "lines": 27998,
+    "lines of code": 17907,
     "files": 189,
-    "functions": 1629,
+    "functions": 1630,
     "named tuples": 54,
     "docstrings that begin with no noun": 6,
     "functions of in-between": 149,
     "files of in-between": 30,
-    "functions of in-between, forward and backward": 189,
-    "files of in-between, forward and backward": 31,
+    "functions of in-between, forward and backward": 185,
+    "files of in-between, forward and backward": 30,
     "functions of subdivide": 164,
     "files of subdivide": 35,
     "functions of making a layer": 141,

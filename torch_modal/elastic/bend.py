@@ -285,17 +285,19 @@ def kernel_functions() -> KernelFunctions:
         return found
 
     @wp.func
-    def full(e: vec3, tip: vec3, altitude: real):
-        longest = wp.max(wp.dot(e, e), wp.max(wp.dot(tip, tip), wp.dot(tip - e, tip - e)))
-        normal = wp.cross(e, tip)
-        squared = wp.dot(normal, normal)
-        found = real(0.0)
-        if longest > real(0.0):
-            found = squared / (squared + altitude * longest * longest)
-        return found
-
-    @wp.func
     def fullness(x: mat33, altitude: real):
-        return full(x[0], x[1], altitude) * full(x[0], x[2], altitude)
+        e = x[0]
+        base = wp.dot(e, e)
+        longest1 = wp.max(base, wp.max(wp.dot(x[1], x[1]), wp.dot(x[1] - e, x[1] - e)))
+        longest2 = wp.max(base, wp.max(wp.dot(x[2], x[2]), wp.dot(x[2] - e, x[2] - e)))
+        n1 = wp.cross(e, x[1])
+        n2 = wp.cross(e, x[2])
+        square1 = wp.dot(n1, n1)
+        square2 = wp.dot(n2, n2)
+        both = (square1 + altitude * longest1 * longest1) * (square2 + altitude * longest2 * longest2)
+        found = real(0.0)
+        if both > real(0.0):
+            found = square1 * square2 / both
+        return found
 
     return KernelFunctions("bend", 3, periodic(), measure, linearised, turned=turned, weight=weight, fullness=fullness)

@@ -110,8 +110,11 @@ class KernelVolume(KernelTerm):
 
     def __init__(self, part: OnMesh, mesh: Mesh, used: Tensor) -> None:
         super().__init__(part, volume.kernel_functions(), torch.tensor([[0, 1]]))
-        self.closed = len(mesh.connectivity.boundary_chain) == 0
-        self.register_buffer("faces", mesh.faces.int(), persistent=False)
+        chain = torch.tensor(mesh.connectivity.boundary_chain)
+        self.closed = len(chain) == 0
+        #: With those that close the surface, whose last corner is the centre, -1.
+        cones = torch.cat([chain.flip(1), torch.full_like(chain[:, :1], -1)], 1)
+        self.register_buffer("faces", torch.cat([mesh.faces, cones]).int(), persistent=False)
         self.register_buffer("used", used, persistent=False)
 
     def mean(self, x: Tensor) -> Tensor:
@@ -131,7 +134,8 @@ class KernelVolume(KernelTerm):
         if not self.closed:
             self._spread(-normal.sum(1), normal)
 
-    def _launch(self, name: str, x: Tensor, *given: Any) -> None:
+    def of_faces(self, name: str, x: Tensor, *given: Any) -> None:
+        """Run a kernel over the faces of so many samples."""
         kernel = getattr(made(volume.kernels), name)
         launch(kernel, (len(x), len(self.faces)), [self.faces, x.shape[1], x, self.centre(x), *given])
 
@@ -141,7 +145,7 @@ class KernelVolume(KernelTerm):
         Gradients are added where they are wanted. *Shape:* ``(B, V, 3) -> (B, 2, 3)``.
         """
         found = x.new_zeros(len(x), 2, 3)
-        self._launch("sizes", x, found, int(area), normal)
+        self.of_faces("sizes", x, found, int(area), normal)
         if normal is not None:
             self.through_centre(normal)
         return found
@@ -155,7 +159,7 @@ class KernelVolume(KernelTerm):
         if to_normal is not None and not self.closed:
             to_normal = (to_normal - self.mean(to_normal)[:, None]).contiguous()
         to_centre = None if self.closed else x.new_zeros(len(x), 3)
-        self._launch("sizes_back", x, to_sizes, to_normal, to_x, to_centre)
+        self.of_faces("sizes_back", x, to_sizes, to_normal, to_x, to_centre)
         if to_centre is not None:
             self._spread(to_centre, to_x)
 

@@ -317,22 +317,13 @@ class KernelModalEnergy(ModalEnergy):
             for part, record in terms:
                 hessians = x.new_empty(b, len(part.elements), (3 * part.functions.n) ** 2)
                 part.launch("hessians", b, n_vertices, x, record, hessians, back=True)
-                self._curve(part.elements, hessians, blocks, pushed)
+                curve, local = of_elements("curving", part.functions.n).curved, (part.elements, hessians)
+                launch(curve, (b, len(part.elements)), [*local, n_vertices + 1, blocks, n_blocks, pushed])
             for i in kernels.volumes:
-                part = kernels.parts[i].part
-                local = part.term.hessians(part.edge_vectors(self.energy.extend(x.movedim(-1, 0)))) * moment[:, None]
-                hessians = local.permute(4, 5, 0, 1, 2, 3).flatten(2).contiguous()
-                self._curve(part.corners.T.int().contiguous(), hessians, blocks, pushed)
+                kernels.parts[i].of_faces("curved", x, moment, blocks, n_blocks, pushed)
             curved = (blocks.mT @ pushed)[:, :n, :n]
         value = value + to.constant
         return Derivatives(value, gradient, inner, curved, rounding * (stiffest * stiffness).sqrt())
-
-    @staticmethod
-    def _curve(elements: Tensor, hessians: Tensor, blocks: Tensor, pushed: Tensor) -> None:
-        """Second derivatives of elements on the columns are added. *Shape:* ``(M, n), (B, M, h)``."""
-        given = elements, hessians, len(blocks) // 3, blocks, blocks.shape[1] // _BLOCK, pushed
-        kernel = of_elements("curving", elements.shape[1] - 1).curved
-        launch(kernel, (len(hessians), len(elements)), given)
 
     def value_and_gradient(self, a: Tensor, placement: Placement) -> tuple[Tensor, Tensor]:
         """As in the base class."""

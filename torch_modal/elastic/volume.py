@@ -103,7 +103,7 @@ def kernels() -> SimpleNamespace:
     """Volumes as above, with their gradients, and the adjoint."""
     import warp as wp
 
-    from torch_modal.elastic.kernels.types import length_of, place
+    from torch_modal.elastic.kernels.types import length_of, place, wide
 
     real, vec3, module = wp.float64, wp.vec3d, wp.get_module("torch_modal.elastic.kernels.volume")
     half, sixth = wp.constant(real(0.5)), wp.constant(real(1 / 6))
@@ -117,25 +117,27 @@ def kernels() -> SimpleNamespace:
         return found
 
     @wp.func
-    def enclosed(face: wp.vec3i, v: int, x: wp.array[vec3], middle: vec3, closed: bool, normal: wp.array[vec3]):
-        """The volume between a face and the middle; its gradient, with a fixed middle, is added if wanted."""
-        p = x[place(v, face[0])] - middle
-        q = x[place(v, face[1])] - middle
-        r = x[place(v, face[2])] - middle
-        to_p = sixth * wp.cross(q - p, r - p)
-        found = wp.dot(p, to_p)
-        if normal:
-            # Where the surface is closed, what the normal of a face lacks of the gradient adds up to nothing.
-            to_q = to_p
-            to_r = to_p
-            if not closed:
-                to_p = sixth * wp.cross(q, r)
-                to_q = sixth * wp.cross(r, p)
-                to_r = sixth * wp.cross(p, q)
-            wp.atomic_add(normal, place(v, face[0]), to_p)
-            wp.atomic_add(normal, place(v, face[1]), to_q)
-            wp.atomic_add(normal, place(v, face[2]), to_r)
+    def corner(x: wp.array[vec3], middle: vec3, v: int, last: int):
+        """The last corner of a face: a vertex, or the middle."""
+        found = middle
+        if last >= 0:
+            found = x[place(v, last)]
         return found
+
+    @wp.func
+    def enclosed(face: wp.vec3i, v: int, x: wp.array[vec3], middle: vec3, normal: wp.array[vec3]):
+        """The volume between a face and the middle; its gradient, with a fixed middle, is added if wanted.
+
+        The faces around a vertex close, so that each gives a sixth of its normal to its corners.
+        """
+        p = x[place(v, face[0])]
+        found = sixth * wp.cross(x[place(v, face[1])] - p, corner(x, middle, v, face[2]) - p)
+        if normal:
+            wp.atomic_add(normal, place(v, face[0]), found)
+            wp.atomic_add(normal, place(v, face[1]), found)
+            if face[2] >= 0:
+                wp.atomic_add(normal, place(v, face[2]), found)
+        return wp.dot(p - middle, found)
 
     @wp.kernel(module=module, enable_backward=False)
     def sizes(
@@ -151,8 +153,8 @@ def kernels() -> SimpleNamespace:
         surface = real(0.0)
         for k in range(i - s * threads, faces.shape[0], threads):
             face = faces[place(k, 0)]
-            inside += enclosed(face, v, x, middle, not centre, normal)
-            if area > 0:
+            inside += enclosed(face, v, x, middle, normal)
+            if area > 0 and face[2] >= 0:
                 p = x[place(v, face[0])]
                 q = x[place(v, face[1])]
                 surface += half * length_of(wp.cross(q - p, x[place(v, face[2])] - p))
@@ -173,34 +175,68 @@ def kernels() -> SimpleNamespace:
         s = i // threads
         v = s * n_vertices
         middle = middle_of(x, v, centre, s, faces[0][0])
-        inside = to_sizes[2 * s + 1][0]
+        inside = sixth * to_sizes[2 * s + 1][0]
         surface = to_sizes[2 * s + 1][1]
-        to_p = vec3()
-        to_q = vec3()
-        to_r = vec3()
+        to_all = vec3()
         received = vec3()
         for k in range(i - s * threads, faces.shape[0], threads):
             face = faces[place(k, 0)]
-            if to_normal:
-                to_p = to_normal[place(v, face[0])]
-                to_q = to_normal[place(v, face[1])]
-                to_r = to_normal[place(v, face[2])]
             p = x[place(v, face[0])] - middle
             q = x[place(v, face[1])] - middle
-            r = x[place(v, face[2])] - middle
-            of_p = sixth * (inside * wp.cross(q, r) + wp.cross(to_q, r) + wp.cross(q, to_r))
-            of_q = sixth * (inside * wp.cross(r, p) + wp.cross(to_r, p) + wp.cross(r, to_p))
-            of_r = sixth * (inside * wp.cross(p, q) + wp.cross(to_p, q) + wp.cross(p, to_q))
-            if surface != real(0.0):
+            r = corner(x, middle, v, face[2]) - middle
+            if to_normal:
+                to_all = to_normal[place(v, face[0])] + to_normal[place(v, face[1])]
+                if face[2] >= 0:
+                    to_all += to_normal[place(v, face[2])]
+                to_all = sixth * to_all
+            of_p = inside * wp.cross(q, r) + wp.cross(q - r, to_all)
+            of_q = inside * wp.cross(r, p) + wp.cross(r - p, to_all)
+            of_r = inside * wp.cross(p, q) + wp.cross(p - q, to_all)
+            if surface != real(0.0) and face[2] >= 0:
                 more_p, more_q, more_r, _0 = wp.grad(area_of)(p, q, r, surface)
                 of_p += more_p
                 of_q += more_q
                 of_r += more_r
             wp.atomic_add(to_x, place(v, face[0]), of_p)
             wp.atomic_add(to_x, place(v, face[1]), of_q)
-            wp.atomic_add(to_x, place(v, face[2]), of_r)
-            received += of_p + of_q + of_r
+            received += of_p + of_q
+            if face[2] >= 0:
+                wp.atomic_add(to_x, place(v, face[2]), of_r)
+                received += of_r
         if to_centre:
             wp.atomic_add(to_centre, s, -received)
 
-    return SimpleNamespace(module=module, sizes=sizes, sizes_back=sizes_back, middle_of=middle_of, enclosed=enclosed)
+    @wp.func
+    def columns_of(columns: wp.array[wide], v: int, n_blocks: int, b: int):
+        at = place(3 * n_blocks * v, b)
+        return wp.matrix_from_rows(columns[at], columns[place(at, n_blocks)], columns[place(at, 2 * n_blocks)])
+
+    @wp.kernel(module=module, enable_backward=False)
+    def curved(
+        faces: wp.array[wp.vec3i], n_vertices: int, x: wp.array[vec3], centre: wp.array[vec3], moment: wp.array[real],
+        columns: wp.array[wide], n_blocks: int, out: wp.array[wide], threads: int,
+    ):  # fmt: skip
+        """The volume's Hessian times its moment on columns of vertices and the centre, added."""
+        i = wp.tid()
+        s = i // threads
+        v = s * n_vertices
+        middle = middle_of(x, v, centre, s, faces[0][0])
+        for k in range(i - s * threads, faces.shape[0], threads):
+            face = faces[place(k, 0)]
+            if face[2] < 0:
+                face[2] = n_vertices
+            p = sixth * moment[s] * x[place(v, face[0])]
+            q = sixth * moment[s] * x[place(v, face[1])]
+            r = sixth * moment[s] * corner(x, middle, v, faces[place(k, 0)][2])
+            for b in range(n_blocks):
+                found = wp.skew(r - q) @ columns_of(columns, face[0], n_blocks, b)
+                found += wp.skew(p - r) @ columns_of(columns, face[1], n_blocks, b)
+                found += wp.skew(q - p) @ columns_of(columns, face[2], n_blocks, b)
+                for j in range(3):
+                    to = place(3 * n_blocks * (s * (n_vertices + 1) + face[j]), b)
+                    for a in range(3):
+                        wp.atomic_add(out, place(to, a * n_blocks), found[a])
+
+    return SimpleNamespace(
+        module=module, sizes=sizes, sizes_back=sizes_back, curved=curved, middle_of=middle_of, enclosed=enclosed
+    )

@@ -279,7 +279,7 @@ def convex(f: KernelFunctions, rider: KernelFunctions | None) -> SimpleNamespace
             middle = middle_of(x, v, centre, s, faces[0][0])
             volume = real(0.0)
             for k in range(i - s * threads, faces.shape[0], threads):
-                volume += enclosed(faces[place(k, 0)], v, x, middle, not centre, normal)
+                volume += enclosed(faces[place(k, 0)], v, x, middle, normal)
             wp.atomic_add(inside, s, volume)
 
     @kernel

@@ -184,9 +184,9 @@ def sign_votes(
 
 
 @wp.func
-def pulls_between(at: packed_turn, q: vec4, w: wp.vec2d, c: vec3):
+def pulls_between(at: packed_turn, half: vec3, w: wp.vec2d, c: vec3):
     """Pulls of the sides of a triangle between two shapes on its corners, with stiffnesses of the sides."""
-    part = about(w[1] * half_turn(q))
+    part = about(w[1] * half)
     s = sides(wp.quat_rotate(part, at[0]), wp.quat_rotate(part, at[1]), w[0] * at[2] + w[1] * at[3])
     return wp.matrix_from_rows(c[2] * s[2] - c[0] * s[0], c[0] * s[0] - c[1] * s[1], c[1] * s[1] - c[2] * s[2])
 
@@ -199,8 +199,8 @@ def at_sides(surface: FaceTables, shares: wp.array[vec3], stiffness: wp.array[re
 
 
 @wp.func
-def pulled(at: packed_turn, q: vec4, w: wp.vec2d, stiffness: vec3, to: wp.mat33d):
-    return wp.ddot(pulls_between(at, q, w, stiffness), to)
+def pulled(at: packed_turn, half: vec3, w: wp.vec2d, stiffness: vec3, to: wp.mat33d):
+    return wp.ddot(pulls_between(at, half, w, stiffness), to)
 
 
 @wp.kernel(enable_backward=False)
@@ -214,9 +214,8 @@ def part_turned(
     s = i // threads
     for k in range(i - s * threads, surface.faces.shape[0], threads):
         at = place(s * surface.faces.shape[0], k)
-        found = pulls_between(
-            given[at], sign[at] * quaternions[at], weights[s], at_sides(surface, shares, stiffness, k)
-        )
+        half = half_turn(sign[at] * quaternions[at])
+        found = pulls_between(given[at], half, weights[s], at_sides(surface, shares, stiffness, k))
         for j in range(3):
             wp.atomic_add(pulls, place(s * surface.n_vertices, surface.faces[place(k, 0)][j]), found[j])
 

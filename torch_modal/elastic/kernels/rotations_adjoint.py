@@ -11,12 +11,13 @@ from torch_modal.elastic.kernels.rotations import (
     FaceTables,
     at_sides,
     corners,
+    half_turn,
     pulled,
     quaternion,
     to_corners,
     triangle,
 )
-from torch_modal.elastic.kernels.types import HALF, place, real, vec3
+from torch_modal.elastic.kernels.types import HALF, TINIEST, place, real, vec3
 
 mean_pose = wp.kernel(procrustes.mean_pose.func, module=__name__)
 trajectory_edges = wp.kernel(rotations.trajectory_edges.func, module=__name__)
@@ -29,11 +30,16 @@ def gradients(first: wp.mat33d, second: wp.mat33d, sign: real, w: wp.vec2d, stif
     b, there = triangle(second)
     q = sign * quaternion(wp.transpose(b) @ a)
     at = wp.matrix_from_rows(a[0], a[1], here, there)
-    to_at, to_q, to_w, _stiffness, _to = wp.grad(pulled)(at, q, w, stiffness, to)
-    # The torque on the rotation, and back in the first shape.
+    half = half_turn(q)
+    to_at, to_half, to_w, _stiffness, _to = wp.grad(pulled)(at, half, w, stiffness, to)
+    # By hand, as ``wp.grad`` takes the arc twice more.
     axis = vec3(q[1], q[2], q[3])
-    to_axis = vec3(to_q[1], to_q[2], to_q[3])
-    torque = HALF * (q[0] * to_axis - to_q[0] * axis + wp.cross(axis, to_axis))
+    square = wp.max(wp.dot(axis, axis), TINIEST)
+    scale = wp.where(square > TINIEST, wp.dot(half, axis) / square, real(1.0))
+    along = wp.dot(axis, to_half)
+    to_axis = scale * to_half + ((q[0] - scale) / square * along) * axis
+    # The torque on the rotation, and back in the first shape.
+    torque = HALF * (q[0] * to_axis + along * axis + wp.cross(axis, to_axis))
     twice = real(2.0) * wp.cross(torque, axis)
     own = wp.cross(a[0], to_at[0]) + wp.cross(a[1], to_at[1]) - torque - q[0] * twice + wp.cross(axis, twice)
     return to_corners(a, here, own, to_at[2]), to_corners(b, there, torque, to_at[3]), to_w
