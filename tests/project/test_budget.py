@@ -21,8 +21,8 @@ import torch
 import torch_modal as tm
 
 BOUNDS = {
-    "lines": 27998,
-    "lines of code": 17907,
+    "lines": 28001,
+    "lines of code": 17909,
     "files": 189,
     "functions": 1630,
     "named tuples": 54,

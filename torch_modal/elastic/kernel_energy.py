@@ -216,6 +216,8 @@ class Pass(nn.Module):
             alone = torch.cat([edges, edges[:, :1].expand(-1, n - 2)], 1)
             elements = torch.where((own < 0)[:, None], alone, elements[own.clamp_min(0)]).contiguous()
         self.kernels = None
+        #: Of the factors.
+        self.sizes = [None if part is None else part.size_of_factors for part in (self.term, self.rider)]
         self.n_elements, self.n_own = len(elements), self.term.n_elements
         self.register_buffer("elements", elements, persistent=False)
         self.register_buffer("own", None if own is None else own.int(), persistent=False)
@@ -232,14 +234,13 @@ class Pass(nn.Module):
 
     def linearise(
         self, x: Tensor, records: Sequence[Tensor], given: tuple[Any, ...], hessian: bool, volume: tuple[Any, ...]
-    ) -> tuple[Tensor | None, ...]:
+    ) -> list[Tensor | None]:
         """Energy and derivatives are added; arguments of the kernel. The factors, if wanted."""
-        own = x.new_empty(len(x), *self.term.size_of_factors) if hessian else None
-        other = x.new_empty(len(x), *self.rider.size_of_factors) if hessian and self.rider is not None else None
+        factors = [x.new_empty(len(x), *size) if hessian and size else None for size in self.sizes]
         others = None if self.other is None else records[self.other]
-        given = x.shape[1], x, records[self.number], others, *given, own, other, *volume
+        given = x.shape[1], x, records[self.number], others, *given, *factors, *volume
         self._launch("linearise", len(x), *given)
-        return own, other
+        return factors
 
     def product(self, dim: tuple[int, int], *given: Any) -> None:
         """Likewise."""
@@ -271,13 +272,14 @@ class KernelEnergy(nn.Module):
         parts: Its terms.
     """
 
+    parts: list[Any]
     volume: KernelVolume | None
     in_passes: list[Pass]
 
     def __init__(self, energy: Energy, parts: Sequence[KernelTerm]) -> None:
         super().__init__()
         self.energy = energy
-        self.parts: Any = nn.ModuleList(parts)
+        self.modules_of_parts = nn.ModuleList(parts)
         #: Numbers of the volume, and of the other terms.
         self.volumes = [i for i, part in enumerate(parts) if isinstance(part, KernelVolume)]
         self.terms = [i for i in range(len(parts)) if i not in self.volumes]
@@ -287,6 +289,7 @@ class KernelEnergy(nn.Module):
         #: The terms in passes over elements, each alone or with another that rides on it.
         self.passes: Any = nn.ModuleList(_passes(parts, energy.n_vertices))
         # Lists of modules are slow to index, and this is done at every evaluation.
+        self.__dict__["parts"] = [*parts]
         self.__dict__["volume"] = parts[self.volumes[0]] if self.volumes else None
         self.__dict__["in_passes"] = [*self.passes]
         #: Whether kernels know the adjoints of all terms.
