@@ -1,5 +1,7 @@
 """Shapes that meet observed points: distance, gradients, outliers, errors."""
 
+from typing import Any
+
 import pytest
 import torch
 from conftest import Shapes
@@ -90,34 +92,94 @@ def test_a_rigid_motion_of_the_points_moves_the_shape(space: tm.ShapeSpace, bars
     torch.testing.assert_close(batch.shape[0].double(), one.shape, rtol=0, atol=1e-4)
 
 
+@pytest.mark.parametrize("weighted", [False, True])
 def test_gradients_are_those_of_weights_and_pose(
-    space: tm.ShapeSpace, bars: Shapes, generator: torch.Generator
+    space: tm.ShapeSpace, bars: Shapes, generator: torch.Generator, weighted: bool
 ) -> None:
-    variation = space.variation()
-    picked = markers(bars.keyframes[1], 12)
+    variation, n, noise = space.variation(), 14, 0.02 * space.variation().size if weighted else 0.0
+    picked = markers(bars.keyframes[1], n)
     points = 0.5 * (bars.keyframes[1] + bars.keyframes[2])[picked]
+    weights = torch.ones(n, dtype=DOUBLE)
+    if weighted:
+        weights = torch.rand(n, generator=generator, dtype=DOUBLE) + 0.5
+        weights[[2, 9]], points[2] = 0, torch.nan
+    seen = weights > 0
     about = torch.full((3,), 1 / 3, dtype=DOUBLE)
     taken = torch.randn(space.n_vertices, 3, generator=generator, dtype=DOUBLE)
     move = torch.randn(points.shape, generator=generator, dtype=DOUBLE)
 
     def assembled(points: Tensor) -> Tensor:
-        to = Observations(points, picked, torch.ones(len(points), dtype=DOUBLE))
-        given = LocalWeights(variation, to, about)
+        to = Observations(points[seen], picked[seen], weights[seen])
+        given = LocalWeights(variation, to, about, noise)
         x = given.shape(given.solved(False)[0])
-        return (best_fit(x[picked], points, to.weights).apply(x) * taken).sum()
+        return (to.pose(x).apply(x) * taken).sum()
 
     ends = [assembled(points + s * 1e-5 * move) for s in (1, -1)]
     expected = float(ends[0] - ends[1]) / 2e-5
     leaf = points.clone().requires_grad_()
-    found = space.fit(leaf, picked)
-    assert torch.equal(found.shape.detach(), space.fit(points, picked).shape)
+    found = space.fit(leaf, picked, weights=weights, noise=noise)
+    assert torch.equal(found.shape.detach(), space.fit(points, picked, weights=weights, noise=noise).shape)
     # The elastic steps are carried along by the pose; without them the gradient is exact.
     assembled(leaf).backward()
     assert leaf.grad is not None
     assert float((leaf.grad * move).sum()) == pytest.approx(expected, rel=1e-5)
     leaf.grad = None
-    (found.shape * taken).sum().backward()
+    ((found.shape * taken).sum() + found.misses.nansum()).backward()
+    assert torch.equal((leaf.grad == 0).all(-1), ~seen)  # not even of a point that is NaN
+    leaf.grad = None
+    (space.fit(leaf, picked, weights=weights, noise=noise).shape * taken).sum().backward()
     assert float((leaf.grad * move).sum()) == pytest.approx(expected, rel=0.2)
+
+
+def test_points_of_no_weight_are_never_read(space: tm.ShapeSpace, bars: Shapes) -> None:
+    picked = markers(bars.keyframes[1], 16)
+    points = (0.5 * (bars.keyframes[1] + bars.keyframes[2]))[picked]
+    seen = torch.ones(2, 16, dtype=torch.bool)
+    seen[0, 3], seen[1, [0, 8]] = False, False
+    both = points.repeat(2, 1, 1)
+    both[0, 3], both[1, 0] = torch.nan, torch.inf
+    found = space.fit(both, picked, weights=seen)
+    for i, own in enumerate(seen):
+        wanted = space.fit(points[own], picked[own])
+        assert all(torch.equal(one[i], other) for one, other in zip(found[:2], wanted[:2], strict=True))
+        assert torch.equal(found.misses[i, own], wanted.misses) and torch.equal(found.trust[i], own.double())
+    assert bool(found.misses[0, 3].isnan()) and bool(found.misses[1, 0].isinf())
+    torch.testing.assert_close(found.misses[1, 8], (found.shape[1, picked[8]] - points[8]).norm())
+    with torch.inference_mode():  # one set of points with two sets of weights
+        again = space.fit(points + 0, picked, weights=seen.double() + 0)
+    torch.testing.assert_close(again.shape, found.shape)
+    assert torch.equal(space.fit(points[None], picked, weights=seen[0].numpy()).shape, found.shape[:1])
+
+
+def test_a_weight_of_two_counts_as_two_points(space: tm.ShapeSpace, bars: Shapes) -> None:
+    variation = space.variation()
+    picked = markers(bars.keyframes[1], 10)
+    points = (0.5 * (bars.keyframes[1] + bars.keyframes[2]))[picked] - variation.origin
+    weights, about = torch.ones(10, dtype=DOUBLE), torch.full((3,), 1 / 3, dtype=DOUBLE)
+    weights[4] = 2
+    twice = torch.cat([torch.arange(10), torch.tensor([4])])
+    one = LocalWeights(variation, Observations(points, picked, weights), about).solved(False)[0]
+    doubled = Observations(points[twice], picked[twice], torch.ones(11, dtype=DOUBLE))
+    torch.testing.assert_close(one, LocalWeights(variation, doubled, about).solved(False)[0], rtol=0, atol=1e-6)
+
+
+def test_points_of_little_weight_are_not_taken_for_outliers(space: tm.ShapeSpace, bars: Shapes) -> None:
+    picked = markers(bars.keyframes[1], 16)
+    points, weights = bars.keyframes[1][picked].clone(), torch.ones(16, dtype=DOUBLE)
+    points[5, 1] += 0.05 * space.variation().size
+    weights[5] = 0.01  # so that its standard deviation is a tenth of the size
+    found = space.fit(points, picked, weights=weights, robust=True)
+    assert 0.003 < float(found.trust[5]) < 0.01
+    assert float(space.fit(points, picked, robust=True).trust[5]) < 0.2
+
+
+def test_noise_that_is_known(space: tm.ShapeSpace, bars: Shapes, generator: torch.Generator) -> None:
+    truth = tm.Blend(bars.bases, bars.faces)(bars.keyframes, torch.tensor([0.3, 0.4, 0.3], dtype=DOUBLE))
+    picked, noise = markers(truth), 0.03 * float((truth.amax(0) - truth.amin(0)).norm())
+    points = truth[picked] + noise * torch.randn(20, 3, generator=generator, dtype=DOUBLE)
+    plain, exact, known = (space.fit(points, picked, noise=own) for own in (None, 0, noise))
+    assert torch.equal(plain.shape, exact.shape)
+    assert float((known.shape - truth).norm(dim=-1).mean()) < 0.85 * float((plain.shape - truth).norm(dim=-1).mean())
 
 
 def test_outliers_are_ignored_if_asked(creature: tuple[tm.ShapeSpace, Tensor]) -> None:
@@ -210,7 +272,7 @@ def test_what_no_mixture_meets_falls_back_to_a_keyframe(
     "points, vertices, near, words",
     [
         (torch.zeros(2, 3), torch.tensor([0, 1]), None, "n of 3 or more"),
-        (torch.full((3, 3), torch.nan), torch.tensor([0, 1, 2]), None, "not finite"),
+        (torch.full((3, 3), torch.nan), torch.tensor([0, 1, 2]), None, "a weight of zero"),
         (torch.zeros(3, 3), torch.tensor([0, 1]), None, "one vertex index for each"),
         (torch.zeros(3, 3), torch.tensor([0, 1, 10**6]), None, "lie in 0 to 163"),
         (torch.zeros(3, 3), torch.tensor([0, 1, 1]), None, "three vertices"),
@@ -223,6 +285,24 @@ def test_arguments_that_do_not_fit(
 ) -> None:
     with pytest.raises(ValueError, match=words):
         space.fit(points, vertices, near=near)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    "given, words",
+    [
+        ({"weights": torch.ones(4)}, r"\(4,\) of \(2, 5, 3\)"),
+        ({"weights": torch.ones(3, 5)}, r"\(3, 5\) of \(2, 5, 3\)"),
+        ({"weights": torch.tensor([1.0, 1.0, 1.0, 1.0, -1.0])}, "none below zero; got -1.0 to 1.0"),
+        ({"weights": torch.tensor([1.0, 1.0, 1.0, 1.0, torch.nan])}, "finite"),
+        ({"weights": [[1, 1, 1, 1, 1], [1, 1, 0, 0, 0]]}, "set 1 of the points, got 2"),
+        ({"weights": [0, 0, 0, 1, 0]}, "set 0 of the points, got 1"),
+        ({"noise": -1.0}, "noise is a standard deviation"),
+        ({"noise": torch.nan}, "noise is a standard deviation"),
+    ],
+)
+def test_weights_and_noise_that_do_not_fit(space: tm.ShapeSpace, given: dict[str, Any], words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        space.fit(torch.zeros(2, 5, 3), torch.arange(5), **given)
 
 
 @pytest.mark.parametrize("scale", [1e3, 1e-3])

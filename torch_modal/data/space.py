@@ -245,7 +245,14 @@ class ShapeSpace:
         return self._made.get(settings, table)
 
     def fit(
-        self, points: Tensor, vertices: Tensor, *, near: int | Tensor | None = None, robust: bool = False
+        self,
+        points: Tensor,
+        vertices: Tensor,
+        *,
+        near: int | Tensor | None = None,
+        robust: bool = False,
+        weights: Tensor | None = None,
+        noise: float | None = None,
     ) -> Fitted:
         """The shape that meets observed points: weights of the key-frames that vary over the surface, then elasticity.
 
@@ -262,14 +269,19 @@ class ShapeSpace:
             near: A key-frame, or weights of all, *shape* ``(K,)``, that the shape is likely near to. Default: all
                 alike.
             robust: Whether points that fit nothing are ignored.
+            weights: Of the points, constants, none below zero; a weight of two counts as much as two points. Zero,
+                or False, is for points that were not seen, which may hold any number, NaN too. Each set needs three
+                vertices of weights above zero. *Shape:* ``(n,)`` or ``(..., n)``, broadcast against the points.
+            noise: Standard deviation of each coordinate of the points, in their units, if they are not exact. The
+                noisier they are, the closer the shape stays to what is likely.
 
         Returns:
             The shapes with their weights, and by how much they miss each point. Should the points be missed by more
-            than of a key-frame that is moved rigidly, it is that one.
+            than of a key-frame that is moved rigidly, it is that one. Points of weight zero have a trust of zero; the
+            shape's distance from them is a constant, and NaN where they are.
 
         Raises:
-            ValueError: There is only one key-frame, points, vertices or weights do not fit, or the points are in other
-                units.
+            ValueError: There is only one key-frame, an argument does not fit, or the points are in other units.
             RuntimeError: The points are within a transform of ``torch.func``, or have a tangent.
         """
-        return fit(self.variation(), points, vertices, near, robust)
+        return fit(self.variation(), points, vertices, near, robust, weights, noise)

@@ -2,15 +2,17 @@
 
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from torch_modal.autograd import transformed
 from torch_modal.contact.active import Pull
-from torch_modal.statistics.local_weights import LocalWeights, Observations
+from torch_modal.statistics.local_weights import NOISE, LocalWeights, Observations
 from torch_modal.statistics.variation import Variation, bounded
 
-# Stiffness of all pulls together, and of one at most, at a size of 100.
+# Stiffness of all pulls together, and of one at most, at a size of 100, for exact points. Like the precision of the
+# points, it falls with the square of their standard deviation.
 STIFFNESS, LARGEST_STIFFNESS = 2000.0, 100.0
 
 # Newton steps and products of the first elastic round, and of each of the next, with weights computed anew.
@@ -31,9 +33,9 @@ class Fitted(NamedTuple):
     weights: Tensor
     """Weights of the given shapes at each vertex, with sum one. *Shape:* ``(K, V)``."""
     misses: Tensor
-    """Distance of each observed point from its place. *Shape:* ``(n,)``."""
+    """Distance of each point from its place; a constant where the weight is zero, NaN of NaN. *Shape:* ``(n,)``."""
     trust: Tensor
-    """Final weight of each observation: less than one for outliers. *Shape:* ``(n,)``."""
+    """Final weight of each point: the given one, less for outliers. *Shape:* ``(n,)``."""
 
 
 def pull(to: Observations, stiffness: float, n_vertices: int) -> Pull:
@@ -45,7 +47,13 @@ def pull(to: Observations, stiffness: float, n_vertices: int) -> Pull:
 
 
 def fit(
-    variation: Variation, points: Tensor, vertices: Tensor, near: int | Tensor | None = None, robust: bool = False
+    variation: Variation,
+    points: Tensor,
+    vertices: Tensor,
+    near: int | Tensor | None = None,
+    robust: bool = False,
+    weights: Tensor | None = None,
+    noise: float | None = None,
 ) -> Fitted:
     """The shapes that meet observed points; see :meth:`torch_modal.ShapeSpace.fit`.
 
@@ -56,35 +64,40 @@ def fit(
     if torch.is_inference_mode_enabled():  # weights are found by gradients
         with torch.inference_mode(False), torch.no_grad():
             near = near.clone() if isinstance(near, Tensor) else near
-            return fit(variation, torch.as_tensor(points).clone(), torch.as_tensor(vertices).clone(), near, robust)
+            points, vertices = (torch.as_tensor(x).clone() for x in (points, vertices))
+            return fit(variation, points, vertices, near, robust, weights, noise)
     points = torch.as_tensor(points)
     if transformed(points):
         raise RuntimeError("fits have no forward mode, and no transforms of torch.func: take torch.autograd.grad")
     k, v = variation.shapes.shape[:2]
-    about, places = _checked_weights(near, k), _checked_vertices(points, vertices, v)
-    lead, n, found = points.shape[:-2], len(places), []
-    for own in points.reshape(lead.numel(), n, 3):
-        known = own.to("cpu", torch.float64)
-        to = Observations(known, places, torch.ones_like(known[:, 0]))
-        found.append(_fit_one(variation, to, about, robust))
+    noise = 0.0 if noise is None else float(noise)
+    if not 0 <= noise < torch.inf:
+        raise ValueError(f"noise is a standard deviation, zero or more, in the units of the points; got {noise}")
+    about, given = _checked_near(near, k), _checked(points, vertices, weights, v)
+    lead, n, found = given.points.shape[:-2], len(given.vertices), []
+    for own, counts in zip(given.points.reshape(-1, n, 3), given.weights.reshape(-1, n), strict=True):
+        to = Observations(own.to("cpu", torch.float64), given.vertices, counts)
+        found.append(_fit_one(variation, to, about, robust, noise))
     if not found:
         return Fitted(*(points.new_zeros(*lead, *shape) for shape in ((v, 3), (k, v), (n,), (n,))))
     return Fitted(*(torch.stack(part).view(*lead, *part[0].shape).to(points) for part in zip(*found, strict=True)))
 
 
-def _fit_one(variation: Variation, to: Observations, about: Tensor, robust: bool) -> Fitted:
+def _fit_one(variation: Variation, every: Observations, about: Tensor, robust: bool, noise: float) -> Fitted:
     """The shape that meets one set of points: of the weights of least cost, then after elastic steps of all vertices.
 
     The steps are constants of the graph. Where a given shape is nearer to the points, it is the result.
     """
+    seen = every.weights > 0
+    to = Observations(*(part[seen] for part in every))
     _check_units(variation, to)
-    given = LocalWeights(variation, to, about)
+    given = LocalWeights(variation, to, about, noise)
     factors, to = given.solved(robust)
     weights = given.weights(factors)
     assembled = variation.assembled(weights)
     pose = to.pose(assembled)
     with torch.no_grad():
-        stiffness = min(LARGEST_STIFFNESS, STIFFNESS / len(to.points))
+        stiffness = min(LARGEST_STIFFNESS, STIFFNESS / len(to.points)) * (NOISE * variation.size / given.noise) ** 2
         there = to._replace(points=variation.scale * pose.inverse().apply(to.points))
         pulls = pull(there, stiffness, len(assembled))
         own = bounded(weights)
@@ -102,7 +115,9 @@ def _fit_one(variation: Variation, to: Observations, about: Tensor, robust: bool
         own = torch.eye(len(errors)).to(x)[k, :, None].expand_as(own)
     else:
         shape = pose.apply(assembled + step)
-    return Fitted(shape, own, to.missed(shape), to.weights)
+    misses, trust = every.missed(shape).detach(), torch.zeros_like(every.weights)
+    misses[seen], trust[seen] = to.missed(shape), to.weights
+    return Fitted(shape, own, misses, trust)
 
 
 def _check_units(variation: Variation, to: Observations) -> None:
@@ -117,29 +132,42 @@ def _check_units(variation: Variation, to: Observations) -> None:
         )
 
 
-def _checked_vertices(points: Tensor, vertices: Tensor, n_vertices: int) -> Tensor:
-    """The observed vertices on the CPU; raises for points or vertices that do not fit."""
+def _checked(points: Tensor, vertices: Tensor, weights: Tensor | None, n_vertices: int) -> Observations:
+    """All sets, with vertices and weights on the CPU, *shape* ``(..., n)``; raises for what does not fit."""
     if points.dim() < 2 or points.shape[-1] != 3 or points.shape[-2] < 3 or not points.is_floating_point():
         raise ValueError(
             f"points are floating-point of the shape (..., n, 3), with n of 3 or more; got {tuple(points.shape)} of "
             f"{points.dtype}"
         )
-    if not bool(points.detach().isfinite().all()):
-        raise ValueError("points hold numbers that are not finite; leave out those that were not observed")
     numbers = torch.as_tensor(vertices).cpu()
     if numbers.shape != points.shape[-2:-1] or numbers.is_floating_point() or numbers.dtype == torch.bool:
         raise ValueError(
             f"vertices hold one vertex index for each of {points.shape[-2]} points; got {tuple(numbers.shape)} of "
             f"{numbers.dtype}"
         )
-    if len(numbers.unique()) < 3:
-        raise ValueError(f"a pose follows from three vertices or more; got {len(numbers.unique())}")
     if not bool(((numbers >= 0) & (numbers < n_vertices)).all()):
         raise ValueError(f"vertices lie in 0 to {n_vertices - 1}; got {int(numbers.min())} to {int(numbers.max())}")
-    return numbers.long()
+    given = torch.ones(len(numbers)) if weights is None else torch.as_tensor(weights).detach().cpu()
+    pairs = zip(reversed(given.shape[:-1]), reversed(points.shape[:-2]), strict=False)
+    if given.shape[-1:] != numbers.shape or not all(one == other or 1 in (one, other) for one, other in pairs):
+        raise ValueError(
+            f"weights are (..., n) of points (..., n, 3); got {tuple(given.shape)} of {tuple(points.shape)}"
+        )
+    if not bool(((given >= 0) & given.isfinite()).all()):
+        raise ValueError(f"weights are finite and none below zero; got {float(given.min())} to {float(given.max())}")
+    lead = torch.broadcast_shapes(given.shape, points.shape[:-1])
+    every = Observations(points.expand(*lead, 3), numbers.long(), given.double().expand(lead).clone())
+    seen = every.weights > 0
+    if not bool(every.points.detach()[seen.to(points.device)].isfinite().all()):
+        raise ValueError("points hold numbers that are not finite; give those that were not observed a weight of zero")
+    for index in np.ndindex(lead[:-1]):
+        if (n := len(numbers[seen[index]].unique())) < 3:
+            whose = f"in set {', '.join(map(str, index))} of the points, " if index else ""
+            raise ValueError(f"a pose follows from three vertices or more with weights above zero; {whose}got {n}")
+    return every
 
 
-def _checked_weights(near: int | Tensor | None, n: int) -> Tensor:
+def _checked_near(near: int | Tensor | None, n: int) -> Tensor:
     """Weights of n shapes; raises unless they add up to one. *Shape:* ``(n,)``, float64."""
     if near is None:
         return torch.full((n,), 1 / n, dtype=torch.float64)

@@ -1,5 +1,6 @@
 """Local weights of a set's shapes, and the rigid motion, that bring them closest to a few observed points."""
 
+import math
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -13,9 +14,9 @@ from torch_modal.geometry.triangle_frames import edge_means
 from torch_modal.statistics.fitting import levenberg_marquardt
 from torch_modal.statistics.variation import Variation
 
-# Standard deviation of observed points, in sizes of the shape, beside local weights of a standard deviation of one; and
-# larger ones that come first, relative to it: far from the points there are other minima, which a more certain prior
-# does not have.
+# Standard deviation, in sizes of the shape, of exact points from shapes of local weights, which have one of one: no
+# mixture is quite the pose that was seen. Noise of the points adds to it. Larger ones come first, relative to it: far
+# from the points there are other minima, which a more certain prior does not have.
 NOISE, COARSE_NOISE = 0.01, (10.0, 3.0)
 
 # Gauss-Newton steps for the weights, with coarse noise or changing weights and at last, and the part of the cost that
@@ -53,8 +54,8 @@ class LocalWeights:
     :math:`\sum_i |x_i(z) - p_i|^2 / s^2 + |z|^2`. The most likely weights are ``about``, *shape* ``(K,)``.
     """
 
-    def __init__(self, variation: Variation, to: Observations, about: Tensor) -> None:
-        self.variation, self.about, self.noise = variation, about, NOISE * variation.size
+    def __init__(self, variation: Variation, to: Observations, about: Tensor, noise: float = 0.0) -> None:
+        self.variation, self.about, self.noise = variation, about, math.hypot(NOISE * variation.size, noise)
         self.given, self.to = to, to._replace(points=to.points.detach())
         self.influence = self._influence()
 
@@ -92,7 +93,7 @@ class LocalWeights:
             factors = descended(noise * self.noise, FEW_STEPS)
         for _ in range(ROBUST_ROUNDS if robust else 0):
             # Observations that are missed by more than most have less weight (Geman and McClure).
-            missed = to.missed_at_best(self.shape(factors))
+            missed = self.to.weights.sqrt() * to.missed_at_best(self.shape(factors))
             usual = (3 * missed.median()).clamp_min(self.noise)
             to = to._replace(weights=self.to.weights / (1 + (missed / usual) ** 2) ** 2)
             factors = descended(self.noise, FEW_STEPS)
