@@ -36,6 +36,9 @@ class PointFile:
         except (ValueError, KeyError, IndexError) as error:
             raise ValueError(f"{path} is no PLY file of points with x, y and z: {error}") from error
         self._names = self._file.properties.keys()
+        self.n_faces = self._file.elements.get("face", (0,))[0]
+        #: *Shape:* ``(P, 3)``, or ``(P, 0)`` without normals.
+        self.normals = self._file.columns(*_NORMALS) if {*_NORMALS} <= self._names else self.positions[:, :0]
         self.is_splats = {*_QUATERNION, *_SCALES} <= self._names
         #: Properties of the harmonics above degree 0, one channel after the other.
         rest = [name for name in self._names if name.startswith("f_rest_")]
@@ -53,8 +56,8 @@ class PointFile:
         ``(P, 3), (P, 3, 3), (P, 3, 3)``.
         """
         new = dict(zip("xyz", positions.T, strict=True))
-        if {*_NORMALS} <= self._names:
-            turned = np.einsum("pij,pj->pi", rotations, self._file.columns(*_NORMALS))
+        if self.normals.size:
+            turned = np.einsum("pij,pj->pi", rotations, self.normals)
             new |= dict(zip(_NORMALS, turned.T, strict=True))
         if self.is_splats:
             # SciPy's quaternions have the scalar last, and a length.
