@@ -178,6 +178,40 @@ def test_numbers_become_colours_with_one_bar(tmp_path):
     assert Image.open(path).width > Image.open(plain_sheet).width + 50  # room for the bar
 
 
+def test_clouds_lie_where_their_shapes_are(tmp_path):
+    """Dots on the surface fill the same disc as the shape below; what lies outside is cut."""
+    dots = np.concatenate([trimesh.sample.sample_surface(BALL, 15_000, seed=0)[0], [[99.0, 0, 0]]])
+    points = [torch.tensor(dots * radius + [7, 1, 0]) for radius in (1, 1.5, 2)]
+    frames = growing(3) + np.array([7.0, 1, 0])
+    options = {"renderer": "matplotlib", "view": (0, 0), "up": "y", "columns": [0, 2]}
+    path = render_sequence({"ball": frames}, BALL.faces, tmp_path / "a.png", points={"seen": points}, **options)
+    image = np.asarray(Image.open(path).convert("RGB")).astype(int)
+    places = ndimage.find_objects(ndimage.label(ndimage.binary_closing(drawn(image), iterations=8))[0])
+    discs = [place for place in places if image[place].size > 30_000]
+    assert len(discs) == 4
+    clouds = sorted(discs, key=lambda place: (place[0].start > 505, place[1].start))
+    for (_, above), (_, below) in zip(clouds[:2], clouds[2:], strict=True):
+        assert (above.start, above.stop) == pytest.approx((below.start, below.stop), abs=4)
+    cloud = image[clouds[0]]
+    middle = cloud[len(cloud) // 2 - 9 : len(cloud) // 2 + 9, cloud.shape[1] // 2 - 9 : cloud.shape[1] // 2 + 9]
+    assert (middle[..., 0] - middle[..., 2]).mean() > 80  # given, not computed
+
+
+def test_near_dots_are_darker_and_hide_far_ones():
+    for order in ([0, 1, 2], [2, 1, 0]):
+        points = np.array([[0.0, 0, 1], [0, 0, -1], [0.5, 0.5, -1]])[order]
+        image = drawing.draw_points(points, (0.8, 0, 0), np.array([1.0, 1.0]), np.array([80, 80]))[..., 1]
+        assert image[40, 40] == 0 and 0 < image[20, 60] < 200 and image[60, 60] == 255
+
+
+def test_many_points_and_none_are_drawn():
+    half, pixels = np.array([1.0, 1.0]), np.array([40, 30])
+    many = np.random.default_rng(0).uniform(-2, 2, (300_000, 3))
+    image = drawing.draw_points(many, (0.5, 0, 0), half, pixels)
+    assert image.shape == (30, 40, 3) and (image[..., 1] < 200).mean() > 0.9
+    assert (drawing.draw_points(np.zeros((0, 3)), (0.5, 0, 0), half, pixels) == 255).all()
+
+
 def test_automatic_camera():
     """Which way is up, and from where a flat shape is seen, in three worlds."""
     plate = np.asarray(trimesh.creation.box((4, 6, 0.5)).vertices)  # stands in a Y-up world, faces Z
@@ -293,6 +327,8 @@ def test_pdf(tmp_path):
         ({"view": (0,)}, "azimuth and elevation"),
         ({"view": (0, float("inf"))}, "azimuth and elevation"),
         ({"up": "x"}, "up must be"),
+        ({"points": {"seen": [np.zeros((5, 3))] * 2}}, r"points\['seen'\] must be 3 clouds"),
+        ({"points": {"seen": [np.zeros((5, 2))] * 3}}, r"\(n, 3\), got \[\(5, 2\)"),
         ({"colors": {"b": np.zeros((3, 162))}}, "'b'.*does not have"),
         ({"colors": {"a": np.zeros((2, 162))}}, r"\(3, 162\).*\(2, 162\)"),
         ({"colors": {"a": np.full((3, 162), np.nan)}}, "finite"),

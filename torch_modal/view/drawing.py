@@ -108,6 +108,22 @@ def _draw_matplotlib(scene: Scene) -> ByteArray:
     return np.stack(images)
 
 
+def draw_points(points: FloatArray, color: tuple[float, ...], half_size: FloatArray, pixels: IntArray) -> ByteArray:
+    """Dots in view coordinates, near ones darker and over far ones. *Shape:* ``(n, 3) -> (height, width, 3)``."""
+    over, radius = 3, int(np.clip(180 / max(len(points), 1) ** 0.5, 4, 16))  # drawn larger, then averaged
+    disc = np.argwhere(np.hypot(*np.mgrid[-radius : radius + 1, -radius : radius + 1]) <= radius) - radius
+    points = points[:: len(points) // 20_000 + 1]
+    points = points[points[:, 2].argsort(kind="stable")]
+    centres = (points[:, :2] * [1, -1] / half_size + 1) / 2 * over * pixels
+    places = (centres[:, None] + disc).reshape(-1, 2).round()
+    inside = ((places >= 0) & (places < over * pixels)).all(axis=1)
+    x, y = places[inside].astype(np.int64).T
+    paint = 1 - np.linspace(0.4, 1, len(points))[:, None] * (1 - np.array(color))
+    image = np.ones((over * pixels[1], over * pixels[0], 3))
+    image[y, x] = np.repeat(paint, len(disc), axis=0)[inside]
+    return (255 * image.reshape(pixels[1], over, pixels[0], over, 3).mean(axis=(1, 3))).round().astype(np.uint8)
+
+
 def _child_command() -> list[str]:
     program = "import sys; sys.path.insert(0, sys.argv[1]); from torch_modal.view import drawing; drawing._child_main()"
     return [sys.executable, "-c", program, str(Path(__file__).parents[2])]

@@ -17,10 +17,11 @@ from torch_modal.arrays import Array, FloatArray, IntArray
 from torch_modal.io.files import write_file
 from torch_modal.io.formats import PICTURES
 from torch_modal.io.write import check_frames, check_indices, check_suffix, refuse_existing, to_numpy
-from torch_modal.view.drawing import ByteArray, Scene, draw
+from torch_modal.view.drawing import ByteArray, Scene, draw, draw_points
 
 KEYFRAME_COLOR = (0.91, 0.60, 0.36)  # warm: given
 BETWEEN_COLOR = (0.62, 0.71, 0.82)  # cool: computed
+DOT_COLOR = (0.71, 0.35, 0.10)
 ERROR_COLORS = ["#e4e4e2", "#f6c9a0", "#e8804f", "#b2182b", "#5c0a20"]
 CELL_PIXELS = 420  # the longer side of a cell
 MARGIN = 1.06  # of a cell against the largest shape in it
@@ -160,6 +161,7 @@ def render_sequence(
     up: Literal["y", "z"] | None = None,
     colors: Mapping[str, Array] | None = None,
     color_label: str = "",
+    points: Mapping[str, Sequence[Array]] | None = None,
     renderer: Literal["auto", "pyvista", "matplotlib"] = "auto",
     overwrite: bool = False,
 ) -> Path:
@@ -181,6 +183,7 @@ def render_sequence(
         colors: A number for each vertex, for any of the rows, shown as colour with a bar. The bar ends at the 99.5th
             percentile of what is shown, with an arrow if there is more. *Shape of each:* ``(N, V)``.
         color_label: What those numbers are, with their unit.
+        points: Rows of clouds, drawn above the shapes as dots: a cloud for each frame. *Shape of each:* ``(n, 3)``.
         renderer: ``"auto"`` is pyvista where it is installed (extra ``pictures``), otherwise matplotlib; also, with a
             warning, where pyvista cannot render.
         overwrite: Replace the file if it exists.
@@ -218,12 +221,16 @@ def render_sequence(
     titles = [f"t = {n / max(n_frames - 1, 1):.3g}" for n in chosen] if titles is None else titles
     if len(titles) != len(chosen):
         raise ValueError(f"titles stand above {len(chosen)} columns, got {len(titles)}.")
+    clouds = {label: [to_numpy(cloud) for cloud in row] for label, row in (points or {}).items()}
+    for label, row in clouds.items():
+        if len(row) != n_frames or any(cloud.shape != (len(cloud), 3) for cloud in row):
+            raise ValueError(f"points[{label!r}] must be {n_frames} clouds (n, 3), got {[c.shape for c in row]}.")
     given = [0, n_frames - 1] if keyframe_indices is None else keyframe_indices
     keyframes = check_indices(given, n_frames, "keyframe_indices")
 
     shown = np.stack([frames[chosen] for frames in shapes])  # (R, C, V, 3)
     rotation = view_rotation(shapes[0][0], view, up)
-    points, half = centred(shown @ rotation.T)
+    placed, half = centred(shown @ rotation.T)
     paint = np.empty(shown.shape)
     paint[:] = np.array([KEYFRAME_COLOR if n in keyframes else BETWEEN_COLOR for n in chosen])[:, None]
     color_bar = None
@@ -232,9 +239,15 @@ def render_sequence(
     pixels = np.maximum((CELL_PIXELS * half / half.max()).round(), 1).astype(np.int64)
     each = (-1, *shown.shape[2:])
     paint = (paint * 255).round().astype(np.uint8).reshape(each)
-    images = draw(Scene(points.reshape(each), paint, triangles, half, pixels), renderer)
+    images = draw(Scene(placed.reshape(each), paint, triangles, half, pixels), renderer)
+    images = images.reshape(*shown.shape[:2], *images.shape[1:])
+    moved = placed[0, :, 0] - shown[0, :, 0] @ rotation.T  # of the first row, into the cells
+    for label, row in reversed(clouds.items()):
+        seen = [row[n] @ rotation.T + move for n, move in zip(chosen, moved, strict=True)]
+        dots = np.stack([draw_points(cloud, DOT_COLOR, half, pixels) for cloud in seen])
+        rows, images = [label, *rows], np.concatenate([dots[None], images])
     labels = [(title, "#b4581a" if n in keyframes else "#333333") for n, title in zip(chosen, titles, strict=True)]
-    write_file(path, _sheet(images.reshape(*shown.shape[:2], *images.shape[1:]), rows, labels, color_bar, fmt))
+    write_file(path, _sheet(images, rows, labels, color_bar, fmt))
     return path
 
 
