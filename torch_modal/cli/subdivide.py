@@ -4,6 +4,7 @@ import argparse
 import warnings
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from torch_modal.cli.arguments import (
     add_common,
@@ -22,12 +23,48 @@ from torch_modal.cli.arguments import (
 from torch_modal.io.formats import ANIMATION_FORMATS, MESH_FORMATS, PICTURES
 
 
+def add_output(sub: argparse.ArgumentParser, picture: str) -> None:
+    """``--out``, ``--format`` and ``--picture`` of a sequence."""
+    add = sub.add_argument
+    text = f"the animation alone: {', '.join(ANIMATION_FORMATS)}; a folder: numbered frames and animation.glb"
+    add("--out", type=Path, required=True, metavar="FILE_OR_FOLDER", help=text)
+    text = "of the numbered frames (default: that of the first mesh, with all that its file carries)"
+    add("--format", choices=[suffix[1:] for suffix in MESH_FORMATS], help=text)
+    add("--picture", type=file_name(PICTURES), metavar="FILE", help=f"also draw {picture}, as .png or .pdf")
+
+
+def check_files(args: argparse.Namespace, inputs: list[Path]) -> tuple[Path, str | None, list[Path]]:
+    """The animation; for a folder the format of the frames, and frames of an earlier run. Raises as `check_output`."""
+    animation, fmt, earlier = args.out, None, []
+    if not is_file(args, ANIMATION_FORMATS):
+        animation, fmt = args.out / "animation.glb", args.format or inputs[0].suffix.lower()[1:].replace("gltf", "glb")
+        earlier = sorted(args.out.glob(f"frame-*.{fmt}"))
+    check_output([animation, *([args.picture] if args.picture else []), *earlier], inputs, args.overwrite)
+    return animation, fmt, earlier
+
+
+def write_sequence(args: argparse.Namespace, files: Any, frames: Any, faces: Any, asset: Any, **options: Any) -> None:
+    """Write what `check_files` found, and report it; ``options`` are those of `save_animation`."""
+    import torch_modal as tm
+
+    report, (animation, fmt, earlier) = reporter(args), files
+    same = {"overwrite": args.overwrite, "asset": asset}
+    if fmt:
+        written = tm.save_frames(frames, faces, args.out, fmt, **same)
+        report(f"frames:    {written[0]} to {written[-1].name}")
+        left = sorted(set(earlier) - set(written))
+        if left:  # they look like the end of this sequence
+            message = f"{args.out} also holds {len(left)} frames of an earlier run, from {left[0].name}"
+            warnings.warn(message, stacklevel=2)
+    tm.save_animation(frames, faces, animation, args.fps, progress=False if args.quiet else None, **same, **options)
+    report(f"animation: {animation}")
+
+
 def add_arguments(sub: argparse.ArgumentParser) -> None:
     """Arguments of ``subdivide``."""
     add, positive = sub.add_argument, number(float, 0, above=True)
     add("meshes", nargs="+", type=Path, metavar="MESH", help="key-frames, two or more, in their order")
-    text = f"the animation alone: {', '.join(ANIMATION_FORMATS)}; a folder: numbered frames and animation.glb"
-    add("--out", type=Path, required=True, metavar="FILE_OR_FOLDER", help=text)
+    add_output(sub, "the sequence beside linear interpolation")
     add_levels(sub, 0)
     text = "number of frames of the result (default: those of the levels)"
     add("--frames", type=number(int, 2), metavar="N", help=text)
@@ -47,10 +84,6 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
     add("--mu", type=number(float, 0), metavar="X", help="with --preset paper: weight of the similarity")
     text = "with --preset paper: segments, the worst of 24, that are interpolated locally (default: 8)"
     add("--regions", type=number(int, 0), metavar="N", help=text)
-    text = "of the numbered frames (default: that of the first key-frame, with all that its file carries)"
-    add("--format", choices=[suffix[1:] for suffix in MESH_FORMATS], help=text)
-    text = "also draw the sequence beside linear interpolation, as .png or .pdf"
-    add("--picture", type=file_name(PICTURES), metavar="FILE", help=text)
     group = sub.add_argument_group("animation")
     text = "of the sequence once (default: 1 for a cycle, 2 for two key-frames, 1 an interval of more)"
     group.add_argument("--duration", type=positive, metavar="SECONDS", help=text)
@@ -105,20 +138,15 @@ def run(args: argparse.Namespace) -> None:
     if args.cyclic and (args.ping_pong or args.ease):
         option = "ping-pong" if args.ping_pong else "ease"
         args.fail(f"--{option} is for sequences that begin and end; a cycle does not")
-    single = is_file(args, ANIMATION_FORMATS)
-    animation = args.out if single else args.out / "animation.glb"
-    if (args.bones or args.targets) and (animation.suffix.lower() != ".glb" or (args.bones and args.targets)):
+    files = check_files(args, args.meshes)
+    if (args.bones or args.targets) and (files[0].suffix.lower() != ".glb" or (args.bones and args.targets)):
         args.fail("--bones and --targets are two forms of a .glb file; take one of them")
-    own = args.meshes[0].suffix.lower()[1:]
-    fmt = args.format or ("glb" if own == "gltf" else own)
-    earlier = [] if single else sorted(args.out.glob(f"frame-*.{fmt}"))
-    check_output([animation, *([args.picture] if args.picture else []), *earlier], args.meshes, args.overwrite)
 
     import torch_modal as tm
     from torch_modal.passengers.proxy import proxy_size
     from torch_modal.view.animation import require_packages
 
-    require_packages(animation)
+    require_packages(files[0])
     n, spread = len(args.meshes), {"cyclic": args.cyclic, "n_frames": args.frames, "times": args.times}
     places = tm.keyframe_places(n, args.levels, **spread)
     when = tm.frame_times(n, args.levels, **spread).tolist() + args.times[-1:] * args.cyclic if args.times else None
@@ -127,7 +155,6 @@ def run(args: argparse.Namespace) -> None:
     keyframes, faces = tm.load_keyframes(args.meshes, **registration, report=report)
     asset = tm.open_asset(args.meshes[0])
     welded = tm.weld_seams(keyframes, faces)
-    progress = False if args.quiet else None
     solved = tm.subdivide(
         welded.keyframes,
         welded.faces,
@@ -135,7 +162,7 @@ def run(args: argparse.Namespace) -> None:
         bases=partial(tm.extract_bases, **mode_options(args)),
         **spread,
         **picked(args, "smooth", "preset", "contact", "mu", "regions", "proxy"),
-        progress=progress,
+        progress=False if args.quiet else None,
     )
     n_proxy = proxy_size(args.proxy, welded.keyframes.shape[1])
     if n_proxy:
@@ -145,25 +172,8 @@ def run(args: argparse.Namespace) -> None:
     frames[keys] = keyframes
     seams = f", {welded.n_merged} of them copies along seams" if welded.n_merged else ""
     report(f"{n} key-frames of {keyframes.shape[1]} vertices{seams} -> {len(frames)} frames")
-    if not single:
-        written = tm.save_frames(frames, faces, args.out, fmt, overwrite=args.overwrite, asset=asset)
-        report(f"frames:    {written[0]} to {written[-1].name}")
-        left = sorted(set(earlier) - set(written))
-        if left:  # they look like the end of this sequence
-            message = f"{args.out} also holds {len(left)} frames of an earlier run, from {left[0].name}"
-            warnings.warn(message, stacklevel=2)
-    tm.save_animation(
-        frames,
-        faces,
-        animation,
-        args.fps,
-        keyframe_indices=keys,
-        times=when,
-        asset=asset,
-        **picked(args, "cyclic", "overwrite", "duration", "ping_pong", "ease", "bones", "targets"),
-        progress=progress,
-    )
-    report(f"animation: {animation}")
+    options = picked(args, "cyclic", "duration", "ping_pong", "ease", "bones", "targets")
+    write_sequence(args, files, frames, faces, asset, keyframe_indices=keys, times=when, **options)
     if args.picture:
         rows = {"torch_modal": frames, "linear": tm.linear_sequence(keyframes, places)}
         tm.render_sequence(rows, faces, args.picture, keyframe_indices=keys, overwrite=args.overwrite)
