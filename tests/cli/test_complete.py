@@ -190,10 +190,12 @@ def test_what_cannot_work_is_refused_before_the_work(
 
     monkeypatch.setattr(tm, "complete", started)
     base, out = ["complete", "template.obj", *SCANS], ["--out", "a.glb"]
-    assert "needs 2 times: of template.obj, later.obj" in misused(capsys, *base, *out, "--keyframes", "later.obj")
+    assert "a time for each of template.obj, later.obj; got 0" in misused(
+        capsys, *base, *out, "--keyframes", "later.obj"
+    )
     argv = [*base, *out, "--keyframes", "later.obj", "--keyframe-times", "3"]
-    assert "needs 2 times" in misused(capsys, *argv)
-    assert "needs 1 times" in misused(capsys, *base, *out, "--keyframe-times", "3", "4")
+    assert "later.obj; got 1" in misused(capsys, *argv)
+    assert "template.obj; got 2" in misused(capsys, *base, *out, "--keyframe-times", "3", "4")
     assert "required: SEEN" in misused(capsys, "complete", "template.obj", *out)
     assert "is not a number above 0" in misused(capsys, *base, *out, "--noise", "0")
     assert "2 times for 10 clouds (scans/s-00.ply, " in fails(capsys, *base, *out, "--times", "0", "1")

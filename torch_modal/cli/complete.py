@@ -46,7 +46,7 @@ def run(args: argparse.Namespace) -> None:
     """
     whole, times = [args.mesh, *args.keyframes], args.keyframe_times
     if (times or args.keyframes) and len(times or ()) != len(whole):
-        args.fail(f"--keyframe-times needs {len(whole)} times: of {', '.join(map(str, whole))}")
+        args.fail(f"--keyframe-times needs a time for each of {', '.join(map(str, whole))}; got {len(times or ())}")
     files = check_files(args, [*whole, *args.observations])
 
     import torch
