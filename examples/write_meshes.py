@@ -3,8 +3,9 @@
     python examples/write_meshes.py [FOLDER]
 
 They are the samples under other names: a hand that closes (open.obj, fist.obj, pose-1.obj to pose-5.obj), its true
-motion (truth), the same fist with other vertices and faces (scan.ply; landmarks in pairs.txt), a galloping creature
-(gait-1.obj to gait-6.obj), and both in a folder tree (shapes/hand, shapes/creature).
+motion (truth), what a depth camera sees of that (scans) and where 20 vertices are (markers.csv), the same fist with
+other vertices and faces (scan.ply; landmarks in pairs.txt), a galloping creature (gait-1.obj to gait-6.obj), and both
+in a folder tree (shapes/hand, shapes/creature).
 """
 
 import argparse
@@ -13,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import torch
 import trimesh
+from complete import scan
 
 from torch_modal.data.samples import load_sample
 from torch_modal.geometry.decimation import decimate
@@ -38,6 +40,25 @@ def write_scan(path: Path, shape: torch.Tensor, faces: torch.Tensor) -> None:
     write(path, torch.from_numpy(points[order] @ turn.T + 0.2), torch.from_numpy(place[triangles]))
 
 
+def write_observations(folder: Path, times: tuple[float, ...], shapes: torch.Tensor, faces: torch.Tensor) -> None:
+    """A cloud with normals of each shape, seen from +Z, and a table of markers, a tenth of which is lost."""
+    noise = 0.003 * float((shapes[0].amax(0) - shapes[0].amin(0)).norm())
+    rows, view = ["time,vertex,x,y,z"], torch.tensor([0.0, 0.0, 1.0])
+    lost = np.random.default_rng(0).random((len(times), 20)) < 0.1
+    for k, shape in enumerate(shapes):
+        points, normals = scan(shape, faces, view, 1500, noise, seed=k)
+        names = "".join(f"property float {name}\n" for name in ("x", "y", "z", "nx", "ny", "nz"))
+        head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(points)}\n{names}end_header\n"
+        path = folder / "scans" / f"scan-{k + 1}.ply"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(head.encode() + torch.cat([points, normals], 1).numpy().astype("<f4").tobytes())
+        rows += [
+            f"{times[k]},{v}," + (",," if gone else ",".join(map(str, shape[v].tolist())))
+            for v, gone in zip(range(0, 3600, 180), lost[k], strict=True)
+        ]
+    (folder / "markers.csv").write_text("\n".join(rows) + "\n")
+
+
 def main(folder: Path) -> None:
     """Write them all into a folder."""
     hand, creature = load_sample("hand"), load_sample("creature")
@@ -48,6 +69,7 @@ def main(folder: Path) -> None:
     for number, shape in enumerate([opened, *hand.truth, fist], 1):
         write(folder / f"pose-{number}.obj", shape, hand.faces)
         write(folder / "truth" / f"frame-{number}.obj", shape, hand.faces)
+    write_observations(folder, hand.true_times, hand.truth, hand.faces)
     for number, shape in enumerate(creature.keyframes, 1):
         write(folder / f"gait-{number}.obj", shape, creature.faces)
     for name, shape in zip("abc", [opened, hand.truth[1], fist], strict=True):

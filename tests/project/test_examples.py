@@ -100,6 +100,14 @@ def test_motion_from_markers_is_nearer_than_pca_and_than_the_path() -> None:
 
 
 @pytest.mark.slow
+def test_complete_is_nearer_than_the_path(tmp_path: Path) -> None:
+    """The short form: fewer points."""
+    errors = load_example("complete").main(tmp_path, n_points=400)
+    assert 0 < errors["completed"] <= errors["path"] < 0.05
+    assert (tmp_path / "complete.glb").stat().st_size > 50_000 and (tmp_path / "complete.png").stat().st_size > 30_000
+
+
+@pytest.mark.slow
 def test_new_shapes_are_drawn_and_poses_follow_their_markers(tmp_path: Path) -> None:
     errors = load_example("new_shapes").main(tmp_path, n=20, n_modes=8)
     assert max(errors["fitted"]) < 0.3 * min(errors["linear span"])
