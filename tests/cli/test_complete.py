@@ -149,10 +149,22 @@ def test_markers_keep_their_places_where_seams_are_welded(
     assert np.load("still.npz")["frames"].shape == (1, *loose.shape)  # one time alone stands still
 
 
-def test_picture_has_the_points_above_the_shapes(files: Path, arrived: dict[str, Any]) -> None:
-    """At most eight columns, of the first and the last time too."""
-    argv = ["complete", "template.obj", *SCANS, "--out", "a.glb", "--picture", "p.png", "--quiet"]
-    assert cli.main(argv) == 0
+def test_picture_has_the_points_above_the_shapes(
+    files: Path, arrived: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At most eight columns, of the first and the last time too; observations of one time share theirs."""
+    drawn: dict[str, Any] = {}
+    render = tm.render_sequence
+    monkeypatch.setattr(
+        tm, "render_sequence", lambda *args, **options: drawn.update(options) or render(*args, **options)
+    )
+    argv = ["complete", "template.obj", *SCANS, SCANS[9], "--out", "a.glb", "--picture", "p.png", "--quiet"]
+    assert cli.main([*argv, "--times", *"01234567899"]) == 0
+    times = [float(title.removeprefix("t = ")) for title in drawn["titles"]]
+    assert len(times) == 8 and times[0] == 0 and times[-1] == 9
+    for time, cloud in zip(times, drawn["points"]["seen"], strict=True):
+        assert len(cloud) == len(arrived["rests"]) * (2 if time == 9 else 1)
+        assert float(cloud[:, 0].mean() - arrived["rests"][:, 0].mean()) == pytest.approx(0.3 * time, abs=1e-5)
     image = np.asarray(Image.open("p.png").convert("RGB")).astype(int)
     upper, lower = np.split(image[: len(image) // 2 * 2], 2)
 
