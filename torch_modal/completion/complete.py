@@ -23,7 +23,7 @@ from torch_modal.completion.bending import ModalBending, Pose
 from torch_modal.completion.energy import PointEnergy
 from torch_modal.completion.observation import Observation, checked
 from torch_modal.completion.pairs import Cloud, Pairs, Surface, rows
-from torch_modal.completion.search import PoseSearch
+from torch_modal.completion.search import SOFT, PoseSearch
 from torch_modal.elastic.backend import choose
 from torch_modal.elastic.bend import Bend
 from torch_modal.elastic.energy import RestShapes
@@ -55,6 +55,10 @@ OWN, WHOLE = 0.5, 0.2
 """Weights of the shape by modes, and of whole shapes, in Eq. 5; that of neighbours in time is the rest."""
 STIFFNESS = 2.0
 """Of a point with a noise of 1, at a size of 100."""
+SWAY = 2.0
+"""Standard deviation of the amplitude of the first mode, at a size of 100."""
+NOISE = 0.5
+"""Of points before it is estimated, at a size of 100."""
 NOISES = 0.1, 2.0
 """Least noise, and the largest that is estimated, at a size of 100."""
 ROUNDS, STEPS, PRODUCTS = 12, 2, 20
@@ -85,7 +89,7 @@ class Completion(NamedTuple):
     misses: list[Tensor]
     """Of each observation, in the order given, the distance of its points from the shape. *Shape of each:* ``(n,)``."""
     trust: list[Tensor]
-    """What each point counts for: 1, or less for outliers. *Shape of each:* ``(n,)``."""
+    """Weights that the points ended with: 1, or less for outliers. *Shape of each:* ``(n,)``."""
     knots: Tensor
     """Whole and completed shapes in the order of time. *Shape:* ``(K, V, 3)``."""
     path: Path | None
@@ -133,12 +137,16 @@ class _Sample(NamedTuple):
 
 
 class _Frame:
-    """What was seen at one time."""
+    """Observations of one time."""
 
     def __init__(self, time: float, samples: list[_Sample]) -> None:
         self.time, self.samples = time, samples
         self.clouds = [one.seen for one in samples if isinstance(one.seen, Cloud)]
         self.markers = [one.seen for one in samples if isinstance(one.seen, Pairs)]
+        #: Stiffness of modes whose amplitudes have the standard deviation :data:`SWAY`, seen by these points.
+        self.soft = max(
+            SOFT, min((one.noise or NOISE) ** 2 / (SWAY**2 * len(one.observation.points)) for one in samples)
+        )
 
 
 @lasting
@@ -272,7 +280,9 @@ class _Completer:
             report.update()
         for i in range(n):
             frame, one = self.frames[i], found[i]
-            pose = self.poses.stiffened(self._coarsened(one.base), one.pose, frame.clouds, self._markers(frame))
+            pose = self.poses.stiffened(
+                self._coarsened(one.base), one.pose, frame.clouds, self._markers(frame), frame.soft
+            )
             self.x.append(self.bending.shape(one.base, pose))
             report.update()
 
@@ -315,7 +325,7 @@ class _Completer:
     def _search(self, i: int, starts: Sequence[tuple[Tensor, Pose]]) -> ModalFit:
         """A frame by modes."""
         frame, own = self.frames[i], [(self._coarsened(x), pose) for x, pose in starts]
-        k, pose, score = self.poses.fit(own, frame.clouds, self._markers(frame))
+        k, pose, score = self.poses.fit(own, frame.clouds, self._markers(frame), frame.soft)
         base = starts[k][0]
         return ModalFit(self.bending.shape(base, pose), base, pose, score)
 
@@ -440,6 +450,6 @@ class _Completer:
 
 
 def robust(off: FloatArray, noise: float) -> FloatArray:
-    """What points at distances count for (Geman and McClure)."""
+    """Weights of points at distances (Geman and McClure)."""
     counts: FloatArray = 1 / (1 + (off / (OUTLIERS * noise)) ** 2) ** 2
     return counts

@@ -1,4 +1,4 @@
-"""What was seen of a motion at a time: a point cloud, markers, or a noisy mesh."""
+"""Observations of a motion at a time: point clouds, markers, noisy meshes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

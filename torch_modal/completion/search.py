@@ -93,26 +93,30 @@ class PoseSearch:
         return pose
 
     def fit(
-        self, starts: Sequence[tuple[Tensor, Pose]], clouds: Sequence[Cloud], markers: Sequence[Pairs]
+        self, starts: Sequence[tuple[Tensor, Pose]], clouds: Sequence[Cloud], markers: Sequence[Pairs], soft: float
     ) -> tuple[int, Pose, float]:
         """The number of the best of several starts, its pose after limbs were tried, and its score."""
-        poses = [self.descend(*one, clouds, markers) for one in starts]
+        poses = [self.descend(*one, clouds, markers, soft=soft) for one in starts]
         scores = [self.score(base, pose, clouds, markers) for (base, _), pose in zip(starts, poses, strict=True)]
         k = int(np.argmin(scores))
         base, pose, best = starts[k][0], poses[k], scores[k]
         for _ in range(ROUNDS):
-            tried = [self._tried(base, pose, clouds, markers, *one) for one in self._limbs(base, pose, clouds)]
+            tried = [self._tried(base, pose, clouds, markers, soft, *one) for one in self._limbs(base, pose, clouds)]
             scores = [self.score(base, other, clouds, markers) for other in tried]
             if not tried or min(scores) > best - GAIN:
                 break
             best, pose = min(scores), tried[int(np.argmin(scores))]
         return k, pose, best
 
-    def stiffened(self, base: Tensor, pose: Pose, clouds: Sequence[Cloud], markers: Sequence[Pairs]) -> Pose:
+    def stiffened(
+        self, base: Tensor, pose: Pose, clouds: Sequence[Cloud], markers: Sequence[Pairs], soft: float
+    ) -> Pose:
         """The pose of the stiffest modes that explain as much: where little moves, soft ones would follow the noise."""
         best = self.score(base, pose, clouds, markers)
-        for soft in STIFFER:
-            other = self.descend(base, pose, clouds, markers, STEPS // 3, 2 * NEAR, soft, soft)
+        for stiff in STIFFER:
+            if stiff <= soft:
+                continue
+            other = self.descend(base, pose, clouds, markers, STEPS // 3, 2 * NEAR, stiff, stiff)
             score = self.score(base, other, clouds, markers)
             if score <= best + GAIN:
                 best, pose = min(best, score), other
@@ -135,6 +139,7 @@ class PoseSearch:
         pose: Pose,
         clouds: Sequence[Cloud],
         markers: Sequence[Pairs],
+        soft: float,
         cloud: Cloud,
         points: FloatArray,
         tip: int,
@@ -152,9 +157,9 @@ class PoseSearch:
             )
             own = Pairs(places, points, None, np.full(len(points), WEIGHT / len(cloud.points)))
             known = fields if k % 2 else None
-            pose, fields = self._step(base, pose, thinned, [*markers, own], MOST_AWAY, SOFT, limb, known=known)
+            pose, fields = self._step(base, pose, thinned, [*markers, own], MOST_AWAY, soft, limb, known=known)
             x = self.bending.shape(base, pose).numpy()[vertices]
-        return self.descend(base, pose, clouds, markers, STEPS // 2, FAR / 3, 10 * SOFT)
+        return self.descend(base, pose, clouds, markers, STEPS // 2, FAR / 3, 10 * soft, soft)
 
     def _step(
         self,

@@ -1,0 +1,224 @@
+"""Motions from partial and noisy samples, against motions that are known."""
+
+import numpy as np
+import pytest
+import torch
+
+import torch_modal as tm
+from torch_modal.completion.bending import ModalBending
+from torch_modal.completion.energy import PointEnergy
+from torch_modal.completion.pairs import Cloud, Pairs, Surface, rows
+from torch_modal.motion.decoder import scaled
+
+
+@pytest.fixture(scope="module")
+def tube():
+    """A bending tube, half as thick as it is wide: shapes at five times, faces, and its diagonal."""
+    n, m = 24, 12
+    t, a = np.meshgrid(np.linspace(0, 1, n), np.arange(m) * 2 * np.pi / m, indexing="ij")
+    shapes = []
+    for bend in np.linspace(-1.2, 1.2, 5):
+        angle = bend * t
+        spine = np.stack([np.sin(angle), 1 - np.cos(angle)], -1) / max(abs(bend), 1e-9) if abs(bend) > 1e-9 else None
+        spine = np.stack([t, 0 * t], -1) if spine is None else spine * np.sign(bend)
+        radius = 0.12 - 0.05 * t
+        x = spine[..., 0] - radius * np.cos(a) * np.sin(angle)
+        y = spine[..., 1] * 1.0 + radius * np.cos(a) * np.cos(angle)
+        rings = np.stack([x, y, 0.5 * radius * np.sin(a)], -1).reshape(-1, 3)
+        shapes.append(np.concatenate([rings, rings[:m].mean(0)[None], rings[-m:].mean(0)[None]]))
+    i, j = np.meshgrid(np.arange(n - 1), np.arange(m), indexing="ij")
+    p, q = i * m + j, i * m + (j + 1) % m
+    sides = np.concatenate([np.stack([p, p + m, q], -1), np.stack([q, p + m, q + m], -1)]).reshape(-1, 3)
+    k = np.arange(m)
+    caps = [np.stack([np.full(m, n * m), k, (k + 1) % m], -1)]
+    caps.append(np.stack([np.full(m, n * m + 1), (n - 1) * m + (k + 1) % m, (n - 1) * m + k], -1))
+    faces = np.concatenate([sides, *caps])[:, ::-1].copy()
+    x = torch.from_numpy(np.stack(shapes))
+    return x, torch.from_numpy(faces), float((x[0].amax(0) - x[0].amin(0)).norm())
+
+
+def scanned(x, faces, time, view, seed=0, n=400, noise=0.0):
+    """A cloud of what faces a direction."""
+    rng = np.random.default_rng(seed)
+    corners = x.numpy()[faces.numpy()]
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    areas = np.linalg.norm(across, axis=1)
+    normals = across / areas[:, None]
+    part = areas * (normals @ view > 0.1)
+    face = rng.choice(len(faces), n, p=part / part.sum())
+    points = (rng.dirichlet([1, 1, 1], n)[..., None] * corners[face]).sum(1) + noise * rng.standard_normal((n, 3))
+    given = {"normals": torch.from_numpy(normals[face]), "view": torch.from_numpy(view)}
+    return tm.Observation(time, torch.from_numpy(points), **given, noise=noise or None)
+
+
+def error(x, truth, diagonal):
+    """Mean distance of all vertices, in % of the diagonal."""
+    return 100 * float((x - truth).norm(dim=-1).mean()) / diagonal
+
+
+VIEWS = [np.array([0.5, np.cos(a), np.sin(a)]) / 1.25**0.5 for a in (0.3, 1.2, 2.1, 3.0, 3.9)]
+
+
+@pytest.fixture(scope="module")
+def between(tube):
+    """The tube from its first and last shape, and scans of the others."""
+    x, faces, diagonal = tube
+    scans = [scanned(x[i], faces, float(i), VIEWS[i], i, noise=0.003 * diagonal) for i in (1, 2, 3)]
+    return tm.complete(x[[0, 4]], faces, scans[::-1], times=[0.0, 4.0], progress=False)
+
+
+class TestKeyframesAndScans:
+    def test_shapes_of_a_gallop_are_far_nearer_than_the_path(self):
+        sample = tm.load_sample("creature")
+        ends, truth, faces = sample.keyframes[[0, 1]].double(), sample.truth[:1].double(), sample.faces
+        diagonal = float((truth[0].amax(0) - truth[0].amin(0)).norm())
+        scan = scanned(truth[0], faces, 0.5, np.array([0.6, 0.0, 0.8]), n=1000, noise=0.003 * diagonal)
+        found = tm.complete(ends, faces, [scan], progress=False)
+        path = tm.Path(ends, faces)(ends, 0.5)[None]
+        assert sample.true_times[0] == 0.5
+        assert error(found.shapes, truth, diagonal) < 0.4 * error(path, truth, diagonal)
+
+    def test_times_are_sorted_and_keyframes_exact(self, tube, between):
+        x = tube[0]
+        assert between.times.tolist() == [1.0, 2.0, 3.0]
+        assert torch.equal(between(0.0), x[0])
+        assert torch.equal(between(4.0), x[4])
+        assert torch.equal(between(torch.tensor([1.0, 2.0, 3.0])), between.shapes)
+
+    def test_misses_and_trust_are_in_the_given_order(self, between):
+        assert [len(one) for one in between.misses] == [400] * 3
+        assert all(float(one.median()) < 0.02 for one in between.misses)
+        assert all(float(one.min()) >= 0 and float(one.max()) <= 1 for one in between.trust)
+
+    def test_what_was_seen_is_more_certain(self, tube, between):
+        assert between.confidence.shape == (3, tube[0].shape[1])
+        seen = between.confidence > 0.5
+        assert 0.2 < float(seen.double().mean()) < 0.95
+        assert 0 <= float(between.confidence.min()) <= float(between.confidence.max()) <= 1
+
+
+class TestTemplateAlone:
+    def test_a_template_follows_scans_of_two_sides(self, tube):
+        x, faces, diagonal = tube
+        scans = [
+            scanned(x[i], faces, i, side * VIEWS[i], i, noise=0.002 * diagonal) for i in range(5) for side in (1, -1)
+        ]
+        found = tm.complete(x[2], faces, scans, progress=False)
+        assert found.shapes.shape == x.shape
+        assert error(found.shapes, x, diagonal) < 0.25 * error(x[2].expand_as(x), x, diagonal)
+
+    def test_one_observation_is_one_shape(self, tube):
+        x, faces, diagonal = tube
+        seen = tm.Observation(3.0, x[1], vertices=torch.arange(len(x[1])))
+        found = tm.complete(x[2], faces, [seen], progress=False)
+        assert found.path is None
+        assert error(found(3.0), x[1], diagonal) < 0.7
+        with pytest.raises(ValueError, match="one shape alone"):
+            found(4.0)
+
+
+class TestMarkersAndMeshes:
+    def test_noise_of_meshes_is_removed(self, tube):
+        x, faces, diagonal = tube
+        noise = 0.01 * diagonal / 3**0.5
+        noisy = x + noise * torch.randn(x.shape, generator=torch.Generator().manual_seed(0), dtype=x.dtype)
+        every = torch.arange(x.shape[1])
+        given = [tm.Observation(i, one, vertices=every, noise=noise) for i, one in enumerate(noisy)]
+        found = tm.complete(x[2], faces, given, progress=False)
+        assert error(found.shapes, x, diagonal) < 0.6 * error(noisy, x, diagonal)
+
+    def test_markers_within_triangles_are_met(self, tube):
+        x, faces, diagonal = tube
+        corners = faces[::20]
+        weights = torch.full((len(corners), 3), 1 / 3, dtype=x.dtype)
+        places = x[1][corners].mean(1)
+        seen = tm.Observation(1.0, places, corners=corners, barycentric=weights, noise=0.001 * diagonal)
+        found = tm.complete(x[[0, 4]], faces, [seen], times=[0.0, 4.0], progress=False)
+        assert float(found.misses[0].mean()) < 0.006 * diagonal
+        assert error(found.shapes, x[1:2], diagonal) < 1.0
+
+
+class TestCoordinates:
+    def test_a_motion_and_other_units_change_nothing(self, tube):
+        x, faces, _ = tube
+        turn = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(1), dtype=x.dtype)).Q
+        turn = turn * torch.linalg.det(turn).sign()
+        scan = scanned(x[1], faces, 1.0, VIEWS[1])
+
+        def moved(points):
+            return 25.4 * points @ turn.T + 3.0
+
+        other = tm.Observation(1.0, moved(scan.points), normals=scan.normals @ turn.T, view=turn @ scan.view)
+        first = tm.complete(x[[0, 4]], faces, [scan], times=[0.0, 4.0], progress=False).shapes
+        second = tm.complete(moved(x[[0, 4]]), faces, [other], times=[0.0, 4.0], progress=False).shapes
+        assert float((moved(first) - second).abs().max()) < 1e-4 * 25.4
+
+
+class TestRefusals:
+    def test_other_units_and_shapes_are_refused(self, tube):
+        x, faces, _ = tube
+        cloud = tm.Observation(1.0, 1000 * x[1])
+        with pytest.raises(ValueError, match="other units"):
+            tm.complete(x[0], faces, [cloud], progress=False)
+        with pytest.raises(ValueError, match="has no time"):
+            tm.complete(x[0], faces, [tm.Observation(0.0, x[1])], times=[0.0], progress=False)
+        with pytest.raises(ValueError, match="vertices lie in"):
+            tm.complete(x[0], faces, [tm.Observation(0.0, x[1][:3], vertices=[0, 1, 9999])], progress=False)
+        with pytest.raises(ValueError, match="got none"):
+            tm.complete(x[0], faces, [], progress=False)
+
+    @pytest.mark.parametrize(
+        ("given", "message"),
+        [
+            ({"points": torch.zeros(2, 3)}, "n of 3 or more"),
+            ({"points": torch.full((4, 3), torch.nan)}, "not finite"),
+            ({"time": torch.inf}, "finite number"),
+            ({"normals": torch.zeros(3, 3)}, "normals have the shape"),
+            ({"vertices": [0, 1, 2, 3], "normals": torch.ones(4, 3)}, "clouds"),
+            ({"corners": torch.zeros(4, 3, dtype=torch.int64)}, "go together"),
+            ({"weights": torch.zeros(4)}, "not all 0"),
+            ({"noise": 0.0}, "above 0"),
+            ({"view": torch.zeros(3)}, "direction"),
+        ],
+    )
+    def test_an_observation_says_what_does_not_fit(self, given, message):
+        with pytest.raises(ValueError, match=message):
+            tm.Observation(**({"time": 0.0, "points": torch.rand(4, 3)} | given))
+
+    def test_something_else_has_low_confidence_and_a_warning(self, tube):
+        x, faces, diagonal = tube
+        ball = torch.randn(400, 3, generator=torch.Generator().manual_seed(0), dtype=x.dtype)
+        ball = 0.4 * diagonal * ball / ball.norm(dim=1, keepdim=True)
+        with pytest.warns(tm.MeshWarning, match="doubtful"):
+            found = tm.complete(x[0], faces, [tm.Observation(0.0, ball, noise=0.002)], progress=False)
+        assert float(found.confidence.mean()) < 0.5
+
+
+def test_derivatives_of_modal_bending(tube):
+    x, faces, _ = tube
+    modes = scaled(tm.extract_modes(x[0], faces, 6).modes, 100.0)
+    bending = ModalBending(100 * x[0], faces, modes)
+    pose = bending.still()
+    pose.amplitudes += torch.linspace(-3, 3, 6)
+    pose.rotation = torch.linalg.qr(torch.rand(3, 3, dtype=x.dtype)).Q
+    shape, fields = bending.linearised(100 * x[1], pose)
+    for k in range(12):
+        step = 1e-5 * torch.eye(12, dtype=x.dtype)[k]
+        there, back = (bending.shape(100 * x[1], bending.stepped(pose, s * step, shape.mean(0))) for s in (1, -1))
+        assert torch.allclose((there - back) / 2e-5, fields[k], atol=1e-6 * float(fields[k].abs().max()) + 1e-8)
+
+
+def test_derivatives_of_the_energy_of_points(tube):
+    x, faces, _ = tube
+    surface = Surface(100 * x[0].numpy(), faces.numpy())
+    cloud = Cloud(100 * x[1].numpy() + 1, None, np.ones(len(x[1])), None)
+    pairs = cloud.pairs(surface)
+    normals = np.random.default_rng(0).standard_normal((len(pairs[0].points), 3))
+    markers = Pairs(rows(faces.numpy()[:5], np.full((5, 3), 1 / 3), len(x[0])), np.ones((5, 3)), None, np.ones(5))
+    energy = PointEnergy([pairs[0]._replace(normals=normals / np.linalg.norm(normals, axis=1, keepdims=True)), markers])
+    at = energy.at(100 * x[:1])
+    field = torch.randn(x[:1].shape, generator=torch.Generator().manual_seed(0), dtype=x.dtype)
+    there, back = (energy.value(100 * x[:1] + s * field) for s in (1e-3, -1e-3))
+    assert torch.allclose((there - back) / 2e-3, at.slope(field), rtol=1e-6)
+    second = (there + back - 2 * at.value) / 1e-6
+    assert torch.allclose(second, (field * at.product(field)).sum((1, 2)), rtol=1e-4)
