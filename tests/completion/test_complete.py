@@ -7,7 +7,7 @@ import torch
 import torch_modal as tm
 from torch_modal.completion.bending import ModalBending
 from torch_modal.completion.energy import PointEnergy
-from torch_modal.completion.pairs import Cloud, Pairs, Surface, rows
+from torch_modal.completion.pairs import Cloud, Pairs, SampledSurface, rows
 from torch_modal.motion.decoder import scaled
 
 
@@ -210,7 +210,7 @@ def test_derivatives_of_modal_bending(tube):
 
 def test_derivatives_of_the_energy_of_points(tube):
     x, faces, _ = tube
-    surface = Surface(100 * x[0].numpy(), faces.numpy())
+    surface = SampledSurface(100 * x[0].numpy(), faces.numpy())
     cloud = Cloud(100 * x[1].numpy() + 1, None, np.ones(len(x[1])), None)
     pairs = cloud.pairs(surface)
     normals = np.random.default_rng(0).standard_normal((len(pairs[0].points), 3))

@@ -10,7 +10,7 @@ from torch_modal.geometry.triangle_frames import bent_sides, edge_means, frames,
 from torch_modal.motion.decoder import bending_columns
 
 
-class Pose:
+class ModalPose:
     """Amplitudes of modes, then a rigid motion. *Shape:* ``(k,), (3, 3), (3,)``."""
 
     def __init__(self, amplitudes: Tensor, rotation: Tensor, move: Tensor) -> None:
@@ -34,22 +34,22 @@ class ModalBending:
         #: What an amplitude of 1 does to each triangle, in its own coordinates. *Shape:* ``(k, 6, F)``.
         self.columns = bending_columns(reference, faces, modes)
 
-    def still(self) -> Pose:
+    def still(self) -> ModalPose:
         """No deformation."""
-        return Pose(self.columns.new_zeros(len(self.columns)), torch.eye(3).double(), torch.zeros(3).double())
+        return ModalPose(self.columns.new_zeros(len(self.columns)), torch.eye(3).double(), torch.zeros(3).double())
 
     def _sides(self, base: Tensor, bending: Tensor) -> tuple[Tensor, Tensor]:
         own = frames(sides(base.T[:, None].contiguous(), self.faces))
         turn = bending[0] * own.e1[:, 0] + bending[1] * own.e2[:, 0] + bending[2] * own.normal[:, 0]
         return bent_sides(turn[:, None], bending[3:, None], own)
 
-    def shape(self, base: Tensor, pose: Pose) -> Tensor:
+    def shape(self, base: Tensor, pose: ModalPose) -> Tensor:
         """The deformed shape. *Shape:* ``(V, 3)``."""
         bending = torch.einsum("k,kcf->cf", pose.amplitudes, self.columns)
         rest = base.T[:, None].contiguous()
         return pose.apply(self.reconstruction(self._sides(base, bending), rest)[:, 0].T)
 
-    def linearised(self, base: Tensor, pose: Pose, rigid: bool = False) -> tuple[Tensor, Tensor]:
+    def linearised(self, base: Tensor, pose: ModalPose, rigid: bool = False) -> tuple[Tensor, Tensor]:
         """The deformed shape, and its derivatives in amplitudes, a move and a turn about its centroid.
 
         If rigid, in the last two alone. *Shape:* ``(V, 3), (k + 6, V, 3)``.
@@ -70,8 +70,8 @@ class ModalBending:
         return x, torch.cat([fields @ pose.rotation.mT, motions])
 
     @staticmethod
-    def stepped(pose: Pose, step: Tensor, centre: Tensor) -> Pose:
+    def stepped(pose: ModalPose, step: Tensor, centre: Tensor) -> ModalPose:
         """A pose after a step in the directions of :meth:`linearised`. *Shape:* ``(k + 6,), (3,)``."""
         turn, move = exp(step[-3:]), step[-6:-3]
         amplitudes = pose.amplitudes + step[:-6] if len(step) > 6 else pose.amplitudes
-        return Pose(amplitudes, turn @ pose.rotation, turn @ (pose.move - centre) + centre + move)
+        return ModalPose(amplitudes, turn @ pose.rotation, turn @ (pose.move - centre) + centre + move)

@@ -19,10 +19,10 @@ from torch import Tensor
 
 from torch_modal.arrays import BoolArray, FloatArray
 from torch_modal.autograd import lasting
-from torch_modal.completion.bending import ModalBending, Pose
+from torch_modal.completion.bending import ModalBending, ModalPose
 from torch_modal.completion.energy import PointEnergy
 from torch_modal.completion.observation import Observation, checked
-from torch_modal.completion.pairs import Cloud, Pairs, Surface, rows
+from torch_modal.completion.pairs import Cloud, Pairs, SampledSurface, rows
 from torch_modal.completion.search import SOFT, PoseSearch
 from torch_modal.elastic.backend import choose
 from torch_modal.elastic.bend import Bend
@@ -114,7 +114,7 @@ class ModalFit(NamedTuple):
 
     x: Tensor
     base: Tensor
-    pose: Pose
+    pose: ModalPose
     score: float
     """How much it leaves unexplained."""
 
@@ -128,7 +128,7 @@ class _Sample(NamedTuple):
     noise: float
     """Its standard deviation; 0 where it is not known yet."""
 
-    def off(self, surface: Surface) -> tuple[FloatArray, BoolArray]:
+    def off(self, surface: SampledSurface) -> tuple[FloatArray, BoolArray]:
         """Distances of the points from their places, and if normals agree. *Shape:* ``(n,)``."""
         if isinstance(self.seen, Cloud):
             return self.seen.closest(surface)[2:]
@@ -286,7 +286,7 @@ class _Completer:
             self.x.append(self.bending.shape(one.base, pose))
             report.update()
 
-    def _starts(self, t: float, known: list[tuple[float, Tensor]]) -> list[tuple[Tensor, Pose]]:
+    def _starts(self, t: float, known: list[tuple[float, Tensor]]) -> list[tuple[Tensor, ModalPose]]:
         """Shapes from which a search at a time starts."""
         times, shapes = np.array([own for own, _ in known]), torch.stack([x for _, x in known])
         if t in times:
@@ -316,13 +316,13 @@ class _Completer:
         middle = last.mean(0)
         return (x - middle) @ motion.rotation.mT + 2 * middle - before.mean(0)
 
-    def _placed_rigidly(self, i: int) -> tuple[Pose, float]:
+    def _placed_rigidly(self, i: int) -> tuple[ModalPose, float]:
         """The pose of the template in a frame, and how much it leaves unexplained."""
         frame, base = self.frames[i], self._coarsened(self.template)
         pose = self.poses.rigid(base, frame.clouds, self._markers(frame))
         return pose, self.poses.score(base, pose, frame.clouds, self._markers(frame))
 
-    def _search(self, i: int, starts: Sequence[tuple[Tensor, Pose]]) -> ModalFit:
+    def _search(self, i: int, starts: Sequence[tuple[Tensor, ModalPose]]) -> ModalFit:
         """A frame by modes."""
         frame, own = self.frames[i], [(self._coarsened(x), pose) for x, pose in starts]
         k, pose, score = self.poses.fit(own, frame.clouds, self._markers(frame), frame.soft)
@@ -349,7 +349,7 @@ class _Completer:
         """Steps of all vertices of all frames, with new pairs and new neighbours in each round."""
         x = torch.stack(self.x)
         for frame, own in zip(self.frames, self.x, strict=True):
-            surface = Surface(own.numpy(), self.faces.numpy())
+            surface = SampledSurface(own.numpy(), self.faces.numpy())
             frame.samples = [self._with_noise(one, surface) for one in frame.samples]
         stiffness = [x.new_full((1, 1), value) for value in self.stiffness]
         for _ in range(ROUNDS):
@@ -363,7 +363,7 @@ class _Completer:
         self.x = list(x)
 
     @staticmethod
-    def _with_noise(one: _Sample, surface: Surface) -> _Sample:
+    def _with_noise(one: _Sample, surface: SampledSurface) -> _Sample:
         """A sample with its noise, estimated where it is not known: from the median of distances with such an error."""
         if one.noise:
             return one
@@ -397,7 +397,7 @@ class _Completer:
 
     def _points(self, frame: _Frame, x: Tensor) -> PointEnergy:
         """The energy of what was seen at a frame."""
-        surface, found = Surface(x.numpy(), self.faces.numpy()), []
+        surface, found = SampledSurface(x.numpy(), self.faces.numpy()), []
         for sample in frame.samples:
             for one in sample.seen.pairs(surface) if isinstance(sample.seen, Cloud) else [sample.seen]:
                 counts = robust(np.linalg.norm(one.places @ surface.vertices - one.points, axis=1), sample.noise)
@@ -412,7 +412,7 @@ class _Completer:
         misses: list[Tensor] = [like.new_zeros(0)] * self.n
         trust, seen, poor = list(misses), x.new_zeros(x.shape[:2]), []
         for i, frame in enumerate(self.frames):
-            surface = Surface(x[i].numpy(), self.faces.numpy())
+            surface = SampledSurface(x[i].numpy(), self.faces.numpy())
             for one in frame.samples:
                 off, agree = one.off(surface)
                 counts = agree * robust(off, one.noise)

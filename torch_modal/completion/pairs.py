@@ -43,7 +43,7 @@ def rows(corners: IntArray, barycentric: FloatArray, n_vertices: int) -> sparse.
     return sparse.csr_matrix((barycentric.reshape(-1), where), shape=(n, n_vertices))
 
 
-class Surface:
+class SampledSurface:
     """A shape at a size of 100, with places on its faces that may be paired. *Shape:* ``(V, 3), (F, 3)``."""
 
     def __init__(self, vertices: FloatArray, faces: IntArray) -> None:
@@ -97,11 +97,11 @@ class Cloud:
         normals = None if self.normals is None else self.normals[kept]
         return Cloud(self.points[kept], normals, self.weights[kept], self.view)
 
-    def closest(self, surface: Surface) -> tuple[IntArray, FloatArray, FloatArray, BoolArray]:
-        """:meth:`Surface.closest` of its points."""
+    def closest(self, surface: SampledSurface) -> tuple[IntArray, FloatArray, FloatArray, BoolArray]:
+        """:meth:`SampledSurface.closest` of its points."""
         return surface.closest(self.points, self.normals)
 
-    def pairs(self, surface: Surface, released: BoolArray | None = None) -> list[Pairs]:
+    def pairs(self, surface: SampledSurface, released: BoolArray | None = None) -> list[Pairs]:
         """Places for the points, and, where the view is known, points for the visible places."""
         face, barycentric, _, agree = self.closest(surface)
         n = len(surface.vertices)
@@ -127,12 +127,12 @@ class Cloud:
             found.append(Pairs(places, self.points[nearest], self.normals[nearest], np.full(len(seen), 1 / len(seen))))
         return found
 
-    def missed(self, surface: Surface, unit: float) -> FloatArray:
+    def missed(self, surface: SampledSurface, unit: float) -> FloatArray:
         """Squared distances of the points in a unit; infinite where normals disagree. *Shape:* ``(n,)``."""
         _, _, distances, agree = self.closest(surface)
         return np.where(agree, (distances / unit) ** 2, np.inf)
 
-    def score(self, surface: Surface, unit: float) -> float:
+    def score(self, surface: SampledSurface, unit: float) -> float:
         """Part of the cloud that the surface leaves out, and of the visible surface that the cloud leaves out."""
         off = self.missed(surface, unit)
         total = float((self.weights * 1 - 1 / (1 + off)).sum() / self.weights.sum())
@@ -142,7 +142,7 @@ class Cloud:
             total += float((gap / (1 + gap)).mean()) if len(seen) else 1.0
         return total
 
-    def unexplained(self, surface: Surface, reach: float, least: int) -> list[IntArray]:
+    def unexplained(self, surface: SampledSurface, reach: float, least: int) -> list[IntArray]:
         """Connected groups of points that are far from the surface."""
         off = np.flatnonzero(self.missed(surface, reach) > 1)
         if len(off) < least:

@@ -10,8 +10,8 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from torch_modal.arrays import BoolArray, FloatArray, IntArray
-from torch_modal.completion.bending import ModalBending, Pose
-from torch_modal.completion.pairs import Cloud, Pairs, Surface
+from torch_modal.completion.bending import ModalBending, ModalPose
+from torch_modal.completion.pairs import Cloud, Pairs, SampledSurface
 from torch_modal.geometry.closest import dot
 
 # Steps, and the distance from which on pairs lose weight at the first and the last; stiffness of the modes likewise.
@@ -51,11 +51,11 @@ class PoseSearch:
         self.stiffness = torch.cat([relative, relative.new_full((6,), OF_MOTIONS)])
         self.tips, self.from_tips = _tips(bending.reference.numpy(), bending.reconstruction.edges.numpy())
 
-    def surface(self, base: Tensor, pose: Pose) -> Surface:
+    def surface(self, base: Tensor, pose: ModalPose) -> SampledSurface:
         """The deformed shape."""
-        return Surface(self.bending.shape(base, pose).numpy(), self.faces)
+        return SampledSurface(self.bending.shape(base, pose).numpy(), self.faces)
 
-    def score(self, base: Tensor, pose: Pose, clouds: Sequence[Cloud], markers: Sequence[Pairs] = ()) -> float:
+    def score(self, base: Tensor, pose: ModalPose, clouds: Sequence[Cloud], markers: Sequence[Pairs] = ()) -> float:
         """How much is left unexplained, from 0 on."""
         surface = self.surface(base, pose)
         total = PRIOR * float(self.stiffness[:-6] @ pose.amplitudes**2)
@@ -64,7 +64,7 @@ class PoseSearch:
             total += float(own.weights @ (off / (1 + off)))
         return total + sum(cloud.score(surface, HALF) for cloud in clouds)
 
-    def rigid(self, base: Tensor, clouds: Sequence[Cloud], markers: Sequence[Pairs]) -> Pose:
+    def rigid(self, base: Tensor, clouds: Sequence[Cloud], markers: Sequence[Pairs]) -> ModalPose:
         """The pose alone, from the centroid of what was seen on."""
         points = np.concatenate([*(own.points for own in clouds), *(own.points for own in markers)])
         pose = self.bending.still()
@@ -76,14 +76,14 @@ class PoseSearch:
     def descend(
         self,
         base: Tensor,
-        pose: Pose,
+        pose: ModalPose,
         clouds: Sequence[Cloud],
         markers: Sequence[Pairs] = (),
         n_steps: int = STEPS,
         far: float = FAR,
         stiff: float = STIFF,
         soft: float = SOFT,
-    ) -> Pose:
+    ) -> ModalPose:
         """Gauss-Newton steps, each with new pairs, from far to near and from stiff to soft."""
         distances, stiffnesses = np.geomspace(far, NEAR, n_steps), np.geomspace(stiff, soft, n_steps)
         clouds, fields = [cloud.thinned(N_POINTS) for cloud in clouds], None
@@ -93,8 +93,8 @@ class PoseSearch:
         return pose
 
     def fit(
-        self, starts: Sequence[tuple[Tensor, Pose]], clouds: Sequence[Cloud], markers: Sequence[Pairs], soft: float
-    ) -> tuple[int, Pose, float]:
+        self, starts: Sequence[tuple[Tensor, ModalPose]], clouds: Sequence[Cloud], markers: Sequence[Pairs], soft: float
+    ) -> tuple[int, ModalPose, float]:
         """The number of the best of several starts, its pose after limbs were tried, and its score."""
         poses = [self.descend(*one, clouds, markers, soft=soft) for one in starts]
         scores = [self.score(base, pose, clouds, markers) for (base, _), pose in zip(starts, poses, strict=True)]
@@ -109,8 +109,8 @@ class PoseSearch:
         return k, pose, best
 
     def stiffened(
-        self, base: Tensor, pose: Pose, clouds: Sequence[Cloud], markers: Sequence[Pairs], soft: float
-    ) -> Pose:
+        self, base: Tensor, pose: ModalPose, clouds: Sequence[Cloud], markers: Sequence[Pairs], soft: float
+    ) -> ModalPose:
         """The pose of the stiffest modes that explain as much: where little moves, soft ones would follow the noise."""
         best = self.score(base, pose, clouds, markers)
         for stiff in STIFFER:
@@ -122,7 +122,7 @@ class PoseSearch:
                 best, pose = min(best, score), other
         return pose
 
-    def _limbs(self, base: Tensor, pose: Pose, clouds: Sequence[Cloud]) -> list[tuple[Cloud, FloatArray, int]]:
+    def _limbs(self, base: Tensor, pose: ModalPose, clouds: Sequence[Cloud]) -> list[tuple[Cloud, FloatArray, int]]:
         """Groups of points that nothing explains, each with the end of a limb that might."""
         surface, found = self.surface(base, pose), []
         for cloud in clouds:
@@ -136,14 +136,14 @@ class PoseSearch:
     def _tried(
         self,
         base: Tensor,
-        pose: Pose,
+        pose: ModalPose,
         clouds: Sequence[Cloud],
         markers: Sequence[Pairs],
         soft: float,
         cloud: Cloud,
         points: FloatArray,
         tip: int,
-    ) -> Pose:
+    ) -> ModalPose:
         """A pose in which a limb explains points that nothing explained; its former pairs are released."""
         extent = 2 * float(np.percentile(np.linalg.norm(points - points.mean(0), axis=1), 90))
         limb = self.from_tips[tip] < np.clip(extent, *LIMBS)
@@ -164,7 +164,7 @@ class PoseSearch:
     def _step(
         self,
         base: Tensor,
-        pose: Pose,
+        pose: ModalPose,
         clouds: Sequence[Cloud],
         markers: Sequence[Pairs],
         far: float,
@@ -172,7 +172,7 @@ class PoseSearch:
         released: BoolArray | None = None,
         rigid: bool = False,
         known: Tensor | None = None,
-    ) -> tuple[Pose, Tensor]:
+    ) -> tuple[ModalPose, Tensor]:
         """A Gauss-Newton step towards pairs, found here, and markers; no vertex moves far. Also its derivatives.
 
         Those of the step before, where they are given, do nearly as well.
@@ -181,7 +181,11 @@ class PoseSearch:
             x, fields = self.bending.linearised(base, pose, rigid)
         else:
             x, fields = self.bending.shape(base, pose), known
-        n, surface, columns = len(fields), Surface(x.numpy(), self.faces), fields.movedim(0, -1).numpy()  # (V, 3, n)
+        n, surface, columns = (
+            len(fields),
+            SampledSurface(x.numpy(), self.faces),
+            fields.movedim(0, -1).numpy(),
+        )  # (V, 3, n)
         rows, gaps = [], []
         for own in [*(pairs for cloud in clouds for pairs in cloud.pairs(surface, released)), *markers]:
             off = own.places @ surface.vertices - own.points
