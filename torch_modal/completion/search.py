@@ -96,16 +96,18 @@ class PoseSearch:
         self, starts: Sequence[tuple[Tensor, ModalPose]], clouds: Sequence[Cloud], markers: Sequence[Pairs], soft: float
     ) -> tuple[int, ModalPose, float]:
         """The number of the best of several starts, its pose after limbs were tried, and its score."""
-        poses = [self.descend(*one, clouds, markers, soft=soft) for one in starts]
-        scores = [self.score(base, pose, clouds, markers) for (base, _), pose in zip(starts, poses, strict=True)]
-        k = int(np.argmin(scores))
-        base, pose, best = starts[k][0], poses[k], scores[k]
+        tried = [(k, self.descend(*one, clouds, markers, soft=soft)) for k, one in enumerate(starts)]
+        tried += [(k, start) for k, (_, start) in enumerate(starts)]  # never worse than these
+        scores = [self.score(starts[k][0], pose, clouds, markers) for k, pose in tried]
+        best = min(scores)
+        k, pose = tried[scores.index(best)]
+        base = starts[k][0]
         for _ in range(ROUNDS):
-            tried = [self._tried(base, pose, clouds, markers, soft, *one) for one in self._limbs(base, pose, clouds)]
-            scores = [self.score(base, other, clouds, markers) for other in tried]
-            if not tried or min(scores) > best - GAIN:
+            others = [self._tried(base, pose, clouds, markers, soft, *one) for one in self._limbs(base, pose, clouds)]
+            scores = [self.score(base, other, clouds, markers) for other in others]
+            if not others or min(scores) > best - GAIN:
                 break
-            best, pose = min(scores), tried[int(np.argmin(scores))]
+            best, pose = min(scores), others[int(np.argmin(scores))]
         return k, pose, best
 
     def stiffened(
