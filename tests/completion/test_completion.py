@@ -222,3 +222,11 @@ def test_derivatives_of_the_energy_of_points(tube):
     assert torch.allclose((there - back) / 2e-3, at.slope(field), rtol=1e-6)
     second = (there + back - 2 * at.value) / 1e-6
     assert torch.allclose(second, (field * at.product(field)).sum((1, 2)), rtol=1e-4)
+
+
+def test_points_of_weight_zero_do_not_count_in_a_score(tube):
+    x, faces, _ = tube
+    surface, on, away = SampledSurface(100 * x[0].numpy(), faces.numpy()), 100 * x[0].numpy(), np.full((9, 3), 500.0)
+    weights = np.concatenate([np.full(len(on), 2.0), np.zeros(9)])
+    assert Cloud(np.concatenate([on, away]), None, weights, None).score(surface, 1.0) < 1e-9
+    assert Cloud(away, None, np.full(9, 2.0), None).score(surface, 1.0) == pytest.approx(1, abs=1e-3)

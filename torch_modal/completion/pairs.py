@@ -135,7 +135,7 @@ class Cloud:
     def score(self, surface: SampledSurface, unit: float) -> float:
         """Part of the cloud that the surface leaves out, and of the visible surface that the cloud leaves out."""
         off = self.missed(surface, unit)
-        total = float((self.weights * 1 - 1 / (1 + off)).sum() / self.weights.sum())
+        total = float((self.weights * (1 - 1 / (1 + off))).sum() / self.weights.sum())
         if self.view is not None:
             seen = surface.samples[surface.visible(self.view)]
             gap = (cKDTree(self.points).query(seen)[0] / (3 * unit)) ** 2
