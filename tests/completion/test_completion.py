@@ -7,8 +7,9 @@ import torch
 import torch_modal as tm
 from torch_modal.completion.bending import ModalBending
 from torch_modal.completion.energy import PointEnergy
-from torch_modal.completion.pairs import Cloud, Pairs, SampledSurface, rows
+from torch_modal.completion.pairs import Cloud, Pairs, SampledSurface
 from torch_modal.motion.decoder import scaled
+from torch_modal.registration.surface import places_between
 
 
 @pytest.fixture(scope="module")
@@ -214,7 +215,9 @@ def test_derivatives_of_the_energy_of_points(tube):
     cloud = Cloud(100 * x[1].numpy() + 1, None, np.ones(len(x[1])), None)
     pairs = cloud.pairs(surface)
     normals = np.random.default_rng(0).standard_normal((len(pairs[0].points), 3))
-    markers = Pairs(rows(faces.numpy()[:5], np.full((5, 3), 1 / 3), len(x[0])), np.ones((5, 3)), None, np.ones(5))
+    markers = Pairs(
+        places_between(faces.numpy()[:5], np.full((5, 3), 1 / 3), len(x[0])), np.ones((5, 3)), None, np.ones(5)
+    )
     energy = PointEnergy([pairs[0]._replace(normals=normals / np.linalg.norm(normals, axis=1, keepdims=True)), markers])
     at = energy.at(100 * x[:1])
     field = torch.randn(x[:1].shape, generator=torch.Generator().manual_seed(0), dtype=x.dtype)

@@ -21,10 +21,10 @@ import torch
 import torch_modal as tm
 
 BOUNDS = {
-    "lines": 29392,
-    "lines of code": 18905,
+    "lines": 29407,
+    "lines of code": 18900,
     "files": 198,
-    "functions": 1708,
+    "functions": 1712,
     "named tuples": 58,
     "docstrings that begin with no noun": 7,
     "functions of in-between": 149,

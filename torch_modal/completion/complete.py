@@ -22,7 +22,7 @@ from torch_modal.autograd import lasting
 from torch_modal.completion.bending import ModalBending, ModalPose
 from torch_modal.completion.energy import PointEnergy
 from torch_modal.completion.observation import Observation, checked
-from torch_modal.completion.pairs import Cloud, Pairs, SampledSurface, rows
+from torch_modal.completion.pairs import Cloud, Pairs, SampledSurface
 from torch_modal.completion.search import SOFT, PoseSearch
 from torch_modal.elastic.backend import choose
 from torch_modal.elastic.bend import Bend
@@ -36,13 +36,14 @@ from torch_modal.errors import MeshWarning
 from torch_modal.geometry.canonical import placed
 from torch_modal.geometry.rigid import best_fit
 from torch_modal.geometry.triangle_frames import frames_of, mirrored_sides
-from torch_modal.keyframes.arrays import checked_times
+from torch_modal.keyframes.arrays import checked_times, require_units
 from torch_modal.keyframes.check import checked_arrays
 from torch_modal.modes.coarsening import Coarsening, coarsen
 from torch_modal.modes.extract import extract_bases
 from torch_modal.motion.decoder import scaled
 from torch_modal.motion.path import Path
 from torch_modal.progress import Progress, ProgressReport
+from torch_modal.registration.surface import places_between
 
 N_MODES = 60
 """Modes of the first shape in which poses are searched."""
@@ -70,8 +71,6 @@ NEAR = 2.5
 """Distance from an observed point within which a vertex counts as seen, at a size of 100."""
 NEIGHBOURS = 0.45
 """Confidence of what a neighbour in time saw."""
-UNITS = 8.0
-"""Observations that extend over more or less than the shapes by this factor are in other units."""
 DOUBTFUL = 0.5
 """Part of the points that a shape has to explain."""
 
@@ -185,7 +184,7 @@ def complete(
     like, shapes, indices = checked_arrays(whole[None] if is_template else whole, faces)
     given = checked(observations, shapes.shape[1])
     at = np.zeros(0) if is_template else _times(times, len(shapes))
-    solver = _Completer(shapes, torch.from_numpy(indices), at, given, [list(observations).index(one) for one in given])
+    solver = _Completer(shapes, torch.from_numpy(indices), at, given)
     with ProgressReport(len(solver.frames) * (3 + ROUNDS), "completing", progress) as report:
         solver.search(report)
         solver.refine(report)
@@ -201,18 +200,17 @@ def _times(times: Tensor | Sequence[float] | None, n: int) -> FloatArray:
 class _Completer:
     """The solver, at a size of 100 in the axes of the first shape."""
 
-    def __init__(
-        self, shapes: FloatArray, faces: Tensor, times: FloatArray, given: list[Observation], order: list[int]
-    ) -> None:
+    def __init__(self, shapes: FloatArray, faces: Tensor, times: FloatArray, given: list[Observation]) -> None:
         self.faces, self.times, self.n = faces, times, len(given)
         _, self.axes, self.centre, self.scale = placed(shapes[0], faces.numpy())
         self.whole = torch.from_numpy((shapes - self.centre) @ self.axes.T * self.scale)
         self.template = self.whole[0]
-        samples = [self._sample(one, i) for one, i in zip(given, order, strict=True)]
+        samples = [self._sample(one, i) for i, one in enumerate(given)]
         every = sorted({one.time for one in given})
         self.frames = [_Frame(t, [one for one in samples if one.observation.time == t]) for t in every]
         mesh = Mesh.of(faces, shapes.shape[1])
-        closed = all(encloses(x, mesh.connectivity) for x in self.whole)
+        self.mesh = mesh.connectivity
+        closed = all(encloses(x, self.mesh) for x in self.whole)
         self.stiffness = ALPHA, BETA, GAMMA if closed else 0.0
         self.fine: FineEnergy = choose("auto").fine_energy(mesh, [Stretch(ALPHA), Bend(BETA), Volume(GAMMA)])
         basis = extract_bases(self.template[None], faces, N_MODES)[0]
@@ -234,7 +232,7 @@ class _Completer:
 
     def _sample(self, one: Observation, number: int) -> _Sample:
         """An observation at a size of 100; raises where it is in other units."""
-        points, own = self._placed(one.points), self.template.numpy()[np.unique(self.faces.numpy())]
+        points, known = self._placed(one.points), self.template[self.faces.unique()]
         weights = np.ones(len(points)) if one.weights is None else one.weights.cpu().double().numpy()
         seen: Cloud | Pairs
         if one.is_cloud:
@@ -242,14 +240,10 @@ class _Completer:
             seen = Cloud(points, normals, weights, view)
         else:
             corners, barycentric = one.places()
-            places = rows(corners.cpu().numpy(), barycentric.cpu().double().numpy(), len(self.template))
-            seen, own = Pairs(places, points, None, weights / weights.sum()), places @ self.template.numpy()
-        extent, usual = (float(np.median(np.linalg.norm(x - np.median(x, 0), axis=1))) for x in (points, own))
-        if not usual / UNITS <= extent <= usual * UNITS:
-            raise ValueError(
-                f"{one}: the points extend over {extent / self.scale:.3g} around their middle, the first shape over "
-                f"{usual / self.scale:.3g}: they are in other units, or of something else; scale them to its units"
-            )
+            places = places_between(corners.cpu().numpy(), barycentric.cpu().double().numpy(), len(self.template))
+            seen = Pairs(places, points, None, weights / weights.sum())
+            known = torch.from_numpy(places @ self.template.numpy())
+        require_units(f"{one}: the points", torch.from_numpy(points), "the first shape", known[None], 1 / self.scale)
         return _Sample(one, number, seen, 0.0 if one.noise is None else max(one.noise * self.scale, NOISES[0]))
 
     # ------------------------------------------------------------------------------------------------- poses of frames
@@ -349,11 +343,12 @@ class _Completer:
         """Steps of all vertices of all frames, with new pairs and new neighbours in each round."""
         x = torch.stack(self.x)
         for frame, own in zip(self.frames, self.x, strict=True):
-            surface = SampledSurface(own.numpy(), self.faces.numpy())
+            surface = SampledSurface(own.numpy(), self.mesh)
             frame.samples = [self._with_noise(one, surface) for one in frame.samples]
         stiffness = [x.new_full((1, 1), value) for value in self.stiffness]
+        numbers, weights = self._rests()
         for _ in range(ROUNDS):
-            shapes, weights = self._rests(x)
+            shapes = torch.cat([torch.stack(self.x), self.whole, x])[numbers]
             for i, frame in enumerate(self.frames):
                 some = slice(i, i + 1)
                 energy = self._points(frame, x[i])
@@ -370,34 +365,33 @@ class _Completer:
         median = float(np.median(one.off(surface)[0])) / (0.6745 if isinstance(one.seen, Cloud) else 1.538)
         return one._replace(noise=float(np.clip(median, *NOISES)))
 
-    def _rests(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Whole shapes and neighbours in time of each frame, and their weights. *Shape:* ``(T, 4, V, 3), (T, 4)``."""
-        at, rows, weights = np.array([frame.time for frame in self.frames]), [], []
-        times = np.concatenate([self.times, at])
-        every = torch.cat([self.whole, x]) if len(self.times) else x
-        for i, t in enumerate(at):
-            others = np.arange(len(times)) != len(self.times) + i
-            row, parts = [self.x[i]], [OWN]
-            for share, pool, shapes in (
-                (WHOLE, self.times, self.whole),
-                (1 - OWN - WHOLE, times[others], every[others]),
+    def _rests(self) -> tuple[Tensor, Tensor]:
+        """Rest shapes of each frame, and their weights: its own by modes, whole ones, and neighbours in time.
+
+        Numbers are those of frames by modes, whole shapes, and frames as they are. *Shape of each:* ``(T, 5)``.
+        """
+        n, times = len(self.frames), np.array([frame.time for frame in self.frames])
+        whole = np.arange(n, n + len(self.whole))
+        frames = np.arange(n + len(self.whole), 2 * n + len(self.whole))
+        every, numbers = np.concatenate([self.times, times]), np.concatenate([whole[: len(self.times)], frames])
+        rows, weights = [], []
+        for i, t in enumerate(times):
+            others = numbers != frames[i]
+            row, parts = [i], [OWN]
+            for share, pool, own in (
+                (WHOLE, self.times, whole),
+                (1 - OWN - WHOLE, every[others], numbers[others]),
             ):
-                if not len(pool):
-                    row, parts = [*row, self.template, self.template], [*parts, share / 2, share / 2]
-                    continue
-                before = int(np.searchsorted(np.sort(pool), t, side="right")) - 1
-                order = np.argsort(pool, kind="stable")
-                first, last = max(before, 0), min(before + 1, len(pool) - 1)
-                gap = pool[order[last]] - pool[order[first]]
-                u = float(np.clip((t - pool[order[first]]) / gap, 0, 1)) if gap > 0 else 0.0
-                row, parts = [*row, shapes[order[first]], shapes[order[last]]], [*parts, share * (1 - u), share * u]
-            rows.append(torch.stack(row))
+                first, last, u = _around(pool, t) if len(pool) else (0, 0, 0.0)
+                own = own if len(pool) else whole  # the template, or one frame alone
+                row, parts = [*row, own[first], own[last]], [*parts, share * (1 - u), share * u]
+            rows.append(row)
             weights.append(parts)
-        return torch.stack(rows), torch.tensor(weights, dtype=torch.float64)
+        return torch.tensor(np.array(rows)), torch.tensor(weights, dtype=torch.float64)
 
     def _points(self, frame: _Frame, x: Tensor) -> PointEnergy:
         """The energy of what was seen at a frame."""
-        surface, found = SampledSurface(x.numpy(), self.faces.numpy()), []
+        surface, found = SampledSurface(x.numpy(), self.mesh), []
         for sample in frame.samples:
             for one in sample.seen.pairs(surface) if isinstance(sample.seen, Cloud) else [sample.seen]:
                 counts = robust(np.linalg.norm(one.places @ surface.vertices - one.points, axis=1), sample.noise)
@@ -412,7 +406,7 @@ class _Completer:
         misses: list[Tensor] = [like.new_zeros(0)] * self.n
         trust, seen, poor = list(misses), x.new_zeros(x.shape[:2]), []
         for i, frame in enumerate(self.frames):
-            surface = SampledSurface(x[i].numpy(), self.faces.numpy())
+            surface = SampledSurface(x[i].numpy(), self.mesh)
             for one in frame.samples:
                 off, agree = one.off(surface)
                 counts = agree * robust(off, one.noise)
@@ -447,6 +441,15 @@ class _Completer:
 
     def _restored(self, x: Tensor) -> Tensor:
         return (x / self.scale) @ torch.from_numpy(self.axes) + torch.from_numpy(self.centre)
+
+
+def _around(times: FloatArray, t: float) -> tuple[int, int, float]:
+    """Indices of the last time before another and of the first after, and how far between; the nearest, outside."""
+    order = np.argsort(times, kind="stable")
+    before = int(np.searchsorted(times[order], t, side="right")) - 1
+    first, last = order[max(before, 0)], order[min(before + 1, len(times) - 1)]
+    gap = times[last] - times[first]
+    return int(first), int(last), float(np.clip((t - times[first]) / gap, 0, 1)) if gap > 0 else 0.0
 
 
 def robust(off: FloatArray, noise: float) -> FloatArray:

@@ -7,11 +7,8 @@ import torch
 from scipy import sparse
 from torch import Tensor
 
-from torch_modal.completion.pairs import Pairs
+from torch_modal.completion.pairs import SLIDE, Pairs
 from torch_modal.elastic.steps import Point
-
-# Part of the stiffness of a pair with a normal that is left along the surface.
-SLIDE = 0.3
 
 
 class PointEnergy:

@@ -116,7 +116,7 @@ class Observation:
 
 
 def checked(observations: Sequence[Observation], n_vertices: int) -> list[Observation]:
-    """The observations in the order of their times; raises a ValueError where one does not fit the mesh."""
+    """The observations as a list; raises a ValueError where one does not fit the mesh."""
     if isinstance(observations, Observation):
         raise ValueError("observations are a list of torch_modal.Observation; got one alone")
     given = list(observations)
@@ -130,4 +130,4 @@ def checked(observations: Sequence[Observation], n_vertices: int) -> list[Observ
                 raise ValueError(
                     f"{one}: vertices lie in 0 to {n_vertices - 1}; got {int(corners.min())} to {int(corners.max())}"
                 )
-    return sorted(given, key=lambda one: one.time)
+    return given

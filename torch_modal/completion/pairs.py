@@ -1,6 +1,7 @@
 """Pairs of observed points and places on a surface: by position and normal, in both directions, robust."""
 
-from typing import NamedTuple
+from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import sparse
@@ -9,10 +10,14 @@ from scipy.spatial import cKDTree
 
 from torch_modal.arrays import BoolArray, FloatArray, IntArray
 from torch_modal.geometry.closest import closest_on_triangles, dot
+from torch_modal.geometry.connectivity import Connectivity
+from torch_modal.registration.surface import MeshSurface, places_between
 
 # Places of each triangle that are candidates: its middle, and one near each corner.
 _PLACES = np.array([[2, 2, 2], [4, 1, 1], [1, 4, 1], [1, 1, 4]]) / 6
 
+# Part of the stiffness of a pair with a normal that is left along the surface.
+SLIDE = 0.3
 # Weight of normals: at a size of 100, a distance of 3 counts as much as 60 degrees.
 LEAN = 3.0
 # Smallest cosine between the normals of a pair.
@@ -36,37 +41,27 @@ class Pairs(NamedTuple):
     """*Shape:* ``(n,)``."""
 
 
-def rows(corners: IntArray, barycentric: FloatArray, n_vertices: int) -> sparse.csr_matrix:
-    """Places between three vertices as a matrix. *Shape:* ``(n, 3), (n, 3) -> (n, V)``."""
-    n = len(corners)
-    where = np.repeat(np.arange(n), 3), corners.reshape(-1)
-    return sparse.csr_matrix((barycentric.reshape(-1), where), shape=(n, n_vertices))
+def featured(points: FloatArray, normals: FloatArray | None) -> FloatArray:
+    """Points with their normals, as places of which near ones are alike. *Shape:* ``(n, 3), (n, 3) -> (n, 6)``."""
+    return points if normals is None else np.hstack([points, LEAN * normals])
 
 
-class SampledSurface:
-    """A shape at a size of 100, with places on its faces that may be paired. *Shape:* ``(V, 3), (F, 3)``."""
+class SampledSurface(MeshSurface):
+    """A shape at a size of 100, with places on its faces that may be paired."""
 
-    def __init__(self, vertices: FloatArray, faces: IntArray) -> None:
-        self.vertices, self.faces = vertices, faces
-        corners = vertices[faces]
-        across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        self.normals = across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-300)
-        self.samples = (_PLACES @ corners).reshape(-1, 3)
-        self.sample_faces = np.arange(len(faces)).repeat(len(_PLACES))
+    def __init__(self, vertices: FloatArray, faces: IntArray | Connectivity) -> None:
+        super().__init__(vertices, faces)
+        self.samples = (_PLACES @ self.vertices[self.faces]).reshape(-1, 3)
+        self.sample_faces = np.arange(len(self.faces)).repeat(len(_PLACES))
 
-    def featured(self, points: FloatArray, normals: FloatArray | None) -> FloatArray:
-        """Points with their normals, as places of which near ones are alike."""
-        return points if normals is None else np.hstack([points, LEAN * normals])
-
-    def closest(
+    def most_alike(
         self, points: FloatArray, normals: FloatArray | None
     ) -> tuple[IntArray, FloatArray, FloatArray, BoolArray]:
         """Face and coordinates of the place that looks most like each point, the distance, and if normals agree."""
-        own = None if normals is None else self.normals[self.sample_faces]
-        tree = cKDTree(self.featured(self.samples, own))
-        face = self.sample_faces[tree.query(self.featured(points, normals))[1]]
+        own = None if normals is None else self.face_normals[self.sample_faces]
+        face = self.sample_faces[cKDTree(featured(self.samples, own)).query(featured(points, normals))[1]]
         barycentric, distances = closest_on_triangles(points, self.vertices[self.faces[face]])
-        agree = np.ones(len(points), bool) if normals is None else dot(self.normals[face], normals) > ALIKE
+        agree = np.ones(len(points), bool) if normals is None else dot(self.face_normals[face], normals) > ALIKE
         return face, barycentric, distances, agree
 
     def visible(self, view: FloatArray) -> IntArray:
@@ -77,12 +72,12 @@ class SampledSurface:
         _, cell = np.unique(cells @ [1, cells[:, 0].max() + 1], return_inverse=True)
         nearest = np.full(cell.max() + 1, -np.inf)
         np.maximum.at(nearest, cell.ravel(), depth)
-        front = self.normals[self.sample_faces] @ view > GRAZING
+        front = self.face_normals[self.sample_faces] @ view > GRAZING
         return np.flatnonzero(front & (nearest[cell.ravel()] - depth < DEPTH))
 
 
 class Cloud:
-    """A cloud at the scale of the solver, thinned to some of its points."""
+    """A cloud at a size of 100."""
 
     def __init__(
         self, points: FloatArray, normals: FloatArray | None, weights: FloatArray, view: FloatArray | None
@@ -97,9 +92,22 @@ class Cloud:
         normals = None if self.normals is None else self.normals[kept]
         return Cloud(self.points[kept], normals, self.weights[kept], self.view)
 
+    @cached_property
+    def _tree(self) -> Any:
+        return cKDTree(self.points)
+
+    @cached_property
+    def _featured(self) -> Any:
+        return cKDTree(featured(self.points, self.normals))
+
+    @cached_property
+    def usual_gap(self) -> float:
+        """The usual distance of a neighbour."""
+        return float(np.median(self._tree.query(self.points, min(N_NEIGHBOURS, len(self.points)))[0][:, -1]))
+
     def closest(self, surface: SampledSurface) -> tuple[IntArray, FloatArray, FloatArray, BoolArray]:
-        """:meth:`SampledSurface.closest` of its points."""
-        return surface.closest(self.points, self.normals)
+        """:meth:`SampledSurface.most_alike` of its points."""
+        return surface.most_alike(self.points, self.normals)
 
     def pairs(self, surface: SampledSurface, released: BoolArray | None = None) -> list[Pairs]:
         """Places for the points, and, where the view is known, points for the visible places."""
@@ -110,20 +118,21 @@ class Cloud:
         kept = np.flatnonzero(agree)
         normals = None if self.normals is None else self.normals[kept]
         share = self.weights[kept] / self.weights.sum()
-        found = [Pairs(rows(surface.faces[face[kept]], barycentric[kept], n), self.points[kept], normals, share)]
+        found = [
+            Pairs(places_between(surface.faces[face[kept]], barycentric[kept], n), self.points[kept], normals, share)
+        ]
         if self.view is None or self.normals is None:
             return found
         seen = surface.visible(self.view)
         seen = seen[:: max(1, len(seen) // len(self.points))]
         faces = surface.sample_faces[seen]
-        queries = surface.featured(surface.samples[seen], surface.normals[faces])
-        nearest = cKDTree(surface.featured(self.points, self.normals)).query(queries)[1]
-        agree = dot(surface.normals[faces], self.normals[nearest]) > ALIKE
+        nearest = self._featured.query(featured(surface.samples[seen], surface.face_normals[faces]))[1]
+        agree = dot(surface.face_normals[faces], self.normals[nearest]) > ALIKE
         if released is not None:
             agree &= ~released[surface.faces[faces]].any(1)
         seen, faces, nearest = seen[agree], faces[agree], nearest[agree]
         if len(seen):
-            places = rows(surface.faces[faces], _PLACES[seen % len(_PLACES)], n)
+            places = places_between(surface.faces[faces], _PLACES[seen % len(_PLACES)], n)
             found.append(Pairs(places, self.points[nearest], self.normals[nearest], np.full(len(seen), 1 / len(seen))))
         return found
 
@@ -138,7 +147,7 @@ class Cloud:
         total = float((self.weights * (1 - 1 / (1 + off))).sum() / self.weights.sum())
         if self.view is not None:
             seen = surface.samples[surface.visible(self.view)]
-            gap = (cKDTree(self.points).query(seen)[0] / (3 * unit)) ** 2
+            gap = (self._tree.query(seen)[0] / (3 * unit)) ** 2
             total += float((gap / (1 + gap)).mean()) if len(seen) else 1.0
         return total
 
@@ -147,9 +156,7 @@ class Cloud:
         off = np.flatnonzero(self.missed(surface, reach) > 1)
         if len(off) < least:
             return []
-        tree = cKDTree(self.points)
-        usual = np.median(tree.query(self.points, min(N_NEIGHBOURS, len(self.points)))[0][:, -1])
-        pairs = cKDTree(self.points[off]).query_pairs(GAP / 2 * usual, output_type="ndarray")
+        pairs = cKDTree(self.points[off]).query_pairs(GAP / 2 * self.usual_gap, output_type="ndarray")
         graph = sparse.coo_matrix((np.ones(len(pairs)), pairs.T), shape=(len(off), len(off)))
         labels = connected_components(graph, directed=False)[1]
         groups = [off[labels == label] for label in np.unique(labels)]

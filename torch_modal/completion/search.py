@@ -5,14 +5,14 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 from scipy import sparse
-from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from torch_modal.arrays import BoolArray, FloatArray, IntArray
+from torch_modal.arrays import BoolArray, FloatArray
 from torch_modal.completion.bending import ModalBending, ModalPose
-from torch_modal.completion.pairs import Cloud, Pairs, SampledSurface
+from torch_modal.completion.pairs import SLIDE, Cloud, Pairs, SampledSurface
 from torch_modal.geometry.closest import dot
+from torch_modal.geometry.connectivity import Connectivity, farthest_apart
 
 # Steps, and the distance from which on pairs lose weight at the first and the last; stiffness of the modes likewise.
 STEPS, FAR, NEAR = 12, 20.0, 2.0
@@ -21,8 +21,6 @@ N_POINTS = 800
 STIFF, SOFT, STIFFER = 1e-2, 3e-5, (1e-4, 1e-3, 1e-2)
 # Stiffness of a turn and a move of the whole.
 OF_MOTIONS = 1e-2
-# Part of the pull of a pair that is left along the surface.
-SLIDE = 0.3
 # Largest move of a vertex in one step.
 LARGEST_STEP = 6.0
 
@@ -46,14 +44,19 @@ class PoseSearch:
     """
 
     def __init__(self, bending: ModalBending, eigenvalues: Tensor) -> None:
-        self.bending, self.faces = bending, bending.faces.numpy()
+        self.bending = bending
+        self.mesh = Connectivity(bending.faces.numpy(), len(bending.reference))
         relative = eigenvalues / eigenvalues[:1]
         self.stiffness = torch.cat([relative, relative.new_full((6,), OF_MOTIONS)])
-        self.tips, self.from_tips = _tips(bending.reference.numpy(), bending.reconstruction.edges.numpy())
+        x, (i, j) = bending.reference.numpy(), self.mesh.edges.T
+        lengths = np.maximum(np.linalg.norm(x[i] - x[j], axis=1), 1e-9)
+        graph = sparse.coo_matrix((lengths, (i, j)), shape=(len(x), len(x)))
+        #: Ends of limbs, and the distances along the surface from each. *Shape:* ``(n,), (n, V)``.
+        self.tips, self.from_tips = farthest_apart((graph + graph.T).tocsr(), self.mesh.used, N_TIPS)
 
     def surface(self, base: Tensor, pose: ModalPose) -> SampledSurface:
         """The deformed shape."""
-        return SampledSurface(self.bending.shape(base, pose).numpy(), self.faces)
+        return SampledSurface(self.bending.shape(base, pose).numpy(), self.mesh)
 
     def score(self, base: Tensor, pose: ModalPose, clouds: Sequence[Cloud], markers: Sequence[Pairs] = ()) -> float:
         """How much is left unexplained, from 0 on."""
@@ -154,9 +157,7 @@ class PoseSearch:
         shift, fields, thinned = points.mean(0) - x.mean(0), None, [one.thinned(N_POINTS) for one in clouds]
         for k in range(STEPS // 2):
             nearest = vertices[cKDTree(x + (shift if k == 0 else 0)).query(points)[1]]
-            places = sparse.csr_matrix(
-                (np.ones(len(points)), (np.arange(len(points)), nearest)), shape=(len(points), len(limb))
-            )
+            places = sparse.identity(len(limb), format="csr")[nearest]
             own = Pairs(places, points, None, np.full(len(points), WEIGHT / len(cloud.points)))
             known = fields if k % 2 else None
             pose, fields = self._step(base, pose, thinned, [*markers, own], MOST_AWAY, soft, limb, known=known)
@@ -183,11 +184,8 @@ class PoseSearch:
             x, fields = self.bending.linearised(base, pose, rigid)
         else:
             x, fields = self.bending.shape(base, pose), known
-        n, surface, columns = (
-            len(fields),
-            SampledSurface(x.numpy(), self.faces),
-            fields.movedim(0, -1).numpy(),
-        )  # (V, 3, n)
+        n, surface = len(fields), SampledSurface(x.numpy(), self.mesh)
+        columns = fields.movedim(0, -1).numpy()  # (V, 3, n)
         rows, gaps = [], []
         for own in [*(pairs for cloud in clouds for pairs in cloud.pairs(surface, released)), *markers]:
             off = own.places @ surface.vertices - own.points
@@ -208,19 +206,3 @@ class PoseSearch:
         step = -torch.linalg.solve(matrix, slope)
         largest = float((fields.movedim(0, -1) @ step).norm(dim=-1).max()) / LARGEST_STEP
         return self.bending.stepped(pose, step / max(1.0, largest), x.mean(0)), fields
-
-
-def _tips(x: FloatArray, edges: IntArray) -> tuple[IntArray, FloatArray]:
-    """Vertices far from each other along the surface, ends of limbs first, and the distances from each.
-
-    *Shape:* ``(n,), (n, V)``.
-    """
-    i, j = edges.T
-    lengths = np.maximum(np.linalg.norm(x[i] - x[j], axis=1), 1e-9)
-    graph = sparse.coo_matrix((lengths, (i, j)), shape=(len(x), len(x))).tocsr()
-    nearest, tips, rows = dijkstra(graph, directed=False, indices=int(i[0])), [], []
-    for _ in range(N_TIPS):
-        tips.append(int(np.where(np.isfinite(nearest), nearest, -1).argmax()))
-        rows.append(dijkstra(graph, directed=False, indices=tips[-1]))
-        nearest = np.min(rows, 0)
-    return np.array(tips), np.stack(rows)

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 from scipy import sparse
-from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
+from scipy.sparse.csgraph import breadth_first_order, connected_components, dijkstra, minimum_spanning_tree
 from scipy.spatial import cKDTree
 
 from torch_modal.arrays import FloatArray, IntArray
@@ -173,3 +173,21 @@ def vertex_areas(vertices: FloatArray, faces: IntArray) -> FloatArray:
     """A third of the area of the incident faces of each vertex. *Shape:* ``(V,)``."""
     summed = np.bincount(faces.reshape(-1), np.repeat(double_areas(vertices, faces) / 6, 3), minlength=len(vertices))
     return summed.astype(np.float64)  # integers if there are no faces
+
+
+def farthest_apart(graph: sparse.csr_matrix, among: IntArray, n: int) -> tuple[IntArray, FloatArray]:
+    """Vertices far from each other along a graph, fewer where no more can be reached, and the distances from each.
+
+    Each is the one farthest from those before; the first is the farthest from some vertex. *Shape:* ``(V, V), (m,) ->
+    (k,), (k, V)``.
+    """
+    found: list[int] = []
+    nearest, rows = dijkstra(graph, indices=among[0]), []
+    while len(found) < n:
+        reachable = np.where(np.isfinite(nearest[among]), nearest[among], 0)
+        if found and not reachable.max() > 0:
+            break
+        found.append(int(among[reachable.argmax()]))
+        rows.append(dijkstra(graph, indices=found[-1]))
+        nearest = np.min(rows, axis=0)
+    return np.array(found), np.stack(rows)

@@ -11,6 +11,9 @@ from torch_modal.arrays import IntArray
 from torch_modal.errors import MeshError
 from torch_modal.geometry.connectivity import merge_seams
 
+UNITS = 8.0
+"""Points that extend over more or less than known ones by this factor are in other units."""
+
 
 def as_positions(keyframes: Any) -> Tensor:
     """Convert positions to a float tensor, sharing memory where possible."""
@@ -153,3 +156,25 @@ def weld_seams(keyframes: Any, faces: Any) -> WeldedKeyframes:
         torch.from_numpy(joined[whole]).to(positions.device),
         torch.from_numpy(vertex_of).to(positions.device),
     )
+
+
+def require_units(name: str, points: Tensor, of: str, known: Tensor, unit: float = 1.0) -> None:
+    """Raise for points that extend far less, or far more, than known ones of each shape.
+
+    Args:
+        name: Of the points.
+        points: *Shape:* ``(n, 3)``.
+        of: Says what is known.
+        known: *Shape:* ``(K, m, 3)``.
+        unit: Length of a coordinate of 1, for the message.
+
+    Raises:
+        ValueError: By more than :data:`UNITS`.
+    """
+    # By medians, which a few outliers do not change.
+    extent, *others = [float((x - x.median(0).values).norm(dim=-1).median()) * unit for x in (points, *known)]
+    if not min(others) / UNITS <= extent <= max(others) * UNITS:
+        raise ValueError(
+            f"{name} extend over {extent:.3g} around their middle, {of} over {min(others):.3g} to {max(others):.3g}: "
+            "they are in other units; scale them to those of the key-frames"
+        )

@@ -32,6 +32,13 @@ class Closest(NamedTuple):
     barycentric: FloatArray
 
 
+def places_between(corners: IntArray, barycentric: FloatArray, n_vertices: int) -> sparse.csr_matrix:
+    """Interpolation matrix from vertices to places between three. *Shape:* ``(n, 3), (n, 3) -> (n, V)``."""
+    n = len(corners)
+    where = np.repeat(np.arange(n), 3), corners.reshape(-1)
+    return sparse.csr_matrix((barycentric.reshape(-1), where), shape=(n, n_vertices))
+
+
 class MeshSurface:
     """A triangle mesh with cached derived quantities. *Shape:* ``(V, 3)``, and ``(F, 3)`` or a connectivity."""
 
@@ -104,9 +111,7 @@ class MeshSurface:
 
     def rows(self, closest: Closest) -> sparse.csr_matrix:
         """Interpolation matrix from vertices to closest points. *Shape:* ``(n, V)``."""
-        n = len(closest.faces)
-        where = (np.repeat(np.arange(n), 3), self.faces[closest.faces].reshape(-1))
-        return sparse.csr_matrix((closest.barycentric.reshape(-1), where), shape=(n, len(self.vertices)))
+        return places_between(self.faces[closest.faces], closest.barycentric, len(self.vertices))
 
     def on_open_edge(self, closest: Closest) -> BoolArray:
         """Closest points on the boundary, as a mask: their true counterpart may be missing. *Shape:* ``(n,)``."""

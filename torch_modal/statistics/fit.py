@@ -8,6 +8,7 @@ from torch import Tensor
 
 from torch_modal.autograd import transformed
 from torch_modal.contact.active import Pull
+from torch_modal.keyframes.arrays import require_units
 from torch_modal.statistics.local_weights import NOISE, LocalWeights, Observations
 from torch_modal.statistics.variation import Variation, bounded
 
@@ -20,9 +21,6 @@ FIRST_ROUND, NEXT_ROUND, N_ROUNDS = (6, 40), (4, 40), 3
 
 # Mean distance, in sizes, by which the result may be farther from the points than a given shape.
 SLACK = 1e-3
-
-# Points that extend over more or less than the same vertices of the key-frames by this factor are in other units.
-UNITS = 8.0
 
 
 class Fitted(NamedTuple):
@@ -90,7 +88,8 @@ def _fit_one(variation: Variation, every: Observations, about: Tensor, robust: b
     """
     seen = every.weights > 0
     to = Observations(*(part[seen] for part in every))
-    _check_units(variation, to)
+    same = "the same vertices of the key-frames"
+    require_units("the points", to.points.detach(), same, variation.shapes[:, to.vertices])
     given = LocalWeights(variation, to, about, noise)
     factors, to = given.solved(robust)
     weights = given.weights(factors)
@@ -118,18 +117,6 @@ def _fit_one(variation: Variation, every: Observations, about: Tensor, robust: b
     misses, trust = every.missed(shape).detach(), torch.zeros_like(every.weights)
     misses[seen], trust[seen] = to.missed(shape), to.weights
     return Fitted(shape, own, misses, trust)
-
-
-def _check_units(variation: Variation, to: Observations) -> None:
-    """Raise for points that extend far less, or far more, than the same vertices of all key-frames."""
-    seen = torch.cat([to.points.detach()[None], variation.shapes[:, to.vertices]])
-    # By medians, which a few outliers do not change.
-    extent, *known = (seen - seen.median(1, keepdim=True).values).norm(dim=-1).median(1).values.tolist()
-    if not min(known) / UNITS <= extent <= max(known) * UNITS:
-        raise ValueError(
-            f"the points extend over {extent:.3g} around their middle, the same vertices of the key-frames over "
-            f"{min(known):.3g} to {max(known):.3g}: they are in other units; scale them to those of the key-frames"
-        )
 
 
 def _checked(points: Tensor, vertices: Tensor, weights: Tensor | None, n_vertices: int) -> Observations:

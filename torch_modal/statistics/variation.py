@@ -5,7 +5,6 @@ from functools import cached_property
 import numpy as np
 import torch
 from scipy import sparse
-from scipy.sparse.csgraph import dijkstra
 from torch import Tensor
 from torch.nn.functional import one_hot
 
@@ -18,6 +17,7 @@ from torch_modal.elastic.stretch import Stretch
 from torch_modal.elastic.term import Mesh
 from torch_modal.elastic.volume import Volume, encloses
 from torch_modal.geometry.canonical import CANONICAL_SIZE
+from torch_modal.geometry.connectivity import farthest_apart
 from torch_modal.geometry.poisson import Reconstruction
 from torch_modal.geometry.rigid import best_rotation
 from torch_modal.geometry.triangle_frames import frames, sides
@@ -179,18 +179,9 @@ class Patches:
 
     def __init__(self, mean: Tensor, reconstruction: Reconstruction) -> None:
         graph, used = _graph(mean, reconstruction), np.unique(reconstruction.faces.numpy())
-        # Each centre is the vertex farthest from those before; the first is the farthest from some vertex.
-        centres: list[int] = []
-        nearest, found = dijkstra(graph, indices=used[0]), []
-        while len(centres) < N_PATCHES:
-            reachable = np.where(np.isfinite(nearest[used]), nearest[used], 0)
-            if centres and not reachable.max() > 0:
-                break
-            centres.append(int(used[reachable.argmax()]))
-            found.append(dijkstra(graph, indices=centres[-1]))
-            nearest = np.min(found, axis=0)
+        centres, found = farthest_apart(graph, used, N_PATCHES)
+        nearest, distances = found.min(axis=0), torch.from_numpy(found)
         reach = OVERLAP * nearest[np.isfinite(nearest)].max()
-        distances = torch.from_numpy(np.stack(found))
         bumps = torch.exp(-2 * (distances / max(reach, np.finfo(float).tiny)) ** 2)
         #: Part of each vertex that belongs to each patch. *Shape:* ``(P, V)``.
         self.shares = bumps / bumps.sum(0).clamp_min(torch.finfo(bumps.dtype).tiny)
