@@ -1,5 +1,7 @@
 """Motions from partial and noisy samples, against motions that are known."""
 
+import copy
+
 import numpy as np
 import pytest
 import torch
@@ -7,7 +9,10 @@ import torch
 import torch_modal as tm
 from torch_modal.completion.bending import ModalBending
 from torch_modal.completion.energy import PointEnergy
+from torch_modal.completion.gradient import LastSolve
 from torch_modal.completion.pairs import Cloud, Pairs, SampledSurface
+from torch_modal.elastic.steps import FineEnergy
+from torch_modal.elastic.term import Mesh
 from torch_modal.motion.decoder import scaled
 from torch_modal.registration.surface import places_between
 
@@ -206,7 +211,9 @@ def test_derivatives_of_modal_bending(tube):
     for k in range(12):
         step = 1e-5 * torch.eye(12, dtype=x.dtype)[k]
         there, back = (bending.shape(100 * x[1], bending.stepped(pose, s * step, shape.mean(0))) for s in (1, -1))
-        assert torch.allclose((there - back) / 2e-5, fields[k], atol=1e-6 * float(fields[k].abs().max()) + 1e-8)
+        assert torch.allclose(
+            (there - back) / 2e-5, fields[..., k], atol=1e-6 * float(fields[..., k].abs().max()) + 1e-8
+        )
 
 
 def test_derivatives_of_the_energy_of_points(tube):
@@ -216,7 +223,11 @@ def test_derivatives_of_the_energy_of_points(tube):
     pairs = cloud.pairs(surface)
     normals = np.random.default_rng(0).standard_normal((len(pairs[0].points), 3))
     markers = Pairs(
-        places_between(faces.numpy()[:5], np.full((5, 3), 1 / 3), len(x[0])), np.ones((5, 3)), None, np.ones(5)
+        places_between(faces.numpy()[:5], np.full((5, 3), 1 / 3), len(x[0])),
+        np.ones((5, 3)),
+        None,
+        np.ones(5),
+        np.arange(5),
     )
     energy = PointEnergy([pairs[0]._replace(normals=normals / np.linalg.norm(normals, axis=1, keepdims=True)), markers])
     at = energy.at(100 * x[:1])
@@ -233,3 +244,60 @@ def test_points_of_weight_zero_do_not_count_in_a_score(tube):
     weights = np.concatenate([np.full(len(on), 2.0), np.zeros(9)])
     assert Cloud(np.concatenate([on, away]), None, weights, None).score(surface, 1.0) < 1e-9
     assert Cloud(away, None, np.full(9, 2.0), None).score(surface, 1.0) == pytest.approx(1, abs=1e-3)
+
+
+@pytest.mark.parametrize("kind", ["markers", "cloud"])
+def test_gradients_in_points(tube, kind):
+    """Against differences of the last minimisation, with its pairs: every point, in turned and scaled coordinates."""
+    x, faces, _ = tube
+    turn = torch.linalg.qr(torch.randn(3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(2)))[0]
+    turn = turn * turn.det()
+    x = 1000 * x @ turn.mT + 5
+    if kind == "markers":
+        vertices = torch.arange(0, len(x[1]), 9)
+        seen = tm.Observation(1.0, (x[1, vertices] + 4).clone(), vertices=vertices, noise=8.0)
+    else:
+        seen = scanned(x[1], faces, 1.0, turn.numpy() @ VIEWS[1], noise=2.0)
+    points = seen.points.clone().requires_grad_()
+    seen = tm.Observation(1.0, points, seen.normals, seen.vertices, noise=seen.noise, view=seen.view)
+    solves = []
+
+    def keep(*given):
+        solves.append(LastSolve(*given))
+        return solves[-1]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("torch_modal.completion.complete.LastSolve", keep)
+        found = tm.complete(x[::2], faces, [seen], times=[0.0, 2.0, 4.0])
+    probe = torch.randn(x[1].shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    (slope,) = torch.autograd.grad((found.shapes[0] * probe).sum(), points)
+    (same,) = torch.autograd.grad((found(1.0) * probe).sum(), points)
+    assert torch.allclose(slope, same, rtol=1e-6, atol=1e-9)
+
+    last, step = solves[-1], 1e-3
+    axes = torch.linalg.lstsq(  # of the solve, from the coordinates of points there and here
+        seen.points.detach()[last.points.numbers] - seen.points.detach()[last.points.numbers[0]],
+        last.points.points - last.points.points[0],
+    ).solution
+    scale = float(axes.det()) ** (1 / 3)
+    moves = torch.randn(points.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    ends = []
+    for sign in (-1, 1):
+        springs = copy.copy(last.points)
+        springs.points = last.points.points + sign * step * (moves @ axes)[last.points.numbers]
+        fine = FineEnergy(Mesh.of(faces, len(x[1])), [part.term for part in last.energy.parts])
+        ends.append(fine.relax(last.x, last.rests, ((12, 200),), lambda *_, own=springs: [own]))
+    moved = ((ends[1] - ends[0])[0] / (2 * step)) @ axes.mT / scale**2
+    assert float((moved * probe).sum()) == pytest.approx(float((slope * moves).sum()), rel=1e-4)
+
+
+def test_gradients_of_shapes_are_first_ones_only(tube):
+    x, faces, _ = tube
+    points = x[1, ::9].clone().requires_grad_()
+    found = tm.complete(x[::2], faces, [tm.Observation(0.5, points, vertices=torch.arange(0, len(x[1]), 9))])
+    with pytest.raises(RuntimeError, match="first derivatives only"):
+        torch.autograd.grad(found.shapes.sum(), points, create_graph=True)
+    with torch.no_grad():
+        again = tm.complete(x[::2], faces, [tm.Observation(0.5, points, vertices=torch.arange(0, len(x[1]), 9))])
+    assert not again.shapes.requires_grad
+    assert torch.equal(again.shapes, found.shapes)

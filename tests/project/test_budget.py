@@ -21,11 +21,11 @@ import torch
 import torch_modal as tm
 
 BOUNDS = {
-    "lines": 29407,
-    "lines of code": 18900,
-    "files": 198,
-    "functions": 1712,
-    "named tuples": 58,
+    "lines": 29619,
+    "lines of code": 19047,
+    "files": 199,
+    "functions": 1726,
+    "named tuples": 60,
     "docstrings that begin with no noun": 7,
     "functions of in-between": 149,
     "files of in-between": 30,

@@ -6,7 +6,7 @@ from torch import Tensor
 from torch_modal.geometry.poisson import Reconstruction
 from torch_modal.geometry.rigid import infinitesimal_motions
 from torch_modal.geometry.rotations import exp
-from torch_modal.geometry.triangle_frames import bent_sides, edge_means, frames, sides
+from torch_modal.geometry.triangle_frames import bent_sides, frames, sides
 from torch_modal.motion.decoder import bending_columns
 
 
@@ -33,6 +33,7 @@ class ModalBending:
         self.reconstruction = Reconstruction(reference, faces)
         #: What an amplitude of 1 does to each triangle, in its own coordinates. *Shape:* ``(k, 6, F)``.
         self.columns = bending_columns(reference, faces, modes)
+        self._by_face = self.columns.permute(2, 1, 0).contiguous()
 
     def still(self) -> ModalPose:
         """No deformation."""
@@ -52,22 +53,30 @@ class ModalBending:
     def linearised(self, base: Tensor, pose: ModalPose, rigid: bool = False) -> tuple[Tensor, Tensor]:
         """The deformed shape, and its derivatives in amplitudes, a move and a turn about its centroid.
 
-        If rigid, in the last two alone. *Shape:* ``(V, 3), (k + 6, V, 3)``.
+        If rigid, in the last two alone. *Shape:* ``(V, 3), (V, 3, k + 6)``.
         """
-        own, rest = self.reconstruction, base.T[:, None].contiguous()
+        rest, n = base.T[:, None].contiguous(), len(base)
         with torch.enable_grad():
             bending = torch.einsum("k,kcf->cf", pose.amplitudes, self.columns).requires_grad_()
             first, second = self._sides(base, bending)
             ends = () if rigid else torch.cat([first, second])[:, 0]
             slopes = [torch.autograd.grad(row.sum(), bending, retain_graph=True)[0] for row in ends]
-        x = pose.apply(own((first.detach(), second.detach()), rest)[:, 0].T)
-        motions = infinitesimal_motions(x - x.mean(0))
+        x = pose.apply(self.reconstruction((first.detach(), second.detach()), rest)[:, 0].T)
+        motions = infinitesimal_motions(x - x.mean(0)).movedim(0, -1)
         if rigid:
             return x, motions
-        moved = torch.einsum("rcf,kcf->rkf", torch.stack(slopes), self.columns)
-        edges = edge_means((moved[:3], moved[3:]), own.weights, own.sides, own.signs, len(own.edges))
-        fields = own.poisson(own.poisson.pulls(edges), edges.new_zeros(edges.shape[1], len(base), 3))
-        return x, torch.cat([fields @ pose.rotation.mT, motions])
+        # The right-hand side of the Poisson problem at the corners of each face, by its bending.
+        of_first, of_second = torch.stack(slopes).movedim(-1, 0).split(3, 1)  # (F, 3, 6) each
+        one, other, last = self.reconstruction.weights.view(3, -1)[..., None, None]
+        corners = [
+            -one * of_first - last * of_second,
+            (one + other) * of_first - other * of_second,
+            (other + last) * of_second - other * of_first,
+        ]
+        moved = (torch.cat(corners, 1) @ self._by_face).view(3 * len(self.faces), -1)
+        right = moved.new_zeros(n, moved.shape[1]).index_add(0, self.faces.flatten(), moved)
+        fields = self.reconstruction.poisson(right, torch.zeros_like(right)).view(n, 3, -1)
+        return x, torch.cat([pose.rotation @ fields, motions], -1)
 
     @staticmethod
     def stepped(pose: ModalPose, step: Tensor, centre: Tensor) -> ModalPose:

@@ -21,9 +21,10 @@ from torch_modal.arrays import BoolArray, FloatArray
 from torch_modal.autograd import lasting
 from torch_modal.completion.bending import ModalBending, ModalPose
 from torch_modal.completion.energy import PointEnergy
+from torch_modal.completion.gradient import LastSolve, with_gradients
 from torch_modal.completion.observation import Observation, checked
 from torch_modal.completion.pairs import Cloud, Pairs, SampledSurface
-from torch_modal.completion.search import SOFT, PoseSearch
+from torch_modal.completion.search import HALF, SOFT, PoseSearch, Seen
 from torch_modal.elastic.backend import choose
 from torch_modal.elastic.bend import Bend
 from torch_modal.elastic.energy import RestShapes
@@ -52,18 +53,26 @@ COARSE_FACES = 2500
 SHIFTS = (-0.17, 0.17)
 """Times at which a motion may be instead of where its neighbours say, in parts of the gap between these."""
 
-OWN, WHOLE = 0.5, 0.2
-"""Weights of the shape by modes, and of whole shapes, in Eq. 5; that of neighbours in time is the rest."""
-STIFFNESS = 2.0
-"""Of a point with a noise of 1, at a size of 100."""
+PASSES, N_ALIKE, TRUSTED = 2, 2, 0.34
+"""Further searches of the worse half of the frames, each also from so many shapes of other times."""
+
+OWN_OF_CLOUDS, OWN, WHOLE = 0.4, 0.1, 0.1
+"""Weights of the shape by modes, where there are clouds and without, and of whole shapes, in Eq. 5; the rest is that of
+neighbours in time."""
+STIFFNESS, STIFFNESSES = 2.0, (0.5, 15.0)
+"""Of a point with a noise of 1, at a size of 100; bounds within which it is adapted where places are known."""
 SWAY = 2.0
 """Standard deviation of the amplitude of the first mode, at a size of 100."""
 NOISE = 0.5
 """Of points before it is estimated, at a size of 100."""
+NOISES_OF_HALF = 3.0
+"""Noises of the distance at which half of a miss counts."""
 NOISES = 0.1, 2.0
 """Least noise, and the largest that is estimated, at a size of 100."""
 ROUNDS, STEPS, PRODUCTS = 12, 2, 20
 """Rounds of new pairs, in each of which all vertices take steps, each with iterations of conjugate gradients."""
+LAST = (6, 60)
+"""Steps after the last round, and their iterations."""
 OUTLIERS = 4.0
 """Distance, in standard deviations of the noise, at which a point loses three quarters of its weight."""
 
@@ -142,14 +151,14 @@ class _Frame:
         self.time, self.samples = time, samples
         self.clouds = [one.seen for one in samples if isinstance(one.seen, Cloud)]
         self.markers = [one.seen for one in samples if isinstance(one.seen, Pairs)]
-        #: Stiffness of modes whose amplitudes have the standard deviation :data:`SWAY`, seen by these points.
-        self.soft = max(
-            SOFT, min((one.noise or NOISE) ** 2 / (SWAY**2 * len(one.observation.points)) for one in samples)
-        )
+
+    def seen(self, markers: list[Pairs]) -> Seen:
+        """Observations that a pose is searched for; modes' amplitudes have the standard deviation :data:`SWAY`."""
+        soft = min((one.noise or NOISE) ** 2 / (SWAY**2 * len(one.observation.points)) for one in self.samples)
+        unit = NOISES_OF_HALF * max(one.noise for one in self.samples)
+        return Seen(self.clouds, markers, max(SOFT, soft), max(HALF, unit))
 
 
-@lasting
-@torch.no_grad()
 def complete(
     keyframes: Tensor,
     faces: Tensor,
@@ -172,7 +181,8 @@ def complete(
         progress: A bar, :data:`torch_modal.progress.Progress`.
 
     Returns:
-        The motion, in the dtype and on the device of the key-frames; a constant of the autograd graph.
+        The motion, in the dtype and on the device of the key-frames. Its shapes have first derivatives in the points of
+        the observations, through the last minimisation: pairs, rest shapes and poses by modes are constants of it.
 
     Raises:
         ValueError: Key-frames, times or observations do not fit, or the points are in other units.
@@ -181,14 +191,39 @@ def complete(
     is_template = whole.dim() == 2
     if is_template and times is not None:
         raise ValueError("a template of the shape (V, 3) has no time; pass key-frames (1, V, 3) that have one")
+    found = _complete(whole.detach(), faces, observations, times, progress)
+    given = [one.points for one in observations]
+    if not torch.is_grad_enabled() or not any(x.requires_grad for x in given):
+        return found[0]
+    return _differentiable(*found, given)
+
+
+@lasting
+def _complete(
+    whole: Tensor,
+    faces: Tensor,
+    observations: Sequence[Observation],
+    times: Tensor | Sequence[float] | None,
+    progress: Progress,
+) -> tuple[Completion, "_Completer"]:
+    is_template = whole.dim() == 2
     like, shapes, indices = checked_arrays(whole[None] if is_template else whole, faces)
     given = checked(observations, shapes.shape[1])
     at = np.zeros(0) if is_template else _times(times, len(shapes))
     solver = _Completer(shapes, torch.from_numpy(indices), at, given)
-    with ProgressReport(len(solver.frames) * (3 + ROUNDS), "completing", progress) as report:
+    with ProgressReport(len(solver.frames) * (4 + ROUNDS), "completing", progress) as report:
         solver.search(report)
         solver.refine(report)
-    return solver.result(like)
+    return solver.result(like), solver
+
+
+def _differentiable(found: Completion, solver: "_Completer", points: Sequence[Tensor]) -> Completion:
+    """Add gradients in the points to a completion."""
+    exact, at = set(solver.times.tolist()), found.times.tolist()
+    solves = [None if t in exact else own for t, own in zip(at, solver.solves, strict=True)]
+    shapes = with_gradients(found.shapes, points, solves, solver.axes)
+    rows = torch.tensor([i for i, t in enumerate(sorted(exact | set(at))) if t in at], device=shapes.device)
+    return found._replace(shapes=shapes, knots=found.knots.index_copy(0, rows, shapes))
 
 
 def _times(times: Tensor | Sequence[float] | None, n: int) -> FloatArray:
@@ -224,6 +259,9 @@ class _Completer:
             coarse_bending = ModalBending(restricted[0], torch.from_numpy(self.coarse.faces), restricted[1])
         self.poses = PoseSearch(coarse_bending, basis.eigenvalues)
         self.x: list[Tensor] = []
+        #: Stiffness of points of known places, as :data:`STIFFNESS`.
+        self.of_known = STIFFNESS
+        self.solves: list[LastSolve] = []
 
     # ------------------------------------------------------------------------------------------------------- the input
     def _placed(self, x: Tensor, direction: bool = False) -> FloatArray:
@@ -241,44 +279,72 @@ class _Completer:
         else:
             corners, barycentric = one.places()
             places = places_between(corners.cpu().numpy(), barycentric.cpu().double().numpy(), len(self.template))
-            seen = Pairs(places, points, None, weights / weights.sum())
+            seen = Pairs(places, points, None, weights / weights.sum(), np.arange(len(points)))
             known = torch.from_numpy(places @ self.template.numpy())
         require_units(f"{one}: the points", torch.from_numpy(points), "the first shape", known[None], 1 / self.scale)
         return _Sample(one, number, seen, 0.0 if one.noise is None else max(one.noise * self.scale, NOISES[0]))
 
     # ------------------------------------------------------------------------------------------------- poses of frames
     def search(self, report: ProgressReport) -> None:
-        """Modal poses of all frames, outward in time from what is known, and once more between their neighbours."""
+        """Modal poses of all frames, outward in time from what is known, and then from those that explain most."""
         n, whole = len(self.frames), list(zip(self.times, self.whole, strict=False))
-        left, found = list(range(n)), dict[int, ModalFit]()
+        found = dict[int, ModalFit]()
         if not whole:
-            rigid = [self._placed_rigidly(i) for i in left]
-            first = left.pop(int(np.argmin([score for _, score in rigid])))
+            rigid = [self._placed_rigidly(i) for i in range(n)]
+            first = int(np.argmin([score for _, score in rigid]))
             found[first] = self._search(first, [(self.template, rigid[first][0])])
             report.update()
-
-        def known(i: int) -> list[tuple[float, Tensor]]:
-            others = [(self.frames[j].time, one.x) for j, one in found.items() if j != i]
-            return sorted([*whole, *others], key=lambda one: one[0])
-
-        while left:
-            times = [t for t, _ in known(-1)]
-            gaps = [min(abs(self.frames[i].time - t) for t in times) for i in left]
-            i = left.pop(int(np.argmin(gaps)))
-            found[i] = self._search(i, self._starts(self.frames[i].time, known(i)))
+        self._outward(found, {}, whole, report)
+        bound = float(np.quantile([one.score for one in found.values()], TRUSTED))
+        trusted = {i: one for i, one in found.items() if one.score <= bound}
+        report.update(len(trusted))
+        self._outward(trusted, found, whole, report)
+        for i in sorted(range(n), key=lambda i: -trusted[i].score):
+            others = {j: one for j, one in trusted.items() if j != i}
+            if others or whole:
+                again = self._search(i, self._starts(self.frames[i].time, self._known(others, whole)))
+                trusted[i] = min(trusted[i], again, key=lambda one: one.score)
             report.update()
-        for i in sorted(range(n), key=lambda i: -found[i].score):
-            if known(i):
-                again = self._search(i, self._starts(self.frames[i].time, known(i)))
-                found[i] = min(found[i], again, key=lambda one: one.score)
-            report.update()
+        found = trusted
         for i in range(n):
-            frame, one = self.frames[i], found[i]
-            pose = self.poses.stiffened(
-                self._coarsened(one.base), one.pose, frame.clouds, self._markers(frame), frame.soft
-            )
+            one = found[i]
+            pose = self.poses.stiffen(self._coarsened(one.base), one.pose, self._seen(i))
             self.x.append(self.bending.shape(one.base, pose))
             report.update()
+
+    def _outward(
+        self,
+        found: dict[int, ModalFit],
+        before: dict[int, ModalFit],
+        whole: list[tuple[float, Tensor]],
+        report: ProgressReport,
+    ) -> None:
+        """Add all other frames, those near in time to what is known first; none is worse than it was before."""
+        left = [i for i in range(len(self.frames)) if i not in found]
+        while left:
+            known = self._known(found, whole)
+            gaps = [min(abs(self.frames[i].time - t) for t, _ in known) for i in left]
+            i = left.pop(int(np.argmin(gaps)))
+            starts = self._starts(self.frames[i].time, known)
+            if before:
+                starts += self._alike(i, [x for _, x in known])
+            found[i] = self._search(i, starts)
+            if i in before:
+                found[i] = min(found[i], before[i], key=lambda one: one.score)
+            report.update()
+
+    def _known(self, found: dict[int, ModalFit], whole: list[tuple[float, Tensor]]) -> list[tuple[float, Tensor]]:
+        """Times and shapes of frames, and of whole ones, in the order of time."""
+        return sorted([*whole, *((self.frames[i].time, one.x) for i, one in found.items())], key=lambda one: one[0])
+
+    def _alike(self, i: int, shapes: Sequence[Tensor]) -> list[tuple[Tensor, ModalPose]]:
+        """The shapes that explain most of a frame after a rigid motion: motions repeat."""
+        seen, placed = self._seen(i), []
+        for x in shapes:
+            base = self._coarsened(x)
+            pose = self.poses.rigid(base, seen)
+            placed.append((self.poses.score(base, pose, seen), x, pose))
+        return [(x, pose) for _, x, pose in sorted(placed, key=lambda one: one[0])[:N_ALIKE]]
 
     def _starts(self, t: float, known: list[tuple[float, Tensor]]) -> list[tuple[Tensor, ModalPose]]:
         """Shapes from which a search at a time starts."""
@@ -312,19 +378,20 @@ class _Completer:
 
     def _placed_rigidly(self, i: int) -> tuple[ModalPose, float]:
         """The pose of the template in a frame, and how much it leaves unexplained."""
-        frame, base = self.frames[i], self._coarsened(self.template)
-        pose = self.poses.rigid(base, frame.clouds, self._markers(frame))
-        return pose, self.poses.score(base, pose, frame.clouds, self._markers(frame))
+        seen, base = self._seen(i), self._coarsened(self.template)
+        pose = self.poses.rigid(base, seen)
+        return pose, self.poses.score(base, pose, seen)
 
     def _search(self, i: int, starts: Sequence[tuple[Tensor, ModalPose]]) -> ModalFit:
         """A frame by modes."""
-        frame, own = self.frames[i], [(self._coarsened(x), pose) for x, pose in starts]
-        k, pose, score = self.poses.fit(own, frame.clouds, self._markers(frame), frame.soft)
+        own = [(self._coarsened(x), pose) for x, pose in starts]
+        k, pose, score = self.poses.fit(own, self._seen(i))
         base = starts[k][0]
         return ModalFit(self.bending.shape(base, pose), base, pose, score)
 
-    def _markers(self, frame: _Frame) -> list[Pairs]:
-        return [self._restricted(pairs) for pairs in frame.markers]
+    def _seen(self, i: int) -> Seen:
+        """Observations of a frame, on the coarse mesh."""
+        return self.frames[i].seen([self._restricted(pairs) for pairs in self.frames[i].markers])
 
     def _coarsened(self, x: Tensor) -> Tensor:
         return x if self.coarse is None else torch.from_numpy(self.coarse.restrict(x.numpy()))
@@ -347,15 +414,47 @@ class _Completer:
             frame.samples = [self._with_noise(one, surface) for one in frame.samples]
         stiffness = [x.new_full((1, 1), value) for value in self.stiffness]
         numbers, weights = self._rests()
-        for _ in range(ROUNDS):
+        for k in range(ROUNDS + 1):
             shapes = torch.cat([torch.stack(self.x), self.whole, x])[numbers]
+            steps = LAST if k == ROUNDS else (STEPS, PRODUCTS)
+            self.solves = []
             for i, frame in enumerate(self.frames):
-                some = slice(i, i + 1)
-                energy = self._points(frame, x[i])
-                rests = RestShapes(shapes[some], weights[some], stiffness)
-                x[some] = self.fine.relax(x[some], rests, ((STEPS, PRODUCTS),), lambda *_, own=energy: [own])
-                report.update()
+                rests = RestShapes(shapes[i : i + 1], weights[i : i + 1], stiffness)
+                self.solves.append(self._relaxed(frame, x[i : i + 1], rests, steps))
+                report.update(k < ROUNDS)
+            x = torch.cat([solve.x for solve in self.solves])
+            ratios = [
+                ratio for frame, own in zip(self.frames, x, strict=True) for ratio in self._missed_noise(frame, own)
+            ]
+            if ratios:
+                # Points of known places are missed by their noise, neither more nor less (Morozov's discrepancy).
+                factor = float(np.clip(np.median(ratios), 0.5, 2.0))
+                self.of_known = float(np.clip(self.of_known * factor**2, *STIFFNESSES))
         self.x = list(x)
+
+    def _relaxed(self, frame: _Frame, x: Tensor, rests: RestShapes, steps: tuple[int, int]) -> LastSolve:
+        """Steps of all vertices of a frame, with pairs found where they start. *Shape:* ``(1, V, 3)``."""
+        surface, numbers, found = SampledSurface(x[0].numpy(), self.mesh), [], []
+        for sample in frame.samples:
+            seen = sample.seen
+            pairs, own = (seen.pairs(surface), STIFFNESS) if isinstance(seen, Cloud) else ([seen], self.of_known)
+            stiffness = own / sample.noise**2 * len(sample.observation.points)
+            for one in pairs:
+                counts = robust(np.linalg.norm(one.places @ surface.vertices - one.points, axis=1), sample.noise)
+                found.append(one._replace(weights=stiffness * one.weights * counts))
+                numbers.append(np.full(len(one.points), sample.number))
+        points = PointEnergy(found)
+        x = self.fine.relax(x, rests, (steps,), lambda *_: [points])
+        return LastSolve(x, self.fine.energy, rests, points, np.concatenate(numbers))
+
+    @staticmethod
+    def _missed_noise(frame: _Frame, x: Tensor) -> list[float]:
+        """Squared distances of points from their known places, over those that their noise explains."""
+        off = [np.linalg.norm(own.places @ x.numpy() - own.points, axis=1) for own in frame.markers]
+        noises = [one.noise for one in frame.samples if isinstance(one.seen, Pairs)]
+        return [
+            float(np.mean(np.minimum(own / noise, OUTLIERS) ** 2)) / 3 for own, noise in zip(off, noises, strict=True)
+        ]
 
     @staticmethod
     def _with_noise(one: _Sample, surface: SampledSurface) -> _Sample:
@@ -377,10 +476,11 @@ class _Completer:
         rows, weights = [], []
         for i, t in enumerate(times):
             others = numbers != frames[i]
-            row, parts = [i], [OWN]
+            by_modes = OWN_OF_CLOUDS if self.frames[i].clouds else OWN
+            row, parts = [i], [by_modes]
             for share, pool, own in (
                 (WHOLE, self.times, whole),
-                (1 - OWN - WHOLE, every[others], numbers[others]),
+                (1 - by_modes - WHOLE, every[others], numbers[others]),
             ):
                 first, last, u = _around(pool, t) if len(pool) else (0, 0, 0.0)
                 own = own if len(pool) else whole  # the template, or one frame alone
@@ -388,16 +488,6 @@ class _Completer:
             rows.append(row)
             weights.append(parts)
         return torch.tensor(np.array(rows)), torch.tensor(weights, dtype=torch.float64)
-
-    def _points(self, frame: _Frame, x: Tensor) -> PointEnergy:
-        """The energy of what was seen at a frame."""
-        surface, found = SampledSurface(x.numpy(), self.mesh), []
-        for sample in frame.samples:
-            for one in sample.seen.pairs(surface) if isinstance(sample.seen, Cloud) else [sample.seen]:
-                counts = robust(np.linalg.norm(one.places @ surface.vertices - one.points, axis=1), sample.noise)
-                stiffness = STIFFNESS / sample.noise**2 * len(sample.observation.points)
-                found.append(one._replace(weights=stiffness * one.weights * counts))
-        return PointEnergy(found)
 
     # ---------------------------------------------------------------------------------------------------------- result
     def result(self, like: Tensor) -> Completion:

@@ -24,6 +24,8 @@ class PointEnergy:
         matrices = [one.places.tocsr() for one in pairs]
         self.places = sparse.vstack(matrices).tocsr()
         self.points = torch.from_numpy(np.concatenate([one.points for one in pairs]))
+        #: The observed point of each pair. *Shape:* ``(n,)``.
+        self.numbers = np.concatenate([one.numbers for one in pairs])
         eye, blocks = torch.eye(3, dtype=torch.float64), []
         for one in pairs:
             block = eye.expand(len(one.points), 3, 3)
@@ -37,7 +39,7 @@ class PointEnergy:
         upper = self.stiffness.flatten(1)[:, [0, 1, 2, 4, 5, 8]]
         self.diagonal = 2 * torch.from_numpy(squares.T @ upper.numpy())
 
-    def _forces(self, field: Tensor, points: Tensor | float = 0.0) -> tuple[Tensor, Tensor]:
+    def forces(self, field: Tensor, points: Tensor | float = 0.0) -> tuple[Tensor, Tensor]:
         """Differences from the points, and the forces on them. *Shape:* ``(1, V, 3) -> (n, 3), (n, 3)``."""
         off = torch.from_numpy(self.places @ field[0].numpy()) - points
         return off, (self.stiffness @ off[..., None])[..., 0]
@@ -47,13 +49,13 @@ class PointEnergy:
 
     def value(self, x: Tensor) -> Tensor:
         """*Shape:* ``(1, V, 3) -> (1,)``."""
-        off, forces = self._forces(x, self.points)
+        off, forces = self.forces(x, self.points)
         return (off * forces).sum()[None]
 
     def at(self, x: Tensor) -> Point:
         """*Shape:* ``(1, V, 3)``."""
-        off, forces = self._forces(x, self.points)
+        off, forces = self.forces(x, self.points)
         gradient = self._spread(forces)
         return Point(
-            (off * forces).sum()[None], gradient, self.diagonal[None], lambda d: self._spread(self._forces(d)[1])
+            (off * forces).sum()[None], gradient, self.diagonal[None], lambda d: self._spread(self.forces(d)[1])
         )

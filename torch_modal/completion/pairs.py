@@ -39,6 +39,8 @@ class Pairs(NamedTuple):
     """Where the places may slide across these. *Shape:* ``(n, 3)``."""
     weights: FloatArray
     """*Shape:* ``(n,)``."""
+    numbers: IntArray
+    """Indices of the points among those observed. *Shape:* ``(n,)``."""
 
 
 def featured(points: FloatArray, normals: FloatArray | None) -> FloatArray:
@@ -118,9 +120,8 @@ class Cloud:
         kept = np.flatnonzero(agree)
         normals = None if self.normals is None else self.normals[kept]
         share = self.weights[kept] / self.weights.sum()
-        found = [
-            Pairs(places_between(surface.faces[face[kept]], barycentric[kept], n), self.points[kept], normals, share)
-        ]
+        places = places_between(surface.faces[face[kept]], barycentric[kept], n)
+        found = [Pairs(places, self.points[kept], normals, share, kept)]
         if self.view is None or self.normals is None:
             return found
         seen = surface.visible(self.view)
@@ -133,7 +134,8 @@ class Cloud:
         seen, faces, nearest = seen[agree], faces[agree], nearest[agree]
         if len(seen):
             places = places_between(surface.faces[faces], _PLACES[seen % len(_PLACES)], n)
-            found.append(Pairs(places, self.points[nearest], self.normals[nearest], np.full(len(seen), 1 / len(seen))))
+            share = np.full(len(seen), 1 / len(seen))
+            found.append(Pairs(places, self.points[nearest], self.normals[nearest], share, nearest))
         return found
 
     def missed(self, surface: SampledSurface, unit: float) -> FloatArray:

@@ -1,6 +1,7 @@
 """Poses and amplitudes of modes that bring a shape near to what was seen, from far to near."""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -16,8 +17,8 @@ from torch_modal.geometry.connectivity import Connectivity, farthest_apart
 
 # Steps, and the distance from which on pairs lose weight at the first and the last; stiffness of the modes likewise.
 STEPS, FAR, NEAR = 12, 20.0, 2.0
-# Points of a cloud, and visible places of a surface, that take part in a step.
-N_POINTS = 800
+# Points of a cloud, and visible places of a surface, that take part in a step, and in one of the pose alone.
+N_POINTS, N_RIGID = 800, 200
 STIFF, SOFT, STIFFER = 1e-2, 3e-5, (1e-4, 1e-3, 1e-2)
 # Stiffness of a turn and a move of the whole.
 OF_MOTIONS = 1e-2
@@ -26,13 +27,29 @@ LARGEST_STEP = 6.0
 
 # Weight of the modes' energy beside what is left unexplained: limbs that crossed explain points as well.
 PRIOR = 3e-5
-# Distance at which half of a miss counts, and points are unexplained; parts of a cloud that make a group.
+# Distance at which half of a miss counts, at least, and at which points are unexplained; parts of a cloud that make a
+# group.
 HALF, REACH, PART_OF_GROUP = 1.0, 2.0, 300
 # Ends of limbs that are tried for a group, of how many, how far away, with which weight; rounds of such trials; and the
 # gain that they need.
 N_TRIED, N_TIPS, MOST_AWAY, WEIGHT, ROUNDS, GAIN = 3, 12, 40.0, 3.0, 3, 1e-3
 # Smallest and largest length of a limb that is tried.
 LIMBS = 8.0, 30.0
+
+
+class Seen(NamedTuple):
+    """Everything that was seen at one time."""
+
+    clouds: list[Cloud]
+    markers: list[Pairs]
+    soft: float
+    """Stiffness of the modes that it leaves."""
+    unit: float
+    """Distance at which half of a miss counts."""
+
+    def thinned(self, n: int) -> "Seen":
+        """With so many points of each cloud, chosen at random, always the same."""
+        return self._replace(clouds=[cloud.thinned(n) for cloud in self.clouds])
 
 
 class PoseSearch:
@@ -58,118 +75,106 @@ class PoseSearch:
         """The deformed shape."""
         return SampledSurface(self.bending.shape(base, pose).numpy(), self.mesh)
 
-    def score(self, base: Tensor, pose: ModalPose, clouds: Sequence[Cloud], markers: Sequence[Pairs] = ()) -> float:
-        """How much is left unexplained, from 0 on."""
+    def score(self, base: Tensor, pose: ModalPose, seen: Seen) -> float:
+        """Part that is left unexplained, and a little of the energy of the modes; 0 or more."""
         surface = self.surface(base, pose)
         total = PRIOR * float(self.stiffness[:-6] @ pose.amplitudes**2)
-        for own in markers:
-            off = (np.linalg.norm(own.places @ surface.vertices - own.points, axis=1) / HALF) ** 2
+        for own in seen.markers:
+            off = (np.linalg.norm(own.places @ surface.vertices - own.points, axis=1) / seen.unit) ** 2
             total += float(own.weights @ (off / (1 + off)))
-        return total + sum(cloud.score(surface, HALF) for cloud in clouds)
+        return total + sum(cloud.score(surface, seen.unit) for cloud in seen.clouds)
 
-    def rigid(self, base: Tensor, clouds: Sequence[Cloud], markers: Sequence[Pairs]) -> ModalPose:
+    def rigid(self, base: Tensor, seen: Seen) -> ModalPose:
         """The pose alone, from the centroid of what was seen on."""
-        points = np.concatenate([*(own.points for own in clouds), *(own.points for own in markers)])
+        points = np.concatenate([*(cloud.points for cloud in seen.clouds), *(pairs.points for pairs in seen.markers)])
         pose = self.bending.still()
         pose.move = torch.from_numpy(np.median(points, 0)) - base.median(0).values
+        seen = seen.thinned(N_RIGID)
         for far in np.geomspace(2 * FAR, FAR, STEPS):
-            pose, _ = self._step(base, pose, clouds, markers, float(far), 1.0, rigid=True)
+            pose, _ = self._step(base, pose, seen, float(far), 1.0, rigid=True)
         return pose
 
     def descend(
         self,
         base: Tensor,
         pose: ModalPose,
-        clouds: Sequence[Cloud],
-        markers: Sequence[Pairs] = (),
+        seen: Seen,
         n_steps: int = STEPS,
         far: float = FAR,
         stiff: float = STIFF,
-        soft: float = SOFT,
     ) -> ModalPose:
         """Gauss-Newton steps, each with new pairs, from far to near and from stiff to soft."""
-        distances, stiffnesses = np.geomspace(far, NEAR, n_steps), np.geomspace(stiff, soft, n_steps)
-        clouds, fields = [cloud.thinned(N_POINTS) for cloud in clouds], None
+        distances, stiffnesses = np.geomspace(far, NEAR, n_steps), np.geomspace(stiff, seen.soft, n_steps)
+        seen, fields = seen.thinned(N_POINTS), None
         for k, (distance, stiffness) in enumerate(zip(distances, stiffnesses, strict=True)):
             known = fields if k % 2 else None
-            pose, fields = self._step(base, pose, clouds, markers, float(distance), float(stiffness), known=known)
+            pose, fields = self._step(base, pose, seen, float(distance), float(stiffness), known=known)
         return pose
 
-    def fit(
-        self, starts: Sequence[tuple[Tensor, ModalPose]], clouds: Sequence[Cloud], markers: Sequence[Pairs], soft: float
-    ) -> tuple[int, ModalPose, float]:
+    def fit(self, starts: Sequence[tuple[Tensor, ModalPose]], seen: Seen) -> tuple[int, ModalPose, float]:
         """The number of the best of several starts, its pose after limbs were tried, and its score."""
-        tried = [(k, self.descend(*one, clouds, markers, soft=soft)) for k, one in enumerate(starts)]
+        tried = [(k, self.descend(*one, seen)) for k, one in enumerate(starts)]
         tried += [(k, start) for k, (_, start) in enumerate(starts)]  # never worse than these
-        scores = [self.score(starts[k][0], pose, clouds, markers) for k, pose in tried]
+        scores = [self.score(starts[k][0], pose, seen) for k, pose in tried]
         best = min(scores)
         k, pose = tried[scores.index(best)]
         base = starts[k][0]
         for _ in range(ROUNDS):
-            others = [self._tried(base, pose, clouds, markers, soft, *one) for one in self._limbs(base, pose, clouds)]
-            scores = [self.score(base, other, clouds, markers) for other in others]
+            others = [self._try_limb(base, pose, seen, *one) for one in self._limbs(base, pose, seen)]
+            scores = [self.score(base, other, seen) for other in others]
             if not others or min(scores) > best - GAIN:
                 break
             best, pose = min(scores), others[int(np.argmin(scores))]
         return k, pose, best
 
-    def stiffened(
-        self, base: Tensor, pose: ModalPose, clouds: Sequence[Cloud], markers: Sequence[Pairs], soft: float
-    ) -> ModalPose:
+    def stiffen(self, base: Tensor, pose: ModalPose, seen: Seen) -> ModalPose:
         """The pose of the stiffest modes that explain as much: where little moves, soft ones would follow the noise."""
-        best = self.score(base, pose, clouds, markers)
+        best = self.score(base, pose, seen)
         for stiff in STIFFER:
-            if stiff <= soft:
+            if stiff <= seen.soft:
                 continue
-            other = self.descend(base, pose, clouds, markers, STEPS // 3, 2 * NEAR, stiff, stiff)
-            score = self.score(base, other, clouds, markers)
+            other = self.descend(base, pose, seen._replace(soft=stiff), STEPS // 3, 2 * NEAR, stiff)
+            score = self.score(base, other, seen)
             if score <= best + GAIN:
                 best, pose = min(best, score), other
         return pose
 
-    def _limbs(self, base: Tensor, pose: ModalPose, clouds: Sequence[Cloud]) -> list[tuple[Cloud, FloatArray, int]]:
+    def _limbs(self, base: Tensor, pose: ModalPose, seen: Seen) -> list[tuple[Cloud, FloatArray, int]]:
         """Groups of points that nothing explains, each with the end of a limb that might."""
-        surface, found = self.surface(base, pose), []
-        for cloud in clouds:
+        surface, limbs = self.surface(base, pose), []
+        for cloud in seen.clouds:
             for group in cloud.unexplained(surface, REACH, max(4, len(cloud.points) // PART_OF_GROUP))[:2]:
                 points = cloud.points[group]
                 away = np.linalg.norm(surface.vertices[self.tips] - points.mean(0), axis=1)
                 nearest = np.argsort(away)[:N_TRIED]
-                found += [(cloud, points, int(tip)) for tip in nearest if away[tip] < MOST_AWAY]
-        return found
+                limbs += [(cloud, points, int(tip)) for tip in nearest if away[tip] < MOST_AWAY]
+        return limbs
 
-    def _tried(
-        self,
-        base: Tensor,
-        pose: ModalPose,
-        clouds: Sequence[Cloud],
-        markers: Sequence[Pairs],
-        soft: float,
-        cloud: Cloud,
-        points: FloatArray,
-        tip: int,
+    def _try_limb(
+        self, base: Tensor, pose: ModalPose, seen: Seen, cloud: Cloud, points: FloatArray, tip: int
     ) -> ModalPose:
         """A pose in which a limb explains points that nothing explained; its former pairs are released."""
         extent = 2 * float(np.percentile(np.linalg.norm(points - points.mean(0), axis=1), 90))
         limb = self.from_tips[tip] < np.clip(extent, *LIMBS)
         vertices = np.flatnonzero(limb)
         x = self.bending.shape(base, pose).numpy()[vertices]
-        shift, fields, thinned = points.mean(0) - x.mean(0), None, [one.thinned(N_POINTS) for one in clouds]
+        shift, fields, thinned = points.mean(0) - x.mean(0), None, seen.thinned(N_POINTS)
         for k in range(STEPS // 2):
             nearest = vertices[cKDTree(x + (shift if k == 0 else 0)).query(points)[1]]
             places = sparse.identity(len(limb), format="csr")[nearest]
-            own = Pairs(places, points, None, np.full(len(points), WEIGHT / len(cloud.points)))
+            weights = np.full(len(points), WEIGHT / len(cloud.points))
+            springs = Pairs(places, points, None, weights, np.arange(len(points)))
+            target = thinned._replace(markers=[*seen.markers, springs])
             known = fields if k % 2 else None
-            pose, fields = self._step(base, pose, thinned, [*markers, own], MOST_AWAY, soft, limb, known=known)
+            pose, fields = self._step(base, pose, target, MOST_AWAY, seen.soft, limb, known=known)
             x = self.bending.shape(base, pose).numpy()[vertices]
-        return self.descend(base, pose, clouds, markers, STEPS // 2, FAR / 3, 10 * soft, soft)
+        return self.descend(base, pose, seen, STEPS // 2, FAR / 3, 10 * seen.soft)
 
     def _step(
         self,
         base: Tensor,
         pose: ModalPose,
-        clouds: Sequence[Cloud],
-        markers: Sequence[Pairs],
+        seen: Seen,
         far: float,
         stiffness: float,
         released: BoolArray | None = None,
@@ -184,13 +189,29 @@ class PoseSearch:
             x, fields = self.bending.linearised(base, pose, rigid)
         else:
             x, fields = self.bending.shape(base, pose), known
-        n, surface = len(fields), SampledSurface(x.numpy(), self.mesh)
-        columns = fields.movedim(0, -1).numpy()  # (V, 3, n)
+        matrix, slope = self._normal_equations(x, fields, pose, seen, far, stiffness, released)
+        step = -torch.linalg.solve(matrix, slope)
+        largest = float((fields @ step).norm(dim=-1).max()) / LARGEST_STEP
+        return self.bending.stepped(pose, step / max(1.0, largest), x.mean(0)), fields
+
+    def _normal_equations(
+        self,
+        x: Tensor,
+        fields: Tensor,
+        pose: ModalPose,
+        seen: Seen,
+        far: float,
+        stiffness: float,
+        released: BoolArray | None,
+    ) -> tuple[Tensor, Tensor]:
+        """Matrix and gradient of a Gauss-Newton step. *Shape:* ``(n, n), (n,)``."""
+        n, surface = fields.shape[-1], SampledSurface(x.numpy(), self.mesh)
+        columns = [fields[:, i].numpy() for i in range(3)]
         rows, gaps = [], []
-        for own in [*(pairs for cloud in clouds for pairs in cloud.pairs(surface, released)), *markers]:
+        for own in [*(pairs for cloud in seen.clouds for pairs in cloud.pairs(surface, released)), *seen.markers]:
             off = own.places @ surface.vertices - own.points
             root = (own.weights**0.5 / (1 + (off**2).sum(1) / far**2))[:, None]
-            moved = [root * (own.places @ columns[:, i]) for i in range(3)]
+            moved = [root * (own.places @ columns[i]) for i in range(3)]
             off = root * off
             if own.normals is not None:
                 across = sum(own.normals[:, i, None] * moved[i] for i in range(3))
@@ -203,6 +224,4 @@ class PoseSearch:
         prior, row, gap = stiffness * self.stiffness[-n:], torch.from_numpy(np.concatenate(rows)), np.concatenate(gaps)
         matrix, slope = row.mT @ row, row.mT @ torch.from_numpy(gap) + prior * amplitudes
         matrix.diagonal().add_(prior + 1e-9 * matrix.diagonal().mean())
-        step = -torch.linalg.solve(matrix, slope)
-        largest = float((fields.movedim(0, -1) @ step).norm(dim=-1).max()) / LARGEST_STEP
-        return self.bending.stepped(pose, step / max(1.0, largest), x.mean(0)), fields
+        return matrix, slope
