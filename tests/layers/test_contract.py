@@ -26,6 +26,8 @@ DOUBLE = torch.float64
 CONTACT = {"InBetween, contact", "Path, contact"}
 OF_ONE_DTYPE = ("ModalDecoder", "Passengers", "GaussNewtonStep")
 """Layers that are cast to the dtype of what they are given."""
+MADE_ON_THE_CPU = (*OF_ONE_DTYPE, "ShellEnergy", "ShellLoss", "LatentElasticity")
+"""Layers that are on the CPU, whatever they are made of, until they are moved."""
 BATCHED = [name for name, case in LAYERS.items() if case.batched]
 NEEDS_NUMBERS = re.compile(r"InBetween|MidShape|Blend|Path\b|ModalDecoder|Random(?!RigidMotion)")
 """Layers that cannot run without numbers, on the meta device."""
@@ -141,6 +143,21 @@ def test_gpu(name: str, made: Made) -> None:
     found = made.call(made.x.cuda(), copy.deepcopy(made.layer).cuda())
     assert found.is_cuda
     assert_near(found.cpu(), made.truth, 1e-8)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
+@pytest.mark.parametrize("name", [name for name in CASES if name != "GaussNewtonStep"])  # made of another module
+def test_gpu_made_there(name: str, made: Made) -> None:
+    """Of key-frames, faces and bases that are on the GPU, and differentiated there."""
+    x, faces, bases = made.shapes
+    layer = made.case.make(Shapes(x.cuda(), faces.cuda(), [basis.to("cuda") for basis in bases]))
+    if name.startswith(MADE_ON_THE_CPU):
+        layer = layer.cuda()
+    found = made.call(x.cuda(), layer)
+    assert found.is_cuda
+    assert_near(found.cpu(), made.truth, 1e-8)
+    slope = gradient(lambda x: made.call(x, layer), x.cuda())
+    assert_near(slope.cpu(), gradient(made.call, x), 1e-6)
 
 
 @pytest.mark.parametrize("factor", [1e-6, 1.0, 1e3])

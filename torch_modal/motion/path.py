@@ -99,7 +99,7 @@ class Path(PreciseModule):
         if self.contact:
             require_contact()
         self.objective = replace(objective, contact=False) if self.contact else objective
-        self.register_buffer("times", checked_times(times, n, cyclic))
+        self.register_buffer("times", checked_times(times, n, cyclic).to(own[0].reference.device))
         self.bases = nn.ModuleList(own)
         #: Number of key-frames, K.
         self.n_keyframes = n
