@@ -514,7 +514,10 @@ class TestBackend:
 
     def test_one_module_is_loaded_without_the_others_and_without_a_word(self) -> None:
         code = (
-            "import sys; from torch_modal.elastic.kernels.launch import kernels; kernels('rotations'); "
+            "import sys, torch; from torch_modal.elastic.kernels.launch import kernels, launch; "
+            "x = torch.zeros(1, 3, 3, dtype=torch.float64); own = torch.zeros(1, 2, dtype=torch.float64); "
+            "two = torch.zeros(2, 3, 3, dtype=torch.float64); four = torch.zeros(4, 3, 3, dtype=torch.float64); "
+            "launch(kernels('procrustes').mean_pose, (1,), [two, four, own, two.clone(), x]); "
             "sys.exit(any(f'torch_modal.elastic.kernels.{name}' in sys.modules "
             "for name in ('quasi_newton', 'steps')))"
         )
@@ -547,6 +550,25 @@ def test_what_warp_says_of_itself_is_left_alone() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         before = warp.config.log_level
-        launch.kernels.cache_clear()
-        launch.kernels("steps")
+        launch._load.cache_clear()
+        launch._load(launch.kernels("steps").inner.module, torch.device("cpu"))
         assert warp.config.log_level == before
+
+
+def test_kernels_are_loaded_for_the_device_of_their_launch_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Their gradients take a minute to compile: on a GPU, nobody waits for those of the CPU."""
+    import warp
+
+    asked: list[tuple[str, str]] = []
+    monkeypatch.setattr(warp, "load_module", lambda module, device, **_: asked.append((module.name, device)))
+    monkeypatch.setattr(launch._COMMANDS, "known", {})
+    launch._load.cache_clear()
+    try:
+        module, x = launch.kernels("steps"), torch.ones(1, 3, dtype=DOUBLE)
+        launch.kernels("rotations_adjoint")
+        assert not asked
+        for _ in range(2):
+            launch.launch(module.inner, (1, 1), [x, x, 1, torch.zeros(1, 3, dtype=DOUBLE)])
+        assert asked == [("torch_modal.elastic.kernels.steps", "cpu")]
+    finally:
+        launch._load.cache_clear()

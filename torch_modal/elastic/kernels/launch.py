@@ -39,11 +39,8 @@ _MADE: dict[tuple[Any, ...], Any] = {}
 
 @cache
 def kernels(name: Module) -> Any:
-    """A module of the kernels, compiled by the first who asks on a machine, and kept by Warp."""
-    module = importlib.import_module(f"{PACKAGE}.{name}")
-    with _LOADING:
-        _load(module.__name__)
-    return module
+    """A module of the kernels. The first launch on a machine's kind of device compiles it, and Warp keeps it."""
+    return importlib.import_module(f"{PACKAGE}.{name}")
 
 
 def made(make: Callable[..., Any], *given: Any) -> Any:
@@ -52,9 +49,7 @@ def made(make: Callable[..., Any], *given: Any) -> Any:
     if key not in _MADE:
         with _LOADING:
             if key not in _MADE:
-                found = make(*given)
-                _load(found.module)
-                _MADE[key] = found
+                _MADE[key] = make(*given)
     return _MADE[key]
 
 
@@ -64,7 +59,7 @@ def of_elements(part: Literal["convex", "forward", "backward", "curving"], *give
 
 
 def load_kernels() -> None:
-    """Load those of in-betweens without gradients, so that nobody waits for it later."""
+    """Load those of in-betweens without gradients for the CPU, so that nobody waits for it later."""
     with _LOADING:
         elements, *_ = (importlib.import_module(f"{PACKAGE}.{name}") for name in ("elements", *IN_BETWEENS))
         own = bend.kernel_functions(), stretch.kernel_functions()
@@ -73,20 +68,19 @@ def load_kernels() -> None:
         elements.convex(*own)
         volume.kernels()
         importlib.import_module("torch_modal.elastic.distortion").kernels()
-        _load(PACKAGE)
-        for name in IN_BETWEENS:
-            kernels(name)
+        _load(PACKAGE, torch.device("cpu"))
 
 
-def _load(module: Any) -> None:
+@cache
+def _load(module: Any, device: torch.device) -> None:
     """Compile a module and those below it, several at a time, or take them from Warp's cache."""
     import warp as wp
 
-    with _quietly():
+    with _LOADING, _quietly():
         with _without_line(NO_DRIVER):
             wp.init()
         with ProgressReport(1, "compiling kernels (once for this machine)", unit="module"):
-            wp.load_module(module, device="cpu", recursive=True, max_workers=os.cpu_count())
+            wp.load_module(module, device=str(device), recursive=True, max_workers=os.cpu_count())
 
 
 @contextmanager
@@ -233,6 +227,7 @@ class _Command:
     def __init__(self, kernel: Any, device: torch.device, back: bool, given: Sequence[Any]) -> None:
         import warp as wp
 
+        _load(kernel.module, device)
         self.device, self.n_threads, entries = device, 1, _entries(kernel)
         pairs = list(zip(entries, given, strict=True))
         self.others = {i: x for i, (entry, x) in enumerate(pairs) if entry is None}
@@ -249,10 +244,9 @@ class _Command:
             [dict((i, a) for i, a, *_ in own).get(i, x) for i, x in enumerate(plain)] for own in self.arrays
         )
         own = wp.device_from_torch(device)
-        with _quietly():  # on a GPU, it compiles now
-            self.recorded = wp.launch(
-                kernel, 1, first, adj_inputs=[*chain(*adjoint)], device=own, adjoint=back, record_cmd=True
-            )
+        self.recorded = wp.launch(
+            kernel, 1, first, adj_inputs=[*chain(*adjoint)], device=own, adjoint=back, record_cmd=True
+        )
         for number, arrays in enumerate(self.arrays):
             for i, array, *_ in arrays:
                 self.recorded.set_param_at_index_from_ctype(i, array, adjoint=number > 0)
