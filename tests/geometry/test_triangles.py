@@ -366,5 +366,5 @@ def test_sparse_solver_on_a_gpu() -> None:
     right = torch.randn(70, mesh.n_vertices, 3, generator=torch.Generator().manual_seed(0), dtype=F64)
     truth = solver(right)
     with torch.cuda.stream(torch.cuda.Stream()):
-        found = solver(right.cuda())
-    torch.testing.assert_close(found.cpu(), truth, rtol=1e-9, atol=1e-9)
+        found = solver(right.cuda()).cpu()  # on this stream: another would not wait for it
+    torch.testing.assert_close(found, truth, rtol=1e-9, atol=1e-9)
