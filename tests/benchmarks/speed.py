@@ -3,7 +3,7 @@
     python tests/benchmarks/speed.py [--peer-python FILE] [--rounds 2] [--only TEXT ...]
     python tests/benchmarks/speed.py --before CHECKOUT
     python tests/benchmarks/speed.py --parts growth first
-    python tests/benchmarks/speed.py --parts batches [--device cuda]
+    python tests/benchmarks/speed.py --parts batches [--device cuda] [--threads 16]
     python tests/benchmarks/speed.py --parts threads [--rounds 10]
 
 Each side runs in processes of its own, on one thread, in turns; what is told are ratios of processor seconds, the best
@@ -11,8 +11,8 @@ of all rounds, so that what else a machine does slows all sides. In-betweens, wi
 without; making a layer is over the set-up of their shape space. ``--before`` names the folder of another checkout, for
 example of an earlier commit, which each column is then compared with. Bases are there before the clock starts, but for
 ``--parts first``: from two new key-frames to a sequence with nothing cached, on the clock. ``--parts batches`` compares
-batches, forward and with their gradients, with single calls. ``--parts threads`` compares two threads with one, in
-turns, on the clock: more rounds find the quiet moments of a machine.
+batches, forward and with their gradients, with single calls, and a GPU with the CPU beside it. ``--parts threads``
+compares two threads with one, in turns, on the clock: more rounds find the quiet moments of a machine.
 """
 
 import argparse
@@ -143,31 +143,41 @@ def growth(arguments: argparse.Namespace) -> None:
 
 
 def batches(arguments: argparse.Namespace) -> None:
-    """Time of one in-between in batches of the sample hand at random times, on the clock."""
-    limit_threads()
-    case = next(case for case in samples() if "hand" in case.name)
-    layer = tm.InBetween(case.bases(), case.faces).to(arguments.device)
-    both = torch.stack([case.x_a, case.x_b]).to(arguments.device)
-    times = torch.rand(64, dtype=torch.float64, generator=torch.Generator().manual_seed(0)).to(arguments.device)
+    """Time of one in-between in batches at random times, on the clock: on a CPU, and on a GPU beside it."""
+    times = torch.rand(64, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    devices = ["cpu"] if arguments.device == "cpu" else ["cpu", arguments.device]
 
-    def clock(work: Callable[[], Any]) -> float:
+    def clock(work: Callable[[], Any], device: str) -> float:
         found = []
         for _ in range(arguments.rounds + 1):
             start = time.perf_counter()
             work()
-            if arguments.device == "cuda":
+            if device != "cpu":
                 torch.cuda.synchronize()
             found.append(time.perf_counter() - start)
         return min(found[1:])
 
-    def trained(n: int) -> None:
-        layer(*both.clone().requires_grad_(), times[:n]).square().sum().backward()
+    def trained(layer: tm.InBetween, both: torch.Tensor, t: torch.Tensor) -> None:
+        layer(*both.clone().requires_grad_(), t).square().sum().backward()
 
-    for n in (1, 4, 16, 64):
-        with torch.no_grad():
-            forward = clock(lambda: layer(*both, times[:n]))  # noqa: B023
-        backward = clock(lambda: trained(n))  # noqa: B023
-        print(f"batch of {n:2d}: {1e3 * forward / n:6.1f} ms each, with gradients {1e3 * backward / n:6.1f} ms")
+    limit_threads(arguments.threads)
+    hand = next(case for case in samples() if "hand" in case.name)
+    ends, faces = divided(torch.stack([hand.x_a, hand.x_b]), hand.faces)
+    for case in (hand, Case("divided", KeyframeSet(ends, faces), 0, 1, {})):
+        print(f"{len(case.x_a):,} vertices, {arguments.threads} threads")
+        layers = {device: tm.InBetween(case.bases(), case.faces).to(device) for device in devices}
+        for n in (1, 8, 64):
+            best: list[list[float]] = []
+            for device, layer in layers.items():
+                both, own = torch.stack([case.x_a, case.x_b]).to(device), times[:n].to(device)
+                with torch.no_grad():
+                    forward = clock(lambda: layer(*both, own), device)  # noqa: B023
+                best.append([forward, clock(lambda: trained(layer, both, own), device)])  # noqa: B023
+                told = " and ".join(f"{1e3 * seconds / n:6.1f} ms" for seconds in best[-1])
+                print(f"batch of {n:2d}, {device:<4}: {told} each, without and with gradients", flush=True)
+            if len(devices) > 1:
+                ratios = [cpu / gpu for cpu, gpu in zip(*best, strict=True)]
+                print(f"batch of {n:2d}, cpu over gpu: {ratios[0]:.1f} and {ratios[1]:.1f}", flush=True)
 
 
 def threads(arguments: argparse.Namespace) -> None:
@@ -254,6 +264,7 @@ def main() -> None:
         "--only", nargs="+", default=[""], metavar="TEXT", help="meshes with one of these in their names"
     )
     parser.add_argument("--device", default="cpu", help="of the batches")
+    parser.add_argument("--threads", type=int, default=1, help="of the batches, on the CPU")
     parser.add_argument("--worker", nargs=2, metavar=("CASE", "ANSWER"), help=argparse.SUPPRESS)
     add_keep(parser)
     arguments = parser.parse_args()
