@@ -23,6 +23,7 @@ FLOORS = [
     "trees",
     "autograd",
     "threads",
+    "times",
     "geometry",
     "io",
     "keyframes",

@@ -37,7 +37,7 @@ from torch_modal.errors import MeshWarning
 from torch_modal.geometry.canonical import placed
 from torch_modal.geometry.rigid import best_fit
 from torch_modal.geometry.triangle_frames import frames_of, mirrored_sides
-from torch_modal.keyframes.arrays import checked_times, require_units
+from torch_modal.keyframes.arrays import require_units
 from torch_modal.keyframes.check import checked_arrays
 from torch_modal.modes.coarsening import Coarsening, coarsen
 from torch_modal.modes.extract import extract_bases
@@ -45,6 +45,7 @@ from torch_modal.motion.decoder import scaled
 from torch_modal.motion.path import Path
 from torch_modal.progress import Progress, ProgressReport
 from torch_modal.registration.surface import places_between
+from torch_modal.times import check_times
 
 N_MODES = 60
 """Modes of the first shape in which poses are searched."""
@@ -209,7 +210,7 @@ def _complete(
     is_template = whole.dim() == 2
     like, shapes, indices = checked_arrays(whole[None] if is_template else whole, faces)
     given = checked(observations, shapes.shape[1])
-    at = np.zeros(0) if is_template else _times(times, len(shapes))
+    at = np.zeros(0) if is_template else check_times(times, len(shapes)).numpy()
     solver = _Completer(shapes, torch.from_numpy(indices), at, given)
     with ProgressReport(len(solver.frames) * (4 + ROUNDS), "completing", progress) as report:
         solver.search(report)
@@ -224,12 +225,6 @@ def _differentiable(found: Completion, solver: "_Completer", points: Sequence[Te
     shapes = with_gradients(found.shapes, points, solves, solver.axes)
     rows = torch.tensor([i for i, t in enumerate(sorted(exact | set(at))) if t in at], device=shapes.device)
     return found._replace(shapes=shapes, knots=found.knots.index_copy(0, rows, shapes))
-
-
-def _times(times: Tensor | Sequence[float] | None, n: int) -> FloatArray:
-    if n == 1:
-        return np.array([0.0 if times is None else float(torch.as_tensor(times).reshape(-1)[0])])
-    return checked_times(times, n, False).numpy()
 
 
 class _Completer:
