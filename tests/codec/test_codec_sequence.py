@@ -51,11 +51,11 @@ def test_no_amplitudes_are_the_path(bars: Shapes, cyclic: bool) -> None:
         (0, torch.full((3, 164, 3), torch.nan).double(), "NaN"),
         (1, torch.tensor([[0, 1, 164]]), "do not exist"),
         (2, [0.0, 2.0, 1.0], "ascend"),
-        (2, [0.0], "one time for each key-frame"),
+        (2, [0.0], "must be 3 or 4 ascending numbers, one for each key-frame"),
         (3, torch.zeros(163, 3).double(), "reference must be"),
         (4, torch.zeros(164, 3).double(), "modes must be"),
         (4, torch.full((2, 164, 3), torch.inf).double(), "modes has entries that are not finite"),
-        (4, [[0.0]], "got a list"),
+        (4, [[0.0]], "modes is a list"),
     ],
 )
 def test_what_does_not_fit_is_said(bars: Shapes, place: int, value: Any, said: str) -> None:
@@ -105,7 +105,7 @@ def test_leading_dimensions(decoder: tm.ModalDecoder, bars: Shapes) -> None:
     assert decoder(a[:0], t).shape == (0, 3, *bars.keyframes.shape[1:])
     with pytest.raises(ValueError, match=r"\(\.\.\., 8\)"):
         decoder(a[..., :5], t)
-    with pytest.raises(ValueError, match=r"motions have the shape \(\.\.\., 6\)"):
+    with pytest.raises(ValueError, match=r"motions must be floating-point of shape \(\.\.\., 6\)"):
         decoder(torch.zeros(2, 8).double(), 0.5, torch.zeros(2, 5).double())
     with pytest.raises(ValueError, match=r"0 and 3; got 3\.5"):
         decoder(a, 3.5)
@@ -162,7 +162,7 @@ def test_other_frames_are_fitted_beside_the_same_path(encoded: tm.ModalSequence,
     assert torch.allclose(measured, found.errors, rtol=0, atol=1e-12)
     at_key = encoded.fit(motion[3:4], 3.0)  # no key-frame of another motion is known
     assert float(at_key.amplitudes.abs().max()) < 1e-6
-    with pytest.raises(ValueError, match="times"):
+    with pytest.raises(ValueError, match="one time for each frame"):
         encoded.fit(motion, [0.0])
     with pytest.raises(ValueError, match="0 and 8"):
         encoded.fit(motion[:1], 9.0)
@@ -245,7 +245,7 @@ def test_saved_and_loaded(encoded: tm.ModalSequence, tmp_path: Path) -> None:
     [
         ("amplitudes", torch.zeros(9, 11).double(), "12 modes needs the shapes"),
         ("times", torch.arange(9).flip(0).double(), "ascend"),
-        ("times", torch.arange(9).double() + 1, "within those of the key-frames"),
+        ("times", torch.arange(9).double() + 1, "within those of the key-frames, 0 to 8"),
         ("motions", torch.full((9, 6), torch.nan).double(), "not finite"),
         ("keyframe_times", torch.zeros(3).double(), "ascend"),
     ],

@@ -16,6 +16,7 @@ from torch_modal import open_asset, save_animation
 from torch_modal.geometry import inspect
 from torch_modal.geometry.inspect import signed_volume
 from torch_modal.geometry.rigid import looks_mirrored
+from torch_modal.keyframes.arrays import check_tensor
 from torch_modal.keyframes.check import Keyframes, MeshError, MeshWarning, check_keyframes
 from torch_modal.modes.surface import CanonicalSurface
 from torch_modal.registration.load import load_keyframes
@@ -619,3 +620,29 @@ def test_large_meshes_are_checked_quickly():
     start = time.perf_counter()
     check_keyframes(keyframes, ball.faces)
     assert time.perf_counter() - start < 3  # 0.4 s; generous, as machines are shared
+
+
+@pytest.mark.parametrize(
+    ("x", "sizes", "options", "said"),
+    [
+        ([[0.0] * 3], ("V", 3), {}, r"x is a list; pass a tensor, for instance torch.as_tensor\(x\)"),
+        (torch.zeros(4, 3), (5, 3), {}, r"x must be floating-point of shape \(5, 3\); got \(4, 3\) of torch.float32$"),
+        (torch.zeros(2, 4, 3), ("V", 3), {}, r"of shape \(V, 3\); got \(2, 4, 3\)"),
+        (torch.zeros(3), ("...", "V", 3), {}, r"of shape \(\.\.\., V, 3\); got \(3,\)"),
+        (torch.zeros(2, 5), ("...", 6), {"hint": "a turn and a move"}, r"got \(2, 5\) of torch.float32; a turn and a"),
+        (torch.zeros(2), (3,), {}, r"of shape \(3,\); got \(2,\)"),
+        (torch.zeros(4, 3, dtype=torch.int64), (4, 3), {}, "floating-point .* of torch.int64"),
+        (torch.zeros(4, 3), (4, 3), {"device": torch.device("meta")}, "x is on cpu, the other tensors on meta; move"),
+        (torch.full((4, 3), torch.nan), (4, 3), {"finite": True}, "x has entries that are not finite"),
+    ],
+)
+def test_arguments_that_are_no_shapes_are_refused(x, sizes, options, said) -> None:
+    with pytest.raises(ValueError, match=said):
+        check_tensor("x", x, *sizes, **options)
+
+
+@pytest.mark.parametrize(
+    "sizes", [(2, 4, 3), ("K", 4, 3), ("...", 4, 3), ("...", 2, 4, 3), ("...", "V", 3), ("...", 3)]
+)
+def test_arguments_that_are_shapes_pass(sizes) -> None:
+    check_tensor("x", torch.zeros(2, 4, 3), *sizes, device=torch.device("cpu"), finite=True)

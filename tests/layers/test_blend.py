@@ -262,9 +262,9 @@ class TestErrors:
             (pulls(0.5, 0.2, 0.2), "add up to 1"),
             (pulls(0.9, 0.4, -0.3), "below zero to -0.25"),
             (pulls(0.5, torch.nan, 0.5), "add up to 1"),
-            (pulls(0.5, 0.5), "with the same K"),
+            (pulls(0.5, 0.5), r"keyframes must be .* \(\.\.\., 2, 164, 3\)"),
             (torch.tensor([1, 0, 0]), "floating-point"),
-            ([0.5, 0.2, 0.3], "with the same K"),
+            ([0.5, 0.2, 0.3], "weights is a list"),
         ],
     )
     def test_weights_that_do_not_fit(self, layer: Blend, poses: Tensor, weights: Tensor, words: str) -> None:

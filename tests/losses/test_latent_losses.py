@@ -137,7 +137,7 @@ def test_decoders_in_half_precision(bars: Shapes) -> None:
         (lambda faces, decoder, z: tm.losses.LatentElasticity(faces, step=0.0), "above 0"),
         (
             lambda faces, decoder, z: tm.losses.LatentElasticity(faces)(lambda z: decoder(z).flatten(1), z),
-            r"makes shapes \(2, V, 3\)",
+            r"decoder's shapes must be floating-point of shape \(2, V, 3\)",
         ),
     ],
 )

@@ -285,9 +285,9 @@ def test_what_a_call_refuses(call: Any, message: str, path: Path, motion: Shapes
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"times": [0.0, 1.0]}, r"one time for each key-frame: \(5,\)"),
-        ({"times": [0.0, 1.0, 2.0, 3.0, 4.0], "cyclic": True}, r"and one when the first comes again: \(6,\)"),
-        ({"times": [0.0, 1.0, 1.0, 3.0, 4.0]}, "must ascend"),
+        ({"times": [0.0, 1.0]}, "must be 5 ascending numbers, one for each key-frame"),
+        ({"times": [0.0, 1.0, 2.0, 3.0, 4.0], "cyclic": True}, "must be 6 ascending numbers"),
+        ({"times": [0.0, 1.0, 1.0, 3.0, 4.0]}, "got 1 at place 2, after 1"),
         ({"preset": "paper"}, "middle of a pair only"),
     ],
 )
@@ -363,7 +363,7 @@ def test_a_pinned_in_between_becomes_a_keyframe(motion: Shapes, path: Path) -> N
     torch.testing.assert_close(editor.shapes(), editor.path(editor.keyframes, editor.times()), rtol=0, atol=1e-9)
     for number, shape, error, message in (
         (6, moved, IndexError, "6 key-frames"),
-        (0, moved * math.nan, ValueError, "holds finite numbers"),
+        (0, moved * math.nan, ValueError, "not finite"),
     ):
         with pytest.raises(error, match=message):
             editor.replace(number, shape)
@@ -391,7 +391,7 @@ def test_an_insert_that_fails_changes_nothing(bars: Shapes, cyclic: bool, t: flo
     editor = tm.PathEditor(path, own.keyframes, steps=2)
     before, at = editor.shapes(), editor.times()
     if cyclic and t == 5.0:
-        with pytest.raises(ValueError, match="finite numbers"):
+        with pytest.raises(ValueError, match="not finite"):
             editor.insert(t, own.keyframes[0] * math.nan)
     else:
         with pytest.raises(ValueError, match=r"lies between|already"):

@@ -213,8 +213,8 @@ def test_open_and_ugly_meshes_in_millimetres() -> None:
         ({"influences": 5}, "influences must be 1, 2, 3 or 4"),
         ({"tolerance": 0.0}, "tolerance must be a positive part"),
         ({"tolerance": float("nan")}, "tolerance must be a positive part"),
-        ({"times": [0, 1, 2]}, "times must be 7 ascending numbers"),
-        ({"times": [0, 1, 2, 2, 3, 4, 5]}, "times must be 7 ascending numbers"),
+        ({"times": [0, 1, 2]}, "times must be 7 or 8 ascending numbers, one for each frame"),
+        ({"times": [0, 1, 2, 2, 3, 4, 5]}, "times must be 7 or 8 ascending numbers, one for each frame"),
     ],
 )
 def test_what_cannot_be_baked(changes: dict, message: str) -> None:

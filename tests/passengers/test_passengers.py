@@ -150,8 +150,8 @@ def test_broken_shapes_stay_alone(bars: Shapes) -> None:
 @pytest.mark.parametrize(
     "change, words",
     [
-        ({"points": torch.zeros(4, 2)}, "points holds finite numbers"),
-        ({"points": torch.full((4, 3), torch.nan)}, "points holds finite numbers"),
+        ({"points": torch.zeros(4, 2)}, r"points must be floating-point of shape \(n, 3\)"),
+        ({"points": torch.full((4, 3), torch.nan)}, "points has entries that are not finite"),
         ({"reference": torch.zeros(5, 3)}, "the faces name vertex 163"),
         ({"faces": torch.tensor([[0, 1, -2]])}, "the faces name vertex -2"),
         ({"faces": torch.zeros(0, 3, dtype=torch.int64)}, "faces have the shape"),

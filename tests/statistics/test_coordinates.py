@@ -113,6 +113,11 @@ class TestComponents:
         with pytest.raises(ValueError, match="one key-frame alone does not vary"):
             tm.ShapeSpace(bars.bases[:1], bars.faces).variation()
 
+    def test_shapes_of_another_mesh_are_refused(self, bars: Shapes) -> None:
+        components = tm.ShapeSpace(bars.bases, bars.faces).components()
+        with pytest.raises(ValueError, match=r"shapes must be floating-point of shape \(\.\.\., 164, 3\)"):
+            components.coordinates(bars.keyframes[:, :-1])
+
 
 def test_the_mean_has_the_shape_of_a_blend(bars: Shapes) -> None:
     space = tm.ShapeSpace(bars.bases, bars.faces)

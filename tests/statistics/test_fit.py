@@ -271,7 +271,7 @@ def test_what_no_mixture_meets_falls_back_to_a_keyframe(
 @pytest.mark.parametrize(
     "points, vertices, near, words",
     [
-        (torch.zeros(2, 3), torch.tensor([0, 1]), None, "n of 3 or more"),
+        (torch.zeros(2, 3), torch.tensor([0, 1]), None, "three vertices or more"),
         (torch.full((3, 3), torch.nan), torch.tensor([0, 1, 2]), None, "a weight of zero"),
         (torch.zeros(3, 3), torch.tensor([0, 1]), None, "one vertex index for each"),
         (torch.zeros(3, 3), torch.tensor([0, 1, 10**6]), None, "lie in 0 to 163"),

@@ -40,7 +40,7 @@ def fit(
     """
     n, k = len(frames), decoder.n_modes
     found = FittedFrames(torch.zeros(n, k).double(), torch.zeros(n, 6).double(), torch.zeros(n).double())
-    intervals = decoder.located(times)[0]
+    intervals = decoder.locate(times)[0]
     with torch.no_grad():
         for interval in intervals.unique():
             a, linear = torch.zeros(k).double(), None

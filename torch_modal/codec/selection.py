@@ -8,11 +8,11 @@ import torch
 from torch import Tensor
 
 from torch_modal.codec.fit import fit
-from torch_modal.keyframes.arrays import checked_times
 from torch_modal.keyframes.check import check_keyframes
 from torch_modal.modes.extract import extract_modes
 from torch_modal.motion.decoder import ModalDecoder
 from torch_modal.progress import Progress, ProgressReport
+from torch_modal.times import check_times
 
 ERROR = 0.002  # default for the largest mean distance of a frame's vertices, over the diagonal
 N_SAMPLES = 5  # frames of an interval that are fitted to estimate its error
@@ -64,7 +64,7 @@ def select_keyframes(
 def checked_motion(frames: Any, faces: Any, times: Any, cyclic: bool) -> tuple[Tensor, Tensor, Tensor]:
     """Checked frames (float64), faces and times; raises as :func:`torch_modal.encode`."""
     shapes, triangles = check_keyframes(frames, faces, min_keyframes=2, warn=False)
-    return shapes.detach().cpu().double(), triangles.cpu(), checked_times(times, len(shapes), cyclic)
+    return shapes.detach().cpu().double(), triangles.cpu(), check_times(times, len(shapes), cyclic)
 
 
 class Selection:

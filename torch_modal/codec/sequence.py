@@ -13,10 +13,12 @@ from torch import Tensor
 from torch_modal.codec.fit import FittedFrames, fit
 from torch_modal.codec.selection import ERROR, Selection, checked_motion
 from torch_modal.io.tensors import TensorFile, write_tensors
+from torch_modal.keyframes.arrays import check_tensor
 from torch_modal.keyframes.check import check_keyframes
 from torch_modal.modes.extract import extract_modes
 from torch_modal.motion.decoder import ModalDecoder
 from torch_modal.progress import Progress, ProgressReport
+from torch_modal.times import check_times, locate_times
 
 FORMAT = "torch_modal.sequence"
 VERSION = "3"
@@ -67,9 +69,10 @@ class ModalSequence:
             raise ValueError(f"a motion of {t} frames and {k} modes needs the shapes {wanted}; got {shapes}")
         if not all(bool(part.isfinite().all()) for part in (self.times, self.amplitudes, self.motions)):
             raise ValueError("times, amplitudes or motions are not finite")
+        check_times(self.times, t, of="frame")
         start, *_, end = self.keyframe_times
-        if bool((self.times.diff() <= 0).any()) or self.times[0] < start or self.times[-1] > end:
-            raise ValueError("times must ascend within those of the key-frames")
+        if self.times[0] < start or self.times[-1] > end:
+            raise ValueError(f"times lie within those of the key-frames, {float(start):g} to {float(end):g}")
         object.__setattr__(self, "decoder", decoder)
 
     @property
@@ -141,28 +144,17 @@ class ModalSequence:
         """
         x = check_keyframes(frames, self.faces, min_keyframes=1, warn=False)[0].detach().cpu().double()
         t = torch.as_tensor(times, dtype=torch.float64).reshape(-1)
-        if x.shape[1:] != self.keyframes.shape[1:] or len(t) != len(x):
-            raise ValueError(
-                f"frames have the shape (N, {self.keyframes.shape[1]}, 3), and times (N,); got {tuple(x.shape)} and "
-                f"{tuple(t.shape)}"
-            )
+        check_tensor("frames", x, len(t), *self.keyframes.shape[1:], hint="one time for each frame")
         return fit(self.decoder, x, t)
 
     def _at(self, t: Tensor) -> tuple[Tensor, Tensor]:
         """Amplitudes and rigid motions at any time. *Shape:* ``(N,) -> (N, k), (N, 6)``."""
-        knots, values = self.times, torch.cat([self.amplitudes, self.motions], 1)
+        times, values = self.times, torch.cat([self.amplitudes, self.motions], 1)
         if self.cyclic:
             period = self.keyframe_times[-1] - self.keyframe_times[0]
-            t = self.keyframe_times[0] + (t - self.keyframe_times[0]) % period
-            knots, values = torch.cat([knots, knots[:1] + period]), torch.cat([values, values[:1]])
-        if bool(((t < knots[0]) | (t > knots[-1]) | t.isnan()).any()):
-            raise ValueError(
-                f"t lies between the times of the first and the last frame, {float(knots[0]):g} and "
-                f"{float(knots[-1]):g}; got {float(t.min()):g} to {float(t.max()):g}"
-            )
-        right = torch.searchsorted(knots, t.contiguous()).clamp(1, len(knots) - 1)
-        part = ((t - knots[right - 1]) / (knots[right] - knots[right - 1]))[:, None]
-        mixed = torch.lerp(values[right - 1], values[right], part)
+            times, values = torch.cat([times, times[:1] + period]), torch.cat([values, values[:1]])
+        before, u = locate_times(t, times, self.cyclic, of="frame")
+        mixed = torch.lerp(values[before], values[before + 1], u[:, None])
         return mixed[:, : self.n_modes], mixed[:, self.n_modes :]
 
     def save(self, path: str | os.PathLike[str]) -> None:

@@ -29,12 +29,12 @@ from torch_modal.data.tree import mesh_files
 from torch_modal.errors import MeshError
 from torch_modal.io.cache import CACHE_VERSION, content_digest
 from torch_modal.io.files import write_file
-from torch_modal.keyframes.arrays import checked_times
 from torch_modal.modes.extract import Method, extract_bases
 from torch_modal.modes.processes import describe_exit, last_line, run_child
 from torch_modal.modes.tetrahedra import Mesher
 from torch_modal.modes.tetwild import Auto, TetWild
 from torch_modal.registration.load import load_keyframes
+from torch_modal.times import check_times
 
 DONE, FAILED, UNFINISHED = "done", "failed", "unfinished"
 COMMAND = [
@@ -251,7 +251,7 @@ def _times(file: Path, n_keyframes: int) -> list[float]:
         return [float(i) for i in range(n_keyframes)]
     try:
         times = [float(word) for word in file.read_text().split()]
-        checked_times(times, n_keyframes, cyclic=len(times) == n_keyframes + 1)
+        check_times(times, n_keyframes, None)
         return times
     except ValueError as error:
         wanted = f"one number for each of the {n_keyframes} key-frames, ascending, and one more if they are a cycle"

@@ -16,8 +16,8 @@ from torch import Tensor
 
 from torch_modal.autograd import lasting
 from torch_modal.io.tensors import TensorFile, write_tensors
-from torch_modal.keyframes.arrays import checked_times
 from torch_modal.modes.basis import ModalBasis
+from torch_modal.times import check_times
 
 FORMAT = "torch_modal.set"
 VERSION = "2"
@@ -45,7 +45,7 @@ class Motion:
     """
 
     def __init__(self, times: Tensor | Sequence[float], n_keyframes: int, cyclic: bool = False) -> None:
-        self.times = checked_times(times, n_keyframes, cyclic)
+        self.times = check_times(times, n_keyframes, cyclic)
         self.n_keyframes = n_keyframes
         self.cyclic = cyclic
         both, last = torch.arange(n_keyframes)[:, None] + torch.tensor([-1, 1]), n_keyframes - 1

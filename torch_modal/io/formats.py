@@ -11,6 +11,7 @@ import numpy as np
 
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.progress import Progress
+from torch_modal.times import check_times
 
 if TYPE_CHECKING:
     from torch_modal.geometry.skin import Skin
@@ -109,14 +110,9 @@ class Timing:
         #: Time of each frame over the duration, from 0 on. *Shape:* ``(N,)``.
         self.parts = np.arange(n_frames) / steps
         if times is not None:
-            given, wanted = np.asarray(times, np.float64), n_frames + cyclic
-            if given.shape != (wanted,) or not np.isfinite(given).all() or (np.diff(given) <= 0).any():
-                also = ", and the one when it begins again" if cyclic else ""
-                raise ValueError(
-                    f"times must be {wanted} ascending numbers, one for each frame{also}; got {given.shape}."
-                )
-            if wanted > 1:
-                self.parts = ((given - given[0]) / (given[-1] - given[0]))[:n_frames]
+            when = check_times(times, n_frames, cyclic, "frame").numpy()
+            if len(when) > 1:
+                self.parts = ((when - when[0]) / (when[-1] - when[0]))[:n_frames]
         #: Seconds of the sequence once, for a cycle with the step back to its start; pictures a second at a fixed rate.
         self.duration, self.fps = float(duration), float(FPS if fps is None else fps)
         self.cyclic, self.ping_pong, self.ease = cyclic, ping_pong, ease

@@ -1,6 +1,5 @@
-"""Positions, faces and times from tensors, NumPy arrays and sequences; vertices welded along seams."""
+"""Positions and faces from tensors, NumPy arrays and sequences; vertices welded along seams."""
 
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -77,24 +76,37 @@ def _as_tensor(name: str, value: Any) -> Tensor:
         ) from error
 
 
-def checked_times(times: Tensor | Sequence[float] | None, n_keyframes: int, cyclic: bool) -> Tensor:
-    """Checked times of key-frames; if cyclic, with the end of the cycle. *Shape:* ``(K,)`` or ``(K + 1,)``.
+def check_tensor(
+    name: str, x: Any, *sizes: int | str, device: torch.device | None = None, finite: bool = False, hint: str = ""
+) -> None:
+    """Raise for what is not a floating-point tensor of a shape.
+
+    Args:
+        name: Of the argument, for the message.
+        x: The argument.
+        sizes: The size of each dimension, or its letter if any size will do; ``"..."`` first for any leading
+            dimensions. Shapes of a mesh of 12 vertices are ``"...", 12, 3``.
+        device: Where it must be.
+        finite: True to look at its numbers.
+        hint: A remedy, for the message on a wrong shape.
 
     Raises:
-        ValueError: The number of times is wrong, or they do not ascend.
+        ValueError: The argument is something else.
     """
-    n = n_keyframes + cyclic
-    if times is None:
-        return torch.arange(n, dtype=torch.float64)
-    found = torch.as_tensor(times, dtype=torch.float64).detach().cpu()
-    if found.shape != (n,):
-        also = ", and one when the first comes again" if cyclic else ""
+    if not isinstance(x, Tensor):
+        raise ValueError(f"{name} is a {type(x).__name__}; pass a tensor, for instance torch.as_tensor({name})")
+    wanted = sizes[1:] if sizes[:1] == ("...",) else sizes
+    last = x.shape[max(0, x.dim() - len(wanted)) :] if wanted is not sizes else x.shape
+    fits = len(last) == len(wanted) and all(isinstance(a, str) or a == b for a, b in zip(wanted, last, strict=True))
+    if not fits or not x.is_floating_point():
+        shape = f"({', '.join(map(str, sizes))}{',' * (len(sizes) == 1)})"
         raise ValueError(
-            f"times has the shape {tuple(found.shape)}; it needs one time for each key-frame{also}: ({n},)"
+            f"{name} must be floating-point of shape {shape}; got {tuple(x.shape)} of {x.dtype}{hint and '; '}{hint}"
         )
-    if not bool(found.isfinite().all()) or bool((found.diff() <= 0).any()):
-        raise ValueError(f"times must ascend from key-frame to key-frame; got {found.tolist()}")
-    return found
+    if device is not None and x.device != device:
+        raise ValueError(f"{name} is on {x.device}, the other tensors on {device}; move one with .to()")
+    if finite and not bool(x.isfinite().all()):
+        raise ValueError(f"{name} has entries that are not finite")
 
 
 class WeldedKeyframes(NamedTuple):

@@ -16,7 +16,7 @@ from torch_modal.geometry.canonical import own_order
 from torch_modal.inbetween.results import InBetweenResult, Samples, of_bodies
 from torch_modal.inbetween.settings import Settings
 from torch_modal.inbetween.solver import InBetweenSolver
-from torch_modal.keyframes.arrays import as_faces, as_positions
+from torch_modal.keyframes.arrays import as_faces, as_positions, check_tensor
 from torch_modal.keyframes.check import checked_surface
 from torch_modal.modes.basis import ModalBasis, checked_bases
 from torch_modal.threads import alone, by_chunks
@@ -48,8 +48,7 @@ def basis_buffers(bases: Bases) -> list[BasisBuffers]:
     several: list[Any] = list(bases) if isinstance(bases, Iterable) else [bases]
     if several and not any(hasattr(basis, "modes") for basis in several):
         x = as_positions(several)
-        if x.dim() != 3 or x.shape[-1] != 3:
-            raise ValueError(f"in the place of bases, key-frames have the shape (K, V, 3); got {tuple(x.shape)}")
+        check_tensor("key-frames without modes", x, "K", "V", 3)
         return [BasisBuffers(shape, shape.new_zeros(0, *shape.shape)) for shape in x]
     return [b if isinstance(b, BasisBuffers) else BasisBuffers(b.reference, b.modes) for b in checked_bases(several)]
 
@@ -91,23 +90,11 @@ class PreciseModule(nn.Module):
         names = [f"{prefix}bases.{i}.reference" for i in range(len(self.bases))]
         checked_surface([given.get(name, own[name]).double().cpu() for name in names], self.faces.cpu())
 
-    def check_shapes(self, **given: Tensor) -> None:
-        """Raise where shapes do not fit the module.
-
-        Raises:
-            ValueError: One is no tensor, no shape of the mesh, or on another device.
-        """
+    def check_shapes(self, *sizes: int | str, **shapes: Tensor) -> None:
+        """Raise a ValueError for shapes that do not fit the mesh, sizes of their leading dimensions, or the device."""
         reference = self.bases[0].reference
-        for name, x in given.items():
-            if not isinstance(x, Tensor):
-                raise ValueError(f"{name} is a {type(x).__name__}; pass a tensor, for instance torch.as_tensor({name})")
-            if x.shape[-2:] != reference.shape or not x.is_floating_point():
-                raise ValueError(
-                    f"{name} must be floating-point of shape (..., {len(reference)}, 3) as the bases are; got "
-                    f"{tuple(x.shape)} of {x.dtype}"
-                )
-            if x.device != reference.device:
-                raise ValueError(f"{name} is on {x.device}, the layer on {reference.device}; move one with .to()")
+        for name, x in shapes.items():
+            check_tensor(name, x, "...", *sizes, *reference.shape, device=reference.device)
 
     def _marks(self) -> Tensor:
         """Numbers that tell the bases from others. *Shape:* ``(K, 3)``."""

@@ -6,6 +6,7 @@ from torch import Tensor
 from torch_modal.autograd import broadcast_shapes, lasting, made_outside, once, traced, untraced
 from torch_modal.inbetween.results import InBetweenResult, report, with_exact_keyframes
 from torch_modal.inbetween.settings import Objective, Preset, Solver, settings
+from torch_modal.keyframes.arrays import check_tensor
 from torch_modal.layers.base import Bases, InBetweenLayer, basis_buffers
 
 MOST_BELOW_ZERO = 0.25
@@ -95,18 +96,8 @@ class Blend(InBetweenLayer):
 
     def _check(self, keyframes: Tensor, weights: Tensor) -> torch.Size:
         """The leading dimensions of the result, of arguments that are checked."""
-        self.check_shapes(keyframes=keyframes)
-        if keyframes.dim() < 3 or not isinstance(weights, Tensor) or weights.shape[-1:] != keyframes.shape[-3:-2]:
-            shape = tuple(weights.shape) if isinstance(weights, Tensor) else type(weights).__name__
-            raise ValueError(
-                "keyframes have the shape (..., K, V, 3), weights (..., K) with the same K; got "
-                f"{tuple(keyframes.shape)} and {shape}"
-            )
-        if not weights.is_floating_point() or weights.device != keyframes.device:
-            raise ValueError(
-                f"weights are floating-point and on the device of the key-frames, {keyframes.device}; got "
-                f"{weights.dtype} on {weights.device}"
-            )
+        check_tensor("weights", weights, "...", "K", device=self.bases[0].reference.device)
+        self.check_shapes(weights.shape[-1], keyframes=keyframes)
         try:
             lead = broadcast_shapes(keyframes.shape[:-3], weights.shape[:-1])
         except RuntimeError:

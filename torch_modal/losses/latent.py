@@ -7,6 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from torch_modal.autograd import full_precision
+from torch_modal.keyframes.arrays import check_tensor
 from torch_modal.losses.shell import ShellLoss
 
 Decoder = Callable[[Tensor], Tensor]
@@ -104,10 +105,7 @@ class LatentElasticity(nn.Module):
                     f"the decoder has no forward mode ({error}); pass LatentElasticity(..., step=1e-3) for differences"
                 ) from error
             x, tangents = found[0][0], [tangent for _, tangent in found]
-        if x.dim() != 3 or x.shape[-1] != 3 or len(x) != len(z):
-            raise ValueError(
-                f"the decoder makes shapes ({len(z)}, V, 3) of latents {tuple(z.shape)}; got {tuple(x.shape)}"
-            )
+        check_tensor("the decoder's shapes", x, len(z), "V", 3)
         return x.to(torch.promote_types(x.dtype, torch.float32)), tangents  # of an autocast decoder
 
     @full_precision

@@ -16,7 +16,7 @@ from typing import NamedTuple, TypeVar
 import torch
 from torch import Tensor
 
-from torch_modal.autograd import in_use, made_outside, mapped, traced
+from torch_modal.autograd import in_use, mapped
 
 # Velocities are cut from this many times the slower one of the steps before and after on, and never reach three times:
 # what stops, stops, and no quantity that grows overshoots (Fritsch and Carlson 1980).
@@ -98,45 +98,6 @@ def limited_spline(speeds: Tensor, durations: Tensor, cyclic: bool, squared: Squ
 def offset(first: Tensor, last: Tensor, u: Tensor) -> Tensor:
     """The difference between a cubic and the straight step at ``u``, which broadcasts against the others."""
     return u * (1 - u) * ((1 - u) * first - u * last)
-
-
-def located(t: Tensor, times: Tensor, cyclic: bool, rounding: float = 0.0) -> tuple[Tensor, Tensor]:
-    """The interval between key-frames that each time lies in, and how far along it is. *Shape of each:* ``(B,)``.
-
-    Args:
-        t: *Shape:* ``(B,)``.
-        times: Of the key-frames, ascending; if cyclic, one more, when the first comes again. *Shape:* ``(K,)``.
-        cyclic: True where times are taken modulo the period.
-        rounding: Relative. Times so near to a key-frame are taken for its own: 0.3 in float32 is beside 0.3 in float64,
-            and would miss the key-frame, or lie after the last.
-
-    Raises:
-        ValueError: A time is before the first or after the last.
-    """
-    scale = torch.maximum(t.detach().abs(), times.abs().amax())
-    if cyclic:
-        t = wrapped(t, times)
-    if rounding:
-        differences = times - t.detach()[:, None]
-        to_nearest = differences.gather(1, differences.abs().argmin(1, keepdim=True))[:, 0]
-        t = t + torch.where(to_nearest.abs() <= 2 * rounding * scale, to_nearest, 0.0)
-    if not traced(t):
-        made_outside(_check_times, t, times)
-    segment = (torch.searchsorted(times, t.detach().contiguous(), right=True) - 1).clamp(0, len(times) - 2)
-    return segment, (t - times[segment]) / (times[segment + 1] - times[segment])
-
-
-def _check_times(t: Tensor, times: Tensor) -> None:
-    outside = t[~((t >= times[0]) & (t <= times[-1]))].tolist()
-    if outside:
-        ends = f"{float(times[0]):g} and {float(times[-1]):g}"
-        raise ValueError(f"t lies between the times of the first and the last key-frame, {ends}; got {outside[0]:g}")
-
-
-def wrapped(t: Tensor, times: Tensor) -> Tensor:
-    """Times modulo the period of a cycle. *Shape:* ``(B,)``."""
-    period = times[-1] - times[0]
-    return t - period * torch.floor((t.detach() - times[0]) / period)
 
 
 def by_interval(

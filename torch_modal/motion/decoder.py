@@ -18,10 +18,11 @@ from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.local_rotations import Trajectory
 from torch_modal.geometry.rotations import exp
 from torch_modal.geometry.triangle_frames import Frames, bend, frames, sides
-from torch_modal.keyframes.arrays import checked_times
+from torch_modal.keyframes.arrays import check_tensor
 from torch_modal.keyframes.check import checked_arrays
-from torch_modal.motion.cubics import by_interval, located
+from torch_modal.motion.cubics import by_interval
 from torch_modal.motion.spline import Knots, Spline
+from torch_modal.times import check_times, locate_times
 
 UNIT = 0.01
 """An amplitude of 1 moves the vertices of the key-frame by this part of its diagonal, in the root mean square."""
@@ -73,8 +74,9 @@ class ModalDecoder(nn.Module):
     ) -> None:
         super().__init__()
         keyframes, _, indices = checked_arrays(keyframes, faces, 2)
-        reference, modes = (_finite(*one, keyframes) for one in (("reference", reference, 2), ("modes", modes, 3)))
-        times = checked_times(times, len(keyframes), len(times) > len(keyframes))
+        check_tensor("reference", reference, *keyframes.shape[1:], finite=True)
+        check_tensor("modes", modes, "k", *keyframes.shape[1:], finite=True)
+        times = check_times(times, len(keyframes), None)
         self._mesh = Connectivity(indices, len(reference))
         self.register_buffer("faces", torch.from_numpy(indices), persistent=False)
         for name, x in (("keyframes", keyframes), ("times", times), ("reference", reference)):
@@ -146,17 +148,16 @@ class ModalDecoder(nn.Module):
         Raises:
             ValueError: Shapes that do not fit, or times outside.
         """
-        if amplitudes.shape[-1:] != (self.n_modes,):
-            raise ValueError(f"amplitudes have the shape (..., {self.n_modes}); got {tuple(amplitudes.shape)}")
-        if keyframes is not None and keyframes.shape != self.keyframes.shape:
-            raise ValueError(f"keyframes have the shape {tuple(self.keyframes.shape)}; got {tuple(keyframes.shape)}")
-        if motions is not None and motions.shape[-1:] != (6,):
-            raise ValueError(f"motions have the shape (..., 6); got {tuple(motions.shape)}")
+        check_tensor("amplitudes", amplitudes, "...", self.n_modes)
+        if keyframes is not None:
+            check_tensor("keyframes", keyframes, *self.keyframes.shape)
+        if motions is not None:
+            check_tensor("motions", motions, "...", 6)
         knots = self.knots if keyframes is None else self.spline.knots(keyframes[None])
         t = torch.as_tensor(t, dtype=self.times.dtype, device=amplitudes.device)
         lead = broadcast_shapes(amplitudes.shape[:-1], t.shape)
         a = amplitudes.expand(*lead, -1).reshape(-1, self.n_modes)
-        segment, u = self.located(t.expand(lead).reshape(-1))
+        segment, u = self.locate(t.expand(lead).reshape(-1))
         size = max(1, CHUNK // self.keyframes.shape[1])
 
         def shapes(i: int, rows: Tensor | slice) -> Tensor:
@@ -181,25 +182,9 @@ class ModalDecoder(nn.Module):
         x = self.spline(knots, i, which, u, trajectory, straight, bending)
         return self.spline.alignment.restore(x, self.spline.pose(knots, i, which, u))
 
-    def located(self, t: Tensor) -> tuple[Tensor, Tensor]:
-        """The interval of each time, and how far along it is. *Shape:* ``(B,)``."""
-        return located(t, self.times, self.spline.cyclic)
-
-
-def _finite(name: str, x: Tensor, n_dimensions: int, keyframes: Tensor) -> Tensor:
-    """Displacements or positions of the vertices of the key-frames.
-
-    Raises:
-        ValueError: They are not.
-    """
-    item = tuple(keyframes.shape[1:])
-    if not isinstance(x, Tensor) or x.dim() != n_dimensions or x.shape[-2:] != item or not x.is_floating_point():
-        shape = f"({'k, ' * (n_dimensions - 2)}{item[0]}, 3)"
-        got = f"{tuple(x.shape)} of {x.dtype}" if isinstance(x, Tensor) else f"a {type(x).__name__}"
-        raise ValueError(f"{name} must be floating-point of shape {shape} as the key-frames are; got {got}")
-    if not bool(x.isfinite().all()):
-        raise ValueError(f"{name} has entries that are not finite")
-    return x
+    def locate(self, t: Tensor) -> tuple[Tensor, Tensor]:
+        """Interval of each time, and its fraction of the interval. *Shape:* ``(B,)``."""
+        return locate_times(t, self.times, self.spline.cyclic)
 
 
 def scaled(modes: Tensor, size: Tensor | float) -> Tensor:

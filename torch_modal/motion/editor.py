@@ -4,7 +4,9 @@ import torch
 from torch import Tensor
 
 from torch_modal.autograd import lasting
+from torch_modal.keyframes.arrays import check_tensor
 from torch_modal.motion.path import Path
+from torch_modal.times import fill_times
 
 SLIGHT = 1e-6
 """An interval is computed again where an edit moves its shapes by more than about this part of the diagonal."""
@@ -24,10 +26,7 @@ class PathEditor:
 
     @lasting
     def __init__(self, path: Path, keyframes: Tensor, steps: int = 16) -> None:
-        if keyframes.dim() != 3 or len(keyframes) != path.n_keyframes:
-            raise ValueError(
-                f"keyframes of this path have the shape ({path.n_keyframes}, V, 3); got {tuple(keyframes.shape)}"
-            )
+        check_tensor("keyframes", keyframes, path.n_keyframes, *path.bases[0].reference.shape)
         if steps < 1:
             raise ValueError(f"steps is 1 or more, got {steps}")
         self.path = path
@@ -77,10 +76,9 @@ class PathEditor:
 
     def times(self) -> Tensor:
         """When the shapes are. *Shape:* ``(T,)``, float64."""
-        knots = self.path.times
-        part = torch.arange(self.steps, dtype=knots.dtype, device=knots.device) / self.steps
-        inner = (knots[:-1, None] + part * knots.diff()[:, None]).flatten()
-        return inner if self.path.cyclic else torch.cat([inner, knots[-1:]])
+        times = self.path.times
+        inner = fill_times(times, [self.steps] * len(self._made))
+        return inner if self.path.cyclic else torch.cat([inner, times[-1:]])
 
     def shapes(self) -> Tensor:
         """All shapes; intervals that no change has touched are those of the last time. *Shape:* ``(T, V, 3)``."""
@@ -111,9 +109,5 @@ class PathEditor:
         return list(zip(ends, torch.cat(velocities, 1), strict=True))
 
     def _checked(self, shape: Tensor) -> Tensor:
-        if shape.shape != self.keyframes.shape[1:] or not bool(shape.isfinite().all()):
-            raise ValueError(
-                f"a key-frame holds finite numbers of the shape {tuple(self.keyframes.shape[1:])}; got a tensor of "
-                f"{tuple(shape.shape)}"
-            )
+        check_tensor("shape", shape, *self.keyframes.shape[1:], finite=True)
         return shape.to(self.keyframes)

@@ -21,13 +21,14 @@ from torch_modal.inbetween.alignment import Pose
 from torch_modal.inbetween.comparison import SLACK_OF_PATHS, no_worse
 from torch_modal.inbetween.results import InBetweenResult, of_bodies, report, unminimised, with_exact_keyframes
 from torch_modal.inbetween.settings import Objective, Preset, Solver, settings
-from torch_modal.keyframes.arrays import as_faces, checked_times
+from torch_modal.keyframes.arrays import as_faces
 from torch_modal.keyframes.check import checked_surface
 from torch_modal.layers.base import Bases, BasisBuffers, PreciseModule, basis_buffers
 from torch_modal.layers.blend import Blend
 from torch_modal.layers.in_between import InBetween
-from torch_modal.motion.cubics import Scheme, by_interval, located, wrapped
+from torch_modal.motion.cubics import Scheme, by_interval
 from torch_modal.motion.spline import Explanation, Knots, Spline
+from torch_modal.times import check_times, locate_times, wrap_times
 
 # Even times between two key-frames at which a path looks for contacts.
 N_SEARCHED = 31
@@ -99,7 +100,7 @@ class Path(PreciseModule):
         if self.contact:
             require_contact()
         self.objective = replace(objective, contact=False) if self.contact else objective
-        self.register_buffer("times", checked_times(times, n, cyclic).to(own[0].reference.device))
+        self.register_buffer("times", check_times(times, n, cyclic).to(own[0].reference.device))
         self.bases = nn.ModuleList(own)
         #: Number of key-frames, K.
         self.n_keyframes = n
@@ -159,9 +160,9 @@ class Path(PreciseModule):
             ValueError: The time is outside, not finite, or that of a key-frame.
         """
         at = self.times.new_tensor([t])
-        segment, u = located(at, self.times, self.cyclic)
+        segment, u = locate_times(at, self.times, self.cyclic)
         if self.cyclic:
-            at = wrapped(at, self.times)
+            at = wrap_times(at, self.times)
         # Modulo the period, a key-frame's time comes out with rounding.
         scale = torch.maximum(self.times.abs().amax(), self.times.new_tensor(abs(t)))
         if bool(((self.times - at).abs() <= SAME_TIME * scale).any()):
@@ -304,12 +305,7 @@ class Path(PreciseModule):
 
     def _located(self, keyframes: Tensor, t: Tensor | float) -> tuple[Tensor, Tensor, Tensor, Tensor, torch.Size]:
         """Motions, *shape* ``(L, K, V, 3)``; of each shape the motion, the interval, and the time there; dimensions."""
-        self.check_shapes(keyframes=keyframes)
-        n, n_vertices = self.n_keyframes, keyframes.shape[-2]
-        if keyframes.shape[-3:-2] != (n,):
-            raise ValueError(
-                f"keyframes of this path have the shape (..., {n}, {n_vertices}, 3); got {tuple(keyframes.shape)}"
-            )
+        self.check_shapes(self.n_keyframes, keyframes=keyframes)
         require_numbers("Path", keyframes)
         self._require_own_bases()
         rounding = torch.finfo(t.dtype).eps if isinstance(t, Tensor) and t.is_floating_point() else 0.0
@@ -324,7 +320,7 @@ class Path(PreciseModule):
             ) from None
         flat = keyframes.to(self.dtype).reshape(-1, *keyframes.shape[-3:])
         which = torch.arange(len(flat), device=t.device).reshape(own).expand(lead).reshape(-1)
-        segment, u = located(t.expand(lead).reshape(-1), self.times, self.cyclic, rounding)
+        segment, u = locate_times(t.expand(lead).reshape(-1), self.times, self.cyclic, rounding)
         return flat, which, segment, u.to(flat), lead
 
 

@@ -21,6 +21,7 @@ from torch_modal.geometry.rigid import best_rotation
 from torch_modal.geometry.rotations import exp, log, matrix
 from torch_modal.geometry.skin import STEPS, Skin, blended
 from torch_modal.io.write import check_frames
+from torch_modal.times import check_times
 
 ROUNDS = 20  # at most; fewer where one lowers the error by less than a hundredth
 SWEEPS = 2  # over the bones in a round
@@ -79,11 +80,7 @@ def bake(
         raise ValueError(f"influences must be 1, 2, 3 or 4 bones of a vertex, got {influences!r}.")
     if tolerance is not None and not 0 < tolerance < np.inf:
         raise ValueError(f"tolerance must be a positive part of the diagonal, such as 0.001; got {tolerance}.")
-    when = None if times is None else torch.as_tensor(times, dtype=torch.float64)
-    if when is not None and (
-        when.shape not in ((n,), (n + 1,)) or not (when.diff().isfinite() & (when.diff() > 0)).all()
-    ):
-        raise ValueError(f"times must be {n} ascending numbers, one for each frame; got {tuple(when.shape)}.")
+    when = None if times is None else check_times(times, n, None, "frame")
     diagonal = float(diagonals(shapes[:1])[0])
     if diagonal == 0:
         raise ValueError("frame 0, the rest shape, is a single point; bones need a shape.")

@@ -18,7 +18,6 @@ from torch_modal.geometry.crossings import Crossings, require_contact
 from torch_modal.geometry.rigid import blend
 from torch_modal.inbetween.results import report
 from torch_modal.inbetween.settings import Objective, Preset, Settings, Solver, settings
-from torch_modal.keyframes.arrays import checked_times
 from torch_modal.keyframes.check import check_keyframes
 from torch_modal.layers.mid_shape import MidShape
 from torch_modal.modes.basis import ModalBasis
@@ -27,6 +26,7 @@ from torch_modal.motion.path import Path
 from torch_modal.passengers.proxy import Proxy, proxy_size
 from torch_modal.progress import Progress, ProgressReport
 from torch_modal.threads import alone
+from torch_modal.times import check_times, fill_times
 
 MAX_LEVELS = 12
 
@@ -228,7 +228,7 @@ def keyframe_places(
     if not isinstance(levels, int) or not 0 <= levels <= MAX_LEVELS:
         raise ValueError(f"levels is a whole number from 0 to {MAX_LEVELS} (each doubles the frames), got {levels!r}")
     intervals = n_keyframes if cyclic else n_keyframes - 1
-    when = checked_times(times, n_keyframes, cyclic)
+    when = check_times(times, n_keyframes, cyclic)
     if n_frames is None:
         return [i * 2**levels for i in range(intervals + 1)]
     if n_frames < n_keyframes:
@@ -259,11 +259,10 @@ def frame_times(
     Returns:
         *Shape:* ``(T,)``, float64.
     """
-    when = checked_times(times, n_keyframes, cyclic)
+    when = check_times(times, n_keyframes, cyclic)
     places = keyframe_places(n_keyframes, levels, cyclic=cyclic, n_frames=n_frames, times=times)
-    each = zip(pairwise(when.tolist()), pairwise(places), strict=True)
-    parts = [torch.linspace(*ends, b - a + 1, dtype=torch.float64)[:-1] for ends, (a, b) in each]
-    return torch.cat(parts if cyclic else [*parts, when[-1:]])
+    inner = fill_times(when, [b - a for a, b in pairwise(places)])
+    return inner if cyclic else torch.cat([inner, when[-1:]])
 
 
 def linear_sequence(keyframes: Tensor, places: Sequence[int]) -> Tensor:

@@ -13,7 +13,7 @@ from torch_modal.autograd import full_precision, lasting, linear_map, traced
 from torch_modal.geometry.rigid import best_rotation
 from torch_modal.geometry.triangle_frames import sides
 from torch_modal.geometry.vectors import cross, inverse, norm
-from torch_modal.keyframes.arrays import as_faces
+from torch_modal.keyframes.arrays import as_faces, check_tensor
 from torch_modal.passengers.binding import binding
 
 
@@ -62,8 +62,7 @@ class Passengers(nn.Module):
         super().__init__()
         corners = torch.from_numpy(as_faces(faces))
         for name, x in (("reference", reference), ("points", points)):
-            if x.dim() != 2 or x.shape[1] != 3 or not x.is_floating_point() or not bool(x.isfinite().all()):
-                raise ValueError(f"{name} holds finite numbers of the shape (n, 3); got {tuple(x.shape)} of {x.dtype}")
+            check_tensor(name, x, "n", 3, finite=True)
         if corners.dim() != 2 or corners.shape[1] != 3 or not len(corners):
             raise ValueError(f"faces have the shape (F, 3), with one or more; got {tuple(corners.shape)}")
         for number in (int(corners.min()), int(corners.max())):
@@ -147,13 +146,11 @@ class Passengers(nn.Module):
         return found.view(*shapes.shape[:-2], len(self), 3, 3)
 
     def _flat(self, shapes: Tensor) -> Tensor:
-        if shapes.shape[-2:] != self.reference.shape or shapes.dtype != self.reference.dtype:
+        check_tensor("shapes", shapes, "...", *self.reference.shape, device=self.reference.device)
+        if shapes.dtype != self.reference.dtype:
             raise ValueError(
-                f"shapes are those of the carrier, (..., {len(self.reference)}, 3) of {self.reference.dtype}; got "
-                f"{tuple(shapes.shape)} of {shapes.dtype}. Another dtype: passengers.to(shapes.dtype)"
+                f"shapes are {shapes.dtype}, the passengers {self.reference.dtype}; use passengers.to(shapes.dtype)"
             )
-        if shapes.device != self.reference.device:
-            raise ValueError(f"shapes are on {shapes.device}, the passengers on {self.reference.device}; use .to()")
         # Unlike the shape's numel(), this keeps the batch of an export dynamic.
         flat = shapes.reshape(math.prod(shapes.shape[:-2]), *shapes.shape[-2:])
         return torch.where(flat.isfinite().all((1, 2), keepdim=True), flat, torch.nan)

@@ -4,6 +4,7 @@ import torch
 from torch import Tensor
 
 from torch_modal.autograd import lasting
+from torch_modal.keyframes.arrays import check_tensor
 from torch_modal.statistics.variation import Variation
 
 
@@ -36,6 +37,7 @@ class Components:
 
     def coordinates(self, shapes: Tensor) -> Tensor:
         """Coordinates of shapes along the components. *Shape:* ``(..., V, 3) -> (..., n)``."""
+        check_tensor("shapes", shapes, "...", *self._coordinates.mean.shape)
         flat = shapes.reshape(shapes.shape[:-2].numel(), *shapes.shape[-2:]).to(self.directions)
         off = (self._coordinates.of(flat) - self._average) * self._coordinates.shares
         found = torch.einsum("bjf,njf->bn", off, self.directions)
@@ -46,6 +48,7 @@ class Components:
 
         *Shape:* ``(..., n) -> (..., V, 3)``.
         """
+        check_tensor("coordinates", coordinates, "...", "n")
         flat = coordinates.reshape(coordinates.shape[:-1].numel(), coordinates.shape[-1]).to(self.directions)
         bending = self._average + torch.einsum("bn,njf->bjf", flat, self.directions[: flat.shape[1]])
         found = self._coordinates.shapes(bending) + self._origin

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torch_modal.autograd import transformed
 from torch_modal.contact.active import Pull
-from torch_modal.keyframes.arrays import require_units
+from torch_modal.keyframes.arrays import check_tensor, require_units
 from torch_modal.statistics.local_weights import NOISE, LocalWeights, Observations
 from torch_modal.statistics.variation import Variation, bounded
 
@@ -121,11 +121,7 @@ def _fit_one(variation: Variation, every: Observations, about: Tensor, robust: b
 
 def _checked(points: Tensor, vertices: Tensor, weights: Tensor | None, n_vertices: int) -> Observations:
     """All sets, with vertices and weights on the CPU, *shape* ``(..., n)``; raises for what does not fit."""
-    if points.dim() < 2 or points.shape[-1] != 3 or points.shape[-2] < 3 or not points.is_floating_point():
-        raise ValueError(
-            f"points are floating-point of the shape (..., n, 3), with n of 3 or more; got {tuple(points.shape)} of "
-            f"{points.dtype}"
-        )
+    check_tensor("points", points, "...", "n", 3)
     numbers = torch.as_tensor(vertices).cpu()
     if numbers.shape != points.shape[-2:-1] or numbers.is_floating_point() or numbers.dtype == torch.bool:
         raise ValueError(

@@ -22,6 +22,7 @@ from torch_modal.arrays import Array
 from torch_modal.io.files import write_file
 from torch_modal.io.formats import PAGES
 from torch_modal.io.write import check_frames, check_indices, check_suffix, refuse_existing, to_numpy
+from torch_modal.times import check_times
 from torch_modal.version import __version__
 from torch_modal.view.page_data import pack_group
 from torch_modal.view.picture import check_sequences, check_view
@@ -118,12 +119,7 @@ def show(
     shapes = list(checked.values())
     n = len(shapes[0])
     keyframes = check_indices([0, n - 1] if keyframe_indices is None else keyframe_indices, n, "keyframe_indices")
-    stamps = np.arange(n, dtype=np.float64) if times is None else np.asarray(to_numpy(times), dtype=np.float64)  # type: ignore[arg-type]
-    if stamps.shape != (n,) or not np.isfinite(stamps).all() or (np.diff(stamps) <= 0).any():
-        raise ValueError(
-            f"times must be {n} finite numbers, one a frame, each larger than the one before; got "
-            f"{np.array2string(stamps, threshold=8)} of shape {stamps.shape}."
-        )
+    stamps = check_times(times, n, of="frame").numpy()
     if cyclic and n > 1 and not all(np.array_equal(frames[0], frames[-1]) for frames in shapes):
         stamps = np.append(stamps, stamps[-1] + (stamps[-1] - stamps[0]) / (n - 1))  # when the first comes again
     data = {"n_frames": n, "times": stamps.tolist(), "has_times": times is not None, "fps": float(fps)}
