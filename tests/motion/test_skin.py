@@ -13,7 +13,7 @@ import torch_modal as tm
 from torch_modal.data.samples import load_sample
 from torch_modal.errors import MeshWarning
 from torch_modal.geometry.rotations import exp, log
-from torch_modal.motion.skin import _between, _convex, _Decomposition
+from torch_modal.motion.skin import _convex_weights, _Decomposition, _halfway_errors
 
 X, FACES = triangles_of_tube()
 BENT = torch.tensor(np.stack([bend(X, turn) for turn in np.linspace(0.01, 0.9, 7)]))
@@ -57,7 +57,7 @@ def test_shapes_are_those_of_the_definition(generator: torch.Generator) -> None:
         expected += skin.weights[:, j, None] * (skin.rest @ turn.mT + shift[:, None])
     torch.testing.assert_close(skin.shapes(), expected)
     diagonal = float((frames[0].amax(0) - frames[0].amin(0)).norm())
-    off = torch.cat([expected - frames, _between(skin, frames)]).square().sum(-1).mean().sqrt()
+    off = torch.cat([expected - frames, _halfway_errors(skin, frames)]).square().sum(-1).mean().sqrt()
     assert skin.error == pytest.approx(float(off) / diagonal)
     assert torch.equal(skin.rest, frames[0])
     assert (skin.weights >= 0).all() and ((skin.weights > 0).sum(1) <= 3).all()
@@ -83,7 +83,7 @@ def test_convex_weights_beat_all_on_a_grid(generator: torch.Generator) -> None:
     a = torch.randn(20, 9, 4, generator=generator, dtype=torch.float64)
     x = torch.randn(20, 9, generator=generator, dtype=torch.float64)
     square, product = a.mT @ a, (a.mT @ x[:, :, None])[..., 0]
-    weights, error = _convex(square, product, torch.arange(4).expand(20, 4))
+    weights, error = _convex_weights(square, product, torch.arange(4).expand(20, 4))
     torch.testing.assert_close(weights.sum(1), torch.ones(20, dtype=torch.float64))
     assert (weights >= 0).all()
     off = (torch.einsum("nij,nj->ni", a, weights) - x).square().sum(1)
@@ -109,8 +109,8 @@ def test_ties_leave_a_rigid_motion_as_it_is(generator: torch.Generator) -> None:
     turns[0] = torch.eye(3)
     fit = _Decomposition(BENT[0] @ turns.mT, 1)
     weights = torch.ones(len(X), 1, dtype=torch.float64)
-    free = fit._moved(fit.still, weights)
-    tied = fit._moved(free, weights, torch.tensor([1e6], dtype=torch.float64))
+    free = fit._fit_bones(fit.still, weights)
+    tied = fit._fit_bones(free, weights, torch.tensor([1e6], dtype=torch.float64))
     torch.testing.assert_close(
         tied, free, atol=0.01, rtol=0
     )  # the turns of the vertices have a small part of the identity
@@ -122,22 +122,22 @@ def test_bones_that_move_as_one_are_merged(generator: torch.Generator) -> None:
     fit = _Decomposition(frames, 4)
     bones = tm.bake(frames, FACES, 2).transforms[:, [0, 1, 0], :3]
     weights = torch.stack([0.5 * second, 1 - second, 0.5 * second], 1)
-    found, left, ties = fit._merged(weights, bones, torch.arange(3.0))
+    found, left, ties = fit._merge_bones(weights, bones, torch.arange(3.0))
     assert found.shape == (len(X), 2) and left.shape[1] == len(ties) == 2
     torch.testing.assert_close(found.sum(1), torch.ones_like(second))
 
 
-def test_half_way_between_frames_by_hand() -> None:
+def test_errors_half_way_between_frames_by_hand() -> None:
     """One bone: the body turns by 80 degrees and moves; then the bone alone has a wrong place in the last frame."""
     turns = exp(torch.tensor([[0.0, 0, 0], [0, 1.4, 0], [0, 2.8, 0]], dtype=torch.float64))
     frames = BENT[0] @ turns.mT + torch.tensor([[[0.0, 0, 0]], [[5, 0, 0]], [[5, 5, 0]]])
     maps = torch.eye(4, dtype=torch.float64).repeat(3, 1, 1, 1)
     maps[:, 0, :3, :3], maps[1:, 0, 0, 3], maps[2, 0, 1, 3] = turns, 5, 5
     skin = tm.Skin(BENT[0], torch.ones(len(X), 1, dtype=torch.float64), maps, 0.0)
-    assert _between(skin, frames).abs().max() < 1e-9
+    assert _halfway_errors(skin, frames).abs().max() < 1e-9
     wrong = skin.transforms.clone()
     wrong[2, 0, 2, 3] += 0.5
-    off = _between(replace(skin, transforms=wrong), frames).norm(dim=-1)
+    off = _halfway_errors(replace(skin, transforms=wrong), frames).norm(dim=-1)
     torch.testing.assert_close(off, torch.tensor([[0.0], [0.25]], dtype=torch.float64).expand_as(off))
 
 
@@ -145,7 +145,7 @@ def test_weights_are_the_best_of_all_pairs(generator: torch.Generator) -> None:
     frames, _, _ = arm(generator)
     fit = _Decomposition(frames, 1)
     bones = tm.bake(frames, FACES, 3).transforms[:, :, :3]
-    weights, error = fit._weights(bones, 1)
+    weights, error = fit._fit_weights(bones, 1)
     off = (torch.einsum("tjab,vb->tjva", bones, fit.rest) - frames[:, None]).square().sum(-1).mean(0)
     torch.testing.assert_close(error, off.min(0).values, atol=1e-9, rtol=1e-6)
     assert torch.equal(weights.argmax(1), off.argmin(0))
@@ -207,7 +207,7 @@ def test_open_and_ugly_meshes_in_millimetres() -> None:
         ({"frames": BENT[0]}, r"frames must have shape \(N, V, 3\)"),
         ({"frames": 0 * BENT}, "frame 0, the rest shape, is a single point"),
         ({"faces": [[0, 1, 98]]}, "faces must index the 98 vertices"),
-        ({"bones": 99}, "bones must be a whole number from 1 to that of the vertices, 98; got 99"),
+        ({"bones": 99}, "bones must be a whole number from 1 to the number of vertices, 98; got 99"),
         ({"bones": 0}, "bones must be"),
         ({"bones": 2.5}, "bones must be"),
         ({"influences": 5}, "influences must be 1, 2, 3 or 4"),

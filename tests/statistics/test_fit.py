@@ -14,7 +14,7 @@ from torch_modal.geometry.rigid import best_fit
 from torch_modal.geometry.rotations import exp
 from torch_modal.statistics.fit import fit, pull
 from torch_modal.statistics.local_weights import LocalWeights, Observations
-from torch_modal.statistics.variation import MOST_BELOW_ZERO, LocalMixtures, Patches, Variation, bounded
+from torch_modal.statistics.variation import MOST_BELOW_ZERO, LocalMixtures, Patches, Variation, bound_weights
 
 DOUBLE = torch.float64
 
@@ -111,7 +111,7 @@ def test_gradients_are_those_of_weights_and_pose(
     def assembled(points: Tensor) -> Tensor:
         to = Observations(points[seen], picked[seen], weights[seen])
         given = LocalWeights(variation, to, about, noise)
-        x = given.shape(given.solved(False)[0])
+        x = given.shape(given.solve(False)[0])
         return (to.pose(x).apply(x) * taken).sum()
 
     ends = [assembled(points + s * 1e-5 * move) for s in (1, -1)]
@@ -158,9 +158,9 @@ def test_a_weight_of_two_counts_as_two_points(space: tm.ShapeSpace, bars: Shapes
     weights, about = torch.ones(10, dtype=DOUBLE), torch.full((3,), 1 / 3, dtype=DOUBLE)
     weights[4] = 2
     twice = torch.cat([torch.arange(10), torch.tensor([4])])
-    one = LocalWeights(variation, Observations(points, picked, weights), about).solved(False)[0]
+    one = LocalWeights(variation, Observations(points, picked, weights), about).solve(False)[0]
     doubled = Observations(points[twice], picked[twice], torch.ones(11, dtype=DOUBLE))
-    torch.testing.assert_close(one, LocalWeights(variation, doubled, about).solved(False)[0], rtol=0, atol=1e-6)
+    torch.testing.assert_close(one, LocalWeights(variation, doubled, about).solve(False)[0], rtol=0, atol=1e-6)
 
 
 def test_points_of_little_weight_are_not_taken_for_outliers(space: tm.ShapeSpace, bars: Shapes) -> None:
@@ -251,7 +251,7 @@ def test_pulls_are_the_derivatives_of_their_energy(generator: torch.Generator) -
 
 def test_weights_far_below_zero_come_nearer_to_even_ones() -> None:
     weights = torch.tensor([[5.0, 1.5, 0.2], [-3.0, -0.5, 0.3], [-1.0, 0.0, 0.5]], dtype=DOUBLE)
-    found = bounded(weights)
+    found = bound_weights(weights)
     torch.testing.assert_close(found.sum(0), torch.ones(3, dtype=DOUBLE))
     assert float(found[:, 0].clamp_max(0).sum()) >= -MOST_BELOW_ZERO
     torch.testing.assert_close(found[:, 1:], weights[:, 1:])  # within the bound

@@ -134,7 +134,7 @@ class Selection:
         period = len(self.frames)
         duration = self.times[-1] - self.times[0]
         key_times = torch.stack([self.times[key % period] + duration * (key // period) for key in around])
-        decoder = self._decoder.through(self.frames[[key % period for key in around]], key_times)
+        decoder = self._decoder.with_keyframes(self.frames[[key % period for key in around]], key_times)
         found = fit(decoder, self.frames[samples], self.times[samples])
         return dict(zip(samples.tolist(), found.errors.tolist(), strict=True))
 

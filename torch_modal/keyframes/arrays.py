@@ -19,16 +19,16 @@ def as_positions(keyframes: Any) -> Tensor:
     if isinstance(keyframes, (list, tuple)):
         if not keyframes:
             raise MeshError("keyframes is empty; it needs the shape (K, V, 3)")
-        parts = [_as_tensor("keyframes", part) for part in keyframes]
-        for i, part in enumerate(parts):
+        shapes = [_as_tensor("keyframes", shape) for shape in keyframes]
+        for i, shape in enumerate(shapes):
             for what, mine, its in (
-                ("shape", tuple(parts[0].shape), tuple(part.shape)),
-                ("dtype", parts[0].dtype, part.dtype),
-                ("device", parts[0].device, part.device),
+                ("shape", tuple(shapes[0].shape), tuple(shape.shape)),
+                ("dtype", shapes[0].dtype, shape.dtype),
+                ("device", shapes[0].device, shape.device),
             ):
                 if mine != its:
                     raise MeshError(f"key-frame {i} has {what} {its}, key-frame 0 has {mine}; they must be equal")
-        positions = torch.stack(parts)
+        positions = torch.stack(shapes)
     else:
         positions = _as_tensor("keyframes", keyframes)
     if positions.dtype not in (torch.float32, torch.float64):
@@ -188,5 +188,5 @@ def require_units(name: str, points: Tensor, of: str, known: Tensor, unit: float
     if not min(others) / UNITS <= extent <= max(others) * UNITS:
         raise ValueError(
             f"{name} extend over {extent:.3g} around their middle, {of} over {min(others):.3g} to {max(others):.3g}: "
-            "they are in other units; scale them to those of the key-frames"
+            "they are in other units; scale them to the units of the key-frames"
         )

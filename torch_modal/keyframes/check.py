@@ -69,10 +69,10 @@ def check_keyframes(keyframes: Any, faces: Any, *, min_keyframes: int = 1, warn:
 def checked_surface(
     keyframes: Any, faces: Any, min_keyframes: int = 1, flaws: list[str] | None = None
 ) -> tuple[torch.Tensor, Connectivity]:
-    """`check_keyframes` with the connectivity in the place of the faces; flaws, where a list is given, go there."""
+    """`check_keyframes` that returns the connectivity instead of the faces, and appends flaws to a list, if given."""
     positions, shapes, indices = checked_arrays(keyframes, faces, min_keyframes)
     notes: list[str] = [] if flaws is None else flaws
-    mesh, orientable = _repaired(indices, shapes.shape[1], notes.append)
+    mesh, orientable = _repair(indices, shapes.shape[1], notes.append)
     scaled = _check_sizes(shapes, mesh, positions.dtype, notes.append)
     if orientable and not (mesh.counts % 2).any():
         _refuse_mirrored(scaled, mesh.faces)
@@ -129,7 +129,7 @@ def checked_arrays(keyframes: Any, faces: Any, min_keyframes: int = 1) -> tuple[
     return positions, shapes, indices
 
 
-def _repaired(faces: IntArray, n_vertices: int, note: Callable[[str], None]) -> tuple[Connectivity, bool]:
+def _repair(faces: IntArray, n_vertices: int, note: Callable[[str], None]) -> tuple[Connectivity, bool]:
     """Drop degenerate and repeated faces, orient the others; return the mesh and its orientability."""
     kept = np.arange(len(faces))
     for flaw, what in (
@@ -212,7 +212,7 @@ def _refuse_mirrored(scaled: FloatArray, faces: IntArray) -> None:
         if len(turned):
             few, many = sorted((positive, int(turned[volumes[turned].argmin()])))
             raise MeshError(
-                f"key-frame {many} is mirrored: its faces wind the other way round than those of key-frame "
+                f"key-frame {many} is mirrored: its faces wind the other way round than in key-frame "
                 f"{few}, seen from outside, and no motion without passing through itself leads from one to the "
                 "other; mirror it back (negate one coordinate)"
             )

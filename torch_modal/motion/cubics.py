@@ -1,7 +1,7 @@
 r"""Cubic splines in time through key-frames, relative to the straight steps between them.
 
-Of any quantity that steps by ``d`` from one key-frame to the next, in the time ``h``, the cubic with the velocities
-``m_0`` and ``m_1`` at both is
+A quantity steps by ``d`` from one key-frame to the next in the time ``h``. Its cubic with the velocities ``m_0`` and
+``m_1`` at both is
 
 .. math::
     q(u) = q_0 + u\, d + u (1 - u) \bigl((1 - u)\, e_0 - u\, e_1\bigr), \qquad e_i = h\, m_i - d,
@@ -25,10 +25,10 @@ LIMIT = 2.75
 Part = TypeVar("Part")
 
 Squared = Callable[[Tensor], Tensor]
-"""The squared size of a quantity, which broadcasts against it."""
+"""Squared size of a quantity, which broadcasts against it."""
 
 Scheme = Callable[[Tensor, Tensor, bool, Squared], Tensor]
-"""A path scheme: the velocities at all key-frames, from the mean velocities between them.
+"""A path scheme: velocities at all key-frames, from the mean velocities between them.
 
 Arguments: mean velocities, *shape* ``(N, ...)``; the durations, *shape* ``(N,)``; True for a cycle; the squared size of
 a quantity, whose components are in a dimension that this function knows. Result: *shape* ``(N + 1, ...)``.
@@ -49,7 +49,7 @@ class Cubics(NamedTuple):
 def cubics(
     steps: Tensor, durations: Tensor, cyclic: bool, squared: Squared = torch.square, scheme: Scheme | None = None
 ) -> Cubics:
-    """The cubics of given steps and durations, by :func:`limited_spline` unless there is another scheme.
+    """Cubics of given steps and durations, by :func:`limited_spline` unless there is another scheme.
 
     *Shape:* ``(N, ...), (N,)``. A cycle's last step leads back to its first key-frame.
     """
@@ -83,27 +83,27 @@ def limited_spline(speeds: Tensor, durations: Tensor, cyclic: bool, squared: Squ
         matrix[0, :2], matrix[-1, -2:] = torch.tensor([[2.0, 1], [1, 2]]).to(h)
         right[0, 0] = right[-1, -1] = 3
     velocities = torch.tensordot(torch.linalg.solve(matrix, right).to(speeds), speeds, 1)
-    slow, fast, found = squared(speeds[before]), squared(speeds[inner]), squared(velocities[inner])
+    slow, fast, length = squared(speeds[before]), squared(speeds[inner]), squared(velocities[inner])
     both = slow + fast
     most = LIMIT**2 * slow * fast / torch.where(both > 0, both, 1)
     # Up to the limit nothing changes; beyond it, velocities fall so that no corner is left, there or at rest.
-    cut = most < found
-    part = torch.where(cut, most, 1) / torch.where(cut, found, 1)
-    found = velocities[inner] * (part * (2 - part))
+    cut = most < length
+    ratio = torch.where(cut, most, 1) / torch.where(cut, length, 1)
+    limited = velocities[inner] * (ratio * (2 - ratio))
     if cyclic:
-        return torch.cat([found, found[:1]])
-    return torch.cat([1.5 * speeds[:1] - 0.5 * found[:1], found, 1.5 * speeds[-1:] - 0.5 * found[-1:]])
+        return torch.cat([limited, limited[:1]])
+    return torch.cat([1.5 * speeds[:1] - 0.5 * limited[:1], limited, 1.5 * speeds[-1:] - 0.5 * limited[-1:]])
 
 
 def offset(first: Tensor, last: Tensor, u: Tensor) -> Tensor:
-    """The difference between a cubic and the straight step at ``u``, which broadcasts against the others."""
+    """Difference between a cubic and the straight step at ``u``, which broadcasts against the others."""
     return u * (1 - u) * ((1 - u) * first - u * last)
 
 
-def by_interval(
+def evaluate_by_interval(
     segment: Tensor, n: int, shapes: Callable[[int, Tensor | slice], Part], everywhere: bool = False
 ) -> tuple[list[Part], Tensor]:
-    """Shapes whose intervals are computed one after the other, and where each stands among those of all intervals.
+    """Evaluate shapes interval by interval; also the place of each shape in the concatenated results.
 
     Args:
         segment: The interval of each shape. *Shape:* ``(B,)``.
@@ -117,4 +117,4 @@ def by_interval(
         order = place * size + torch.arange(size, device=segment.device)
         return [shapes(i, slice(None)) for i in intervals], order
     rows = [torch.nonzero(segment == i).flatten() for i in intervals]
-    return [shapes(i, own) for i, own in zip(intervals, rows, strict=True)], torch.argsort(torch.cat(rows))
+    return [shapes(*each) for each in zip(intervals, rows, strict=True)], torch.argsort(torch.cat(rows))

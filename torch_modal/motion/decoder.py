@@ -20,7 +20,7 @@ from torch_modal.geometry.rotations import exp
 from torch_modal.geometry.triangle_frames import Frames, bend, frames, sides
 from torch_modal.keyframes.arrays import check_tensor
 from torch_modal.keyframes.check import checked_arrays
-from torch_modal.motion.cubics import by_interval
+from torch_modal.motion.cubics import evaluate_by_interval
 from torch_modal.motion.spline import Knots, Spline
 from torch_modal.times import check_times, locate_times
 
@@ -31,7 +31,7 @@ LEAST = 1e-4
 """A triangle with less than this part of the mean side has no turn or strain of its own."""
 
 MOST = 30.0
-"""A triangle turns and strains by at most this many times the mode's mean over the area: more is that of a sliver."""
+"""A triangle turns and strains by at most this many times the mode's mean over the area; only slivers do more."""
 
 CHUNK = 40_000
 """Vertices of all shapes that are decoded at a time: more would not fit into caches."""
@@ -84,9 +84,9 @@ class ModalDecoder(nn.Module):
         self._build()
         modes = modes.detach().double().cpu()
         displaced = scaled(modes, self.size)
-        #: What an amplitude of 1 does to each triangle. *Shape:* ``(k, 6, F)``.
+        #: Turn and strain of each triangle by an amplitude of 1. *Shape:* ``(k, 6, F)``.
         self.register_buffer("columns", bending_columns(self.reference, self.faces, displaced))
-        #: What it does to the centres of loose pieces, if there are several. *Shape:* ``(k, 3V)``, or none.
+        #: Displacement of the centres of loose pieces by it, if there are several. *Shape:* ``(k, 3V)``, or none.
         several = int(self._mesh.vertex_pieces.max()) > 0
         centres = self.spline.poisson.centres(displaced) * self.spline.alignment.scale
         self.register_buffer("moves", centres.flatten(1)[:, : centres[0].numel() if several else 0].contiguous())
@@ -111,8 +111,8 @@ class ModalDecoder(nn.Module):
         return moved
 
     @lasting
-    def through(self, keyframes: Tensor, times: Tensor) -> "ModalDecoder":
-        """Decoder with these modes beside a path through other key-frames, of the same connectivity."""
+    def with_keyframes(self, keyframes: Tensor, times: Tensor) -> "ModalDecoder":
+        """Decoder with these modes along a path through other key-frames of the same connectivity."""
         other = ModalDecoder.__new__(ModalDecoder)
         nn.Module.__init__(other)
         other._mesh = self._mesh
@@ -133,14 +133,14 @@ class ModalDecoder(nn.Module):
     def forward(
         self, amplitudes: Tensor, t: Tensor | float, motions: Tensor | None = None, keyframes: Tensor | None = None
     ) -> Tensor:
-        """The shapes of amplitudes at times.
+        """Shapes of amplitudes at times.
 
         Args:
             amplitudes: *Shape:* ``(..., k)``.
-            t: Times within those of the key-frames; if cyclic, any. *Shape:* broadcasts against ``(...)``.
+            t: Times from the first to the last key-frame; if cyclic, any. *Shape:* broadcasts against ``(...)``.
             motions: A turn, axis times angle about the shape's centre, and a move in units of the diagonal, after all
                 else. Default: none. *Shape:* ``(..., 6)``.
-            keyframes: Others in the place of those that the decoder was made with, near them. *Shape:* ``(K, V, 3)``.
+            keyframes: Key-frames instead of the decoder's own, near them. *Shape:* ``(K, V, 3)``.
 
         Returns:
             *Shape:* ``(..., V, 3)``.
@@ -164,12 +164,12 @@ class ModalDecoder(nn.Module):
             trajectory = self.spline.trajectory(knots, i)
             if isinstance(rows, slice):
                 return self._shapes(knots, i, trajectory, a, u)
-            return torch.cat([self._shapes(knots, i, trajectory, a[own], u[own]) for own in rows.split(size)])
+            return torch.cat([self._shapes(knots, i, trajectory, a[chunk], u[chunk]) for chunk in rows.split(size)])
 
-        parts, order = by_interval(segment, len(self.times) - 1, shapes, traced(segment))
+        parts, order = evaluate_by_interval(segment, len(self.times) - 1, shapes, traced(segment))
         x = torch.cat(parts)[order]
         if motions is not None:
-            x = moved(x, motions.expand(*lead, 6).reshape(-1, 6), self.size)
+            x = apply_motions(x, motions.expand(*lead, 6).reshape(-1, 6), self.size)
         return x.reshape(*lead, *x.shape[1:])
 
     def _shapes(self, knots: Knots, i: int, trajectory: Trajectory, a: Tensor, u: Tensor) -> Tensor:
@@ -195,22 +195,22 @@ def scaled(modes: Tensor, size: Tensor | float) -> Tensor:
 
 def bending_columns(reference: Tensor, faces: Tensor, displaced: Tensor) -> Tensor:
     """Turns and strains of the triangles by displacements. *Shape:* ``(V, 3), (F, 3), (k, V, 3) -> (k, 6, F)``."""
-    own = frames(sides(reference.T[:, None].contiguous(), faces))
-    turn, strain = bend(sides(displaced.movedim(-1, 0).contiguous(), faces), own)
-    return _bounded(torch.cat([own.coordinates(turn), strain]), own)
+    rest = frames(sides(reference.T[:, None].contiguous(), faces))
+    turn, strain = bend(sides(displaced.movedim(-1, 0).contiguous(), faces), rest)
+    return _limit_slivers(torch.cat([rest.coordinates(turn), strain]), rest)
 
 
-def _bounded(columns: Tensor, own: Frames) -> Tensor:
-    """Turns and strains; less where they are those of slivers, none without a size. *Shape:* ``(6, k, F)``."""
-    areas = own.doubled_areas
-    columns = torch.where(areas / own.size > LEAST * own.size.mean(), columns, 0)
-    squared = columns.square().sum(0) + columns[4].square()  # the entry beside the diagonal counts twice
+def _limit_slivers(columns: Tensor, rest: Frames) -> Tensor:
+    """Bound turns and strains of slivers; zero them for triangles without a size. *Shape:* ``(6, k, F)``."""
+    areas = rest.doubled_areas
+    columns = torch.where(areas / rest.size > LEAST * rest.size.mean(), columns, 0)
+    squared = columns.square().sum(0) + columns[4].square()  # the off-diagonal entry counts twice
     limit = MOST * ((areas * squared).sum(1, keepdim=True) / areas.sum()).sqrt()
     bound = (limit / squared.sqrt().clamp_min(torch.finfo(squared.dtype).tiny)).clamp_max(1)
     return (bound * columns).movedim(0, 1).contiguous()
 
 
-def moved(x: Tensor, motions: Tensor, size: Tensor) -> Tensor:
-    """Shapes turned about their centres, and moved. *Shape:* ``(B, V, 3), (B, 6) -> (B, V, 3)``."""
+def apply_motions(x: Tensor, motions: Tensor, size: Tensor) -> Tensor:
+    """Turn shapes about their centres, and move them. *Shape:* ``(B, V, 3), (B, 6) -> (B, V, 3)``."""
     centre = x.mean(1, keepdim=True)
     return (x - centre) @ exp(motions[:, :3]).mT + centre + size * motions[:, None, 3:]

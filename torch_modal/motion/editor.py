@@ -36,7 +36,7 @@ class PathEditor:
         self._made: list[tuple[Tensor, tuple[Tensor, Tensor]] | None] = [None] * (len(path.times) - 1)
 
     def replace(self, i: int, shape: Tensor) -> None:
-        """Put another shape in the place of a key-frame.
+        """Replace a key-frame by another shape.
 
         Args:
             i: Number of the key-frame.
@@ -48,7 +48,7 @@ class PathEditor:
         """
         if not -len(self.keyframes) <= i < len(self.keyframes):
             raise IndexError(f"there are {len(self.keyframes)} key-frames; got the number {i}")
-        self.keyframes[i] = self._checked(shape)
+        self.keyframes[i] = self._check_shape(shape)
 
     @lasting
     def insert(self, t: float, shape: Tensor | None = None) -> int:
@@ -62,11 +62,12 @@ class PathEditor:
             Number of the new key-frame.
 
         Raises:
-            ValueError: The time is outside, or that of a key-frame; the shape does not fit. Nothing is changed then.
+            ValueError: The time is outside, or equal to the time of a key-frame; the shape does not fit. Nothing is
+                changed then.
         """
         if shape is None:
             shape = lasting(self.path)(self.keyframes, t)
-        shape = self._checked(shape)
+        shape = self._check_shape(shape)
         path = self.path.insert(t)
         i = int((path.times[:-1] == self.path.times).cumprod(0).sum())  # up to there, all times are as before
         self.keyframes = torch.cat([self.keyframes[:i], shape[None], self.keyframes[i:]])
@@ -75,39 +76,39 @@ class PathEditor:
         return i
 
     def times(self) -> Tensor:
-        """When the shapes are. *Shape:* ``(T,)``, float64."""
+        """Times of the shapes. *Shape:* ``(T,)``, float64."""
         times = self.path.times
         inner = fill_times(times, [self.steps] * len(self._made))
         return inner if self.path.cyclic else torch.cat([inner, times[-1:]])
 
     def shapes(self) -> Tensor:
-        """All shapes; intervals that no change has touched are those of the last time. *Shape:* ``(T, V, 3)``."""
-        at, found = self.times(), []
-        for i, (made, needed) in enumerate(zip(self._made, self._needed(), strict=True)):
+        """All shapes; intervals that no change has touched are not computed again. *Shape:* ``(T, V, 3)``."""
+        at, intervals = self.times(), []
+        for i, (made, needed) in enumerate(zip(self._made, self._dependencies(), strict=True)):
             same = made is not None and torch.equal(made[1][0], needed[0])
             if made is None or not same or not bool(((made[1][1] - needed[1]).abs() <= SLIGHT).all()):
-                own = at[i * self.steps : (i + 1) * self.steps]
-                made = lasting(self.path)(self.keyframes, own), needed
+                times = at[i * self.steps : (i + 1) * self.steps]
+                made = lasting(self.path)(self.keyframes, times), needed
                 self._made[i] = made
-            found.append(made[0])
-        return torch.cat(found if self.path.cyclic else [*found, self.keyframes[-1:]])
+            intervals.append(made[0])
+        return torch.cat(intervals if self.path.cyclic else [*intervals, self.keyframes[-1:]])
 
     @lasting
-    def _needed(self) -> list[tuple[Tensor, Tensor]]:
+    def _dependencies(self) -> list[tuple[Tensor, Tensor]]:
         """Key-frames and velocities that each interval follows from, in visible units. *Shape:* ``(2, V, 3), (n,)``."""
         path, closed = self.path, torch.cat([self.keyframes, self.keyframes[:1]])
         ends = [closed[i : i + 2] for i in range(len(self._made))]
         if not path.smooth:
-            return [(own, own.new_zeros(0)) for own in ends]
+            return [(pair, pair.new_zeros(0)) for pair in ends]
         size = (self.keyframes.amax(1) - self.keyframes.amin(1)).norm(dim=-1).amax()
         velocities = []
         for knots in path.knots(self.keyframes[None].to(path.dtype)) or []:
             unit = torch.ones(6, 1, 1).to(knots.shapes)
-            unit[3:] /= knots.shapes.abs().amax()  # of turns 1, of sizes those of the shapes
+            unit[3:] /= knots.shapes.abs().amax()  # turns as they are, sizes relative to the shapes
             for triangles, turns, moves in zip(knots.triangles[1:], knots.turns[1:], knots.moves[1:], strict=True):
-                velocities += [part.flatten(1) for part in (unit * triangles, turns, moves / size)]
+                velocities += [velocity.flatten(1) for velocity in (unit * triangles, turns, moves / size)]
         return list(zip(ends, torch.cat(velocities, 1), strict=True))
 
-    def _checked(self, shape: Tensor) -> Tensor:
+    def _check_shape(self, shape: Tensor) -> Tensor:
         check_tensor("shape", shape, *self.keyframes.shape[1:], finite=True)
         return shape.to(self.keyframes)

@@ -26,7 +26,7 @@ from torch_modal.keyframes.check import checked_surface
 from torch_modal.layers.base import Bases, BasisBuffers, PreciseModule, basis_buffers
 from torch_modal.layers.blend import Blend
 from torch_modal.layers.in_between import InBetween
-from torch_modal.motion.cubics import Scheme, by_interval
+from torch_modal.motion.cubics import Scheme, evaluate_by_interval
 from torch_modal.motion.spline import Explanation, Knots, Spline
 from torch_modal.times import check_times, locate_times, wrap_times
 
@@ -44,7 +44,7 @@ class Path(PreciseModule):
     (:mod:`torch_modal.motion.spline`): nothing is minimised, and no modes are needed, unless there are contacts or
     terms beyond Eq. 5. Velocities are continuous at the key-frames, which are reproduced exactly. They are limited to
     three times the slower one of both sides, triangle by triangle, so that what stops does stop. The ends have no
-    acceleration. Between two key-frames alone the shapes are those of :class:`torch_modal.InBetween`.
+    acceleration. Two key-frames alone give the shapes of :class:`torch_modal.InBetween`.
 
     Args:
         bases: The key-frames, *shape* ``(K, V, 3)``, or, where modes are needed or wanted, the basis of each
@@ -56,13 +56,13 @@ class Path(PreciseModule):
         smooth: False treats each pair of key-frames alone. A function is another path scheme:
             :data:`torch_modal.motion.cubics.Scheme` (docs/extending.md).
         preset: As for :class:`torch_modal.InBetween`; not ``"paper"``, which knows the middle of a pair only.
-        objective: What is minimised, in the place of the preset's. With further terms, the shapes on the spline are
-            minimised with these, each compared with itself.
-        solver: How it is solved, in the place of the preset's.
-        contact: True to keep parts from passing through each other, in the place of what the objective says
+        objective: What is minimised, instead of the preset's objective. With further terms, the shapes on the spline
+            are minimised with these, each compared with itself.
+        solver: How it is solved, instead of the preset's solver.
+        contact: True to keep parts from passing through each other, instead of what the objective says
             (docs/contact.md; extra ``contact``). Shapes are searched at 31 times between any two key-frames, and
-            pushed apart by one displacement that is smooth in time. It is a constant of the graph: gradients are those
-            of the shapes without contact, and not exact where something touches. Those of ``InBetween`` are.
+            pushed apart by one displacement that is smooth in time. It is a constant of the graph: gradients are of
+            the shapes without contact, and not exact where something touches. Gradients of ``InBetween`` are exact.
 
     Raises:
         ValueError: An argument is not usable.
@@ -88,20 +88,20 @@ class Path(PreciseModule):
         contact: bool | None = None,
     ) -> None:
         super().__init__()
-        own = basis_buffers(bases)
-        n = len(own)
+        buffers = basis_buffers(bases)
+        n = len(buffers)
         if n < 2:
             raise ValueError(f"a path needs two key-frames or more, got {n}")
         objective, self.solver = settings(preset, objective, solver, contact)
         if objective.space == "paired":
             raise ValueError("the paired space (Eq. 4) knows the middle of a pair only; a path needs space='joint'")
-        #: True where shapes are pushed apart. No layer does that: what it did at each time alone would jump.
+        #: True where shapes are pushed apart: per interval, not per time as in a layer, to stay continuous.
         self.contact = objective.contact
         if self.contact:
             require_contact()
         self.objective = replace(objective, contact=False) if self.contact else objective
-        self.register_buffer("times", check_times(times, n, cyclic).to(own[0].reference.device))
-        self.bases = nn.ModuleList(own)
+        self.register_buffer("times", check_times(times, n, cyclic).to(buffers[0].reference.device))
+        self.bases = nn.ModuleList(buffers)
         #: Number of key-frames, K.
         self.n_keyframes = n
         #: The key-frames of each interval.
@@ -110,13 +110,13 @@ class Path(PreciseModule):
         self.cyclic, self.smooth = cyclic, bool(smooth) and (n > 2 or cyclic)
         #: The path scheme; None for the default.
         self.scheme = smooth if callable(smooth) else None
-        given: dict[str, Any] = {"objective": self.objective, "solver": self.solver}
-        #: In-betweens of each interval; of a smooth path none, or, with contact or further terms, those of all bases.
+        options: dict[str, Any] = {"objective": self.objective, "solver": self.solver}
+        #: In-betweens of each interval; a smooth path has none, or, with contact or further terms, one of all bases.
         self.layers: Any = nn.ModuleList()
         if not self.smooth:
-            self.layers.extend(InBetween([own[i], own[j]], self.faces, **given) for i, j in self.pairs)
+            self.layers.extend(InBetween([buffers[i], buffers[j]], self.faces, **options) for i, j in self.pairs)
         elif self.objective.terms or self.contact:
-            self.layers.append(Blend(own, self.faces, **given))
+            self.layers.append(Blend(buffers, self.faces, **options))
         layer: Any
         for layer in self.layers if self.contact else ():
             layer.separate = False
@@ -133,11 +133,12 @@ class Path(PreciseModule):
         connectivity = checked_surface(list(references), self.faces)[1]
         self.faces = torch.tensor(connectivity.faces)
         backend, alone = choose(self.solver.backend), self.contact or self.objective.terms
-        found = [(slice(None), connectivity)] if alone else bodies(references.numpy(), connectivity)
+        pieces = [(slice(None), connectivity)] if alone else bodies(references.numpy(), connectivity)
         #: Vertices of each body, and its spline.
-        self.vertices, self.splines, self.distortions = [own for own, _ in found], nn.ModuleList(), nn.ModuleList()
-        for own, mesh in found:
-            self.splines.append(Spline(mesh, references[:, own], self.times.cpu(), self.scheme, backend).to(like))
+        self.vertices = [vertices for vertices, _ in pieces]
+        self.splines, self.distortions = nn.ModuleList(), nn.ModuleList()
+        for vertices, mesh in pieces:
+            self.splines.append(Spline(mesh, references[:, vertices], self.times.cpu(), self.scheme, backend).to(like))
             self.distortions.append(backend.distortion(Mesh(mesh), None).to(like))
         self.register_buffer("built_from", self._marks(), persistent=False)
 
@@ -157,7 +158,7 @@ class Path(PreciseModule):
             A path of one more key-frame.
 
         Raises:
-            ValueError: The time is outside, not finite, or that of a key-frame.
+            ValueError: The time is outside, not finite, or equal to the time of a key-frame.
         """
         at = self.times.new_tensor([t])
         segment, u = locate_times(at, self.times, self.cyclic)
@@ -167,13 +168,13 @@ class Path(PreciseModule):
         scale = torch.maximum(self.times.abs().amax(), self.times.new_tensor(abs(t)))
         if bool(((self.times - at).abs() <= SAME_TIME * scale).any()):
             raise ValueError(f"there is a key-frame at {t:g} already; replace it in the keyframes that are passed")
-        i, own = int(segment[0]), [BasisBuffers(basis.reference, basis.modes) for basis in self.bases]
-        nearest = own[self.pairs[i][int(u[0] > 0.5)]]
-        passed = self(torch.stack([basis.reference for basis in own]).to(self.dtype), t)
-        own.insert(i + 1, BasisBuffers(passed, nearest.modes))
+        i, buffers = int(segment[0]), [BasisBuffers(basis.reference, basis.modes) for basis in self.bases]
+        nearest = buffers[self.pairs[i][int(u[0] > 0.5)]]
+        passed = self(torch.stack([basis.reference for basis in buffers]).to(self.dtype), t)
+        buffers.insert(i + 1, BasisBuffers(passed, nearest.modes))
         times = torch.cat([self.times[: i + 1], at, self.times[i + 1 :]])
-        given: dict[str, Any] = {"objective": self.objective, "solver": self.solver, "contact": self.contact}
-        other = Path(own, self.faces, times, self.cyclic, self.scheme or self.smooth, **given)
+        options: dict[str, Any] = {"objective": self.objective, "solver": self.solver, "contact": self.contact}
+        other = Path(buffers, self.faces, times, self.cyclic, self.scheme or self.smooth, **options)
         return other.to(self.bases[0].reference)
 
     @untraced
@@ -185,25 +186,25 @@ class Path(PreciseModule):
             t: Times, broadcast against the leading dimensions of the key-frames. *Shape:* ``(...)``, or a number.
 
         Returns:
-            The key-frames exactly at theirs. *Shape:* ``(..., V, 3)``.
+            The key-frames exactly at their times. *Shape:* ``(..., V, 3)``.
 
         Raises:
             ValueError: Shapes that do not fit, or a time before the first or after the last key-frame.
             ConvergenceError: As for :class:`torch_modal.InBetween`.
         """
-        found = self.solve(keyframes, t)
-        report(found.solution, self.solver)
-        return found.shapes
+        result = self.solve(keyframes, t)
+        report(result.solution, self.solver)
+        return result.shapes
 
     @untraced
     def solve(self, keyframes: Tensor, t: Tensor | float) -> InBetweenResult:
         """The shapes, and how each minimisation went, without a warning. Arguments as for :meth:`forward`."""
-        flat, which, segment, u, lead = self._located(keyframes, t)
+        flat, which, segment, u, lead = self._flatten(keyframes, t)
         knots = self.knots(flat)
-        parts, order = by_interval(
-            segment, len(self.pairs), lambda i, rows: self.within(knots, flat, i, which[rows], u[rows])
+        parts, order = evaluate_by_interval(
+            segment, len(self.pairs), lambda i, rows: self.evaluate_interval(knots, flat, i, which[rows], u[rows])
         )
-        result = joined(parts, order)
+        result = join_batches(parts, order)
         pairs = torch.tensor(self.pairs, device=segment.device)[segment]
         ends = torch.stack([flat[which, k] for k in pairs.unbind(-1)], 1).to(keyframes.dtype)
         exact = with_exact_keyframes(result.shapes, ends, torch.stack([1 - u, u], -1))
@@ -213,63 +214,67 @@ class Path(PreciseModule):
     @full_precision
     def explain(self, keyframes: Tensor, t: Tensor | float) -> Explanation:
         """Causes of sudden changes in the motion, at given times. Arguments as for :meth:`forward`."""
-        flat, which, segment, u, lead = self._located(keyframes, t)
+        flat, which, segment, u, lead = self._flatten(keyframes, t)
         splines, n = self.splines, len(self.pairs)
-        knots = [spline.knots(flat[:, :, own]) for spline, own in zip(splines, self.vertices, strict=True)]
+        knots = [spline.knots(flat[:, :, body]) for spline, body in zip(splines, self.vertices, strict=True)]
         limited, turns = zip(*map(Spline.explain, splines, knots), strict=True)
-        part, turn = self.smooth * torch.cat(limited, -1).to(u).mean(-1), torch.stack(turns).amax(0)
-        even = [not self.smooth or any(own.rotations[i].clusters is not None for own in splines) for i in range(n)]
+        share, turn = self.smooth * torch.cat(limited, -1).to(u).mean(-1), torch.stack(turns).amax(0)
+        even = [not self.smooth or any(s.rotations[i].clusters is not None for s in splines) for i in range(n)]
         known, result = knots if self.smooth else None, self.solve(keyframes, t)
-        alone = joined(*by_interval(segment, n, lambda i, rows: self._alone(known, flat, i, which[rows], u[rows])))
+        alone = join_batches(
+            *evaluate_by_interval(segment, n, lambda i, rows: self._spline_shapes(known, flat, i, which[rows], u[rows]))
+        )
         moved = (result.shapes.reshape_as(alone.shapes) - alone.shapes).norm(dim=-1).amax(-1)
-        of_intervals = part[segment, :, which], torch.tensor(even, device=u.device)[segment], turn[segment, :, which]
-        found = (x.reshape(lead + x.shape[1:]) for x in (segment, u, *of_intervals, moved))
-        return Explanation._make([*found, result.solution])
+        of_intervals = share[segment, :, which], torch.tensor(even, device=u.device)[segment], turn[segment, :, which]
+        fields = (x.reshape(lead + x.shape[1:]) for x in (segment, u, *of_intervals, moved))
+        return Explanation._make([*fields, result.solution])
 
     def knots(self, motions: Tensor) -> list[Knots] | None:
         """The knots of each body; None if the path is not smooth. *Shape:* ``(L, K, V, 3)``."""
         parts = zip(self.splines, self.vertices, strict=True)
-        return [spline.knots(motions[:, :, own]) for spline, own in parts] if self.smooth else None
+        return [spline.knots(motions[:, :, vertices]) for spline, vertices in parts] if self.smooth else None
 
     @full_precision
-    def within(
+    def evaluate_interval(
         self, knots: list[Knots] | None, flat: Tensor, i: int, which: Tensor, u: Tensor, n_searched: int = N_SEARCHED
     ) -> InBetweenResult:
         """Shapes of one interval.
 
         Args:
-            knots: Of :meth:`knots`.
+            knots: From :meth:`knots`.
             flat: The motions, in the dtype of the computation. *Shape:* ``(L, K, V, 3)``.
             i: The interval.
-            which: The motion of each shape. *Shape:* ``(B,)``.
+            which: Index of each shape's motion. *Shape:* ``(B,)``.
             u: Times, 0 to 1. *Shape:* ``(B,)``.
             n_searched: Number of even times at which contacts are searched.
         """
-        found = self._alone(knots, flat, i, which, u)
+        result = self._spline_shapes(knots, flat, i, which, u)
         if self.contact:
-            found = self._separated(knots, flat, i, which, u, found, n_searched)
+            result = self._separate_contacts(knots, flat, i, which, u, result, n_searched)
         if knots is not None and self.objective.terms:
-            x = found.shapes[:, None]  # each is compared with itself
-            found = self.layers[0].solved(x, torch.ones_like(x[..., 0, 0]), u.shape)
-        return found
+            x = result.shapes[:, None]  # each is compared with itself
+            result = self.layers[0].solved(x, torch.ones_like(x[..., 0, 0]), u.shape)
+        return result
 
-    def _alone(self, knots: list[Knots] | None, flat: Tensor, i: int, which: Tensor, u: Tensor) -> InBetweenResult:
-        """Shapes without contact and further terms. Arguments as for :meth:`within`."""
+    def _spline_shapes(
+        self, knots: list[Knots] | None, flat: Tensor, i: int, which: Tensor, u: Tensor
+    ) -> InBetweenResult:
+        """Shapes without contact and further terms. Arguments as for :meth:`evaluate_interval`."""
         weights = torch.stack([1 - u, u], -1)
         if knots is None:
             ends = flat[which][:, list(self.pairs[i])]
             return self.layers[i].solved(ends, weights, u.shape)  # type: ignore[no-any-return]
-        found, stiffness = [], [u.new_full((len(u), 1), value) for value in (ALPHA, BETA)]
-        for spline, distortion, own in zip(self.splines, self.distortions, knots, strict=True):
-            straight = spline.straight(own, i, which, u)
-            x, usable = spline(own, i, which, u, straight=straight), own.usable[which]
-            rests = RestShapes(own.shapes[i : i + 2, which].movedim(0, 1), weights, stiffness, None)
+        results, stiffness = [], [u.new_full((len(u), 1), value) for value in (ALPHA, BETA)]
+        for spline, distortion, body in zip(self.splines, self.distortions, knots, strict=True):
+            straight = spline.straight(body, i, which, u)
+            x, usable = spline(body, i, which, u, straight=straight), body.usable[which]
+            rests = RestShapes(body.shapes[i : i + 2, which].movedim(0, 1), weights, stiffness, None)
             x, solution = no_worse(x, [straight], unminimised(x, usable), distortion, rests, SLACK_OF_PATHS)
-            shapes = spline.alignment.restore(x, spline.pose(own, i, which, u))
-            found.append(InBetweenResult(torch.where(usable[:, None, None], shapes, torch.nan), solution))
-        return of_bodies(found, self.vertices)
+            shapes = spline.alignment.restore(x, spline.pose(body, i, which, u))
+            results.append(InBetweenResult(torch.where(usable[:, None, None], shapes, torch.nan), solution))
+        return of_bodies(results, self.vertices)
 
-    def _separated(
+    def _separate_contacts(
         self, knots: list[Knots] | None, flat: Tensor, i: int, which: Tensor, u: Tensor, result: InBetweenResult, n: int
     ) -> InBetweenResult:
         """Shapes pushed apart by a displacement found at ``n`` even times of each motion."""
@@ -278,59 +283,59 @@ class Path(PreciseModule):
         core, even = layer.core, torch.arange(1, n + 1).to(u) / (n + 1)
         shapes, left = result.shapes.clone(), torch.zeros_like(result.solution.status)
 
-        def placed(own: Tensor, at: Tensor) -> tuple[Pose, Tensor | None, Tensor]:
-            """The poses, the rest shapes of a pair, and the key-frames in the frame."""
+        def pose_at(rows: Tensor, at: Tensor) -> tuple[Pose, Tensor | None, Tensor]:
+            """Poses, rest shapes of a pair, and key-frames in the frame of the solver."""
             if knots is not None:
-                return self.splines[0].pose(knots[0], i, own, at), None, knots[0].shapes[i : i + 2, own[0]]
-            rests, pose, _ = core.alignment(flat[own][:, pair], torch.stack([1 - at, at], -1))
+                return self.splines[0].pose(knots[0], i, rows, at), None, knots[0].shapes[i : i + 2, rows[0]]
+            rests, pose, _ = core.alignment(flat[rows][:, pair], torch.stack([1 - at, at], -1))
             return pose, rests, rests[0]
 
         for motion in which.unique().tolist():
             with torch.no_grad():
-                own = torch.full_like(even, motion, dtype=torch.int64)
-                pose, known, ends = placed(own, even)
-                x = core.alignment.bring(self._alone(knots, flat, i, own, even).shapes, pose)
+                rows = torch.full_like(even, motion, dtype=torch.int64)
+                pose, known, ends = pose_at(rows, even)
+                x = core.alignment.bring(self._spline_shapes(knots, flat, i, rows, even).shapes, pose)
                 pulls = torch.stack([1 - even, even], -1)
                 pulls = torch.ones_like(pulls[:, :1]) if known is None else pulls
                 rests = RestShapes(x[:, None] if known is None else known, pulls, layer.stiffness_of(even, even.shape))
                 last = len(self.pairs) - 1
                 goes_on = self.smooth and (self.cyclic or i > 0), self.smooth and (self.cyclic or i < last)
                 both = torch.stack([ends, flat[motion, pair]])
-                found = push_apart(core, x, even, rests, pose, both, goes_on)
+                displacement = push_apart(core, x, even, rests, pose, both, goes_on)
             mine = torch.nonzero(which == motion).flatten()
-            pose = placed(which[mine], u[mine])[0]
-            pushed, left[mine] = found.apply(core.alignment.bring(result.shapes[mine], pose), u[mine])
+            pose = pose_at(which[mine], u[mine])[0]
+            pushed, left[mine] = displacement.apply(core.alignment.bring(result.shapes[mine], pose), u[mine])
             shapes = shapes.index_copy(0, mine, core.alignment.restore(pushed, pose))
         return InBetweenResult(shapes, result.solution._replace(n_crossing=left))
 
-    def _located(self, keyframes: Tensor, t: Tensor | float) -> tuple[Tensor, Tensor, Tensor, Tensor, torch.Size]:
-        """Motions, *shape* ``(L, K, V, 3)``; of each shape the motion, the interval, and the time there; dimensions."""
+    def _flatten(self, keyframes: Tensor, t: Tensor | float) -> tuple[Tensor, Tensor, Tensor, Tensor, torch.Size]:
+        """Checked motions ``(L, K, V, 3)``; the motion, interval and fraction of each shape; leading dimensions."""
         self.check_shapes(self.n_keyframes, keyframes=keyframes)
         require_numbers("Path", keyframes)
         self._require_own_bases()
         rounding = torch.finfo(t.dtype).eps if isinstance(t, Tensor) and t.is_floating_point() else 0.0
         t = torch.as_tensor(t, dtype=self.times.dtype, device=keyframes.device)
-        own = keyframes.shape[:-3]
+        leading = keyframes.shape[:-3]
         try:
-            lead = broadcast_shapes(own, t.shape)
+            lead = broadcast_shapes(leading, t.shape)
         except RuntimeError:
             raise ValueError(
-                f"t of shape {tuple(t.shape)} does not broadcast against motions of {tuple(own)}; for all times of all "
-                "motions pass keyframes[:, None]"
+                f"t of shape {tuple(t.shape)} does not broadcast against motions of {tuple(leading)}; for all times "
+                "of all motions pass keyframes[:, None]"
             ) from None
         flat = keyframes.to(self.dtype).reshape(-1, *keyframes.shape[-3:])
-        which = torch.arange(len(flat), device=t.device).reshape(own).expand(lead).reshape(-1)
+        which = torch.arange(len(flat), device=t.device).reshape(leading).expand(lead).reshape(-1)
         segment, u = locate_times(t.expand(lead).reshape(-1), self.times, self.cyclic, rounding)
         return flat, which, segment, u.to(flat), lead
 
 
-def joined(parts: Sequence[InBetweenResult], order: Tensor) -> InBetweenResult:
-    """Flat batches as one, by where each shape of the whole stands among the parts. *Shape:* ``(B,)``.
+def join_batches(parts: Sequence[InBetweenResult], order: Tensor) -> InBetweenResult:
+    """Join flat batches into one; ``order`` is the place of each shape among the parts. *Shape:* ``(B,)``.
 
     Where numbers of modes differ, zeros follow the amplitudes.
     """
-    widest = max(part.solution.amplitudes.shape[-1] for part in parts)
+    widest = max(result.solution.amplitudes.shape[-1] for result in parts)
     wide = [nn.functional.pad(p.solution.amplitudes, (0, widest - p.solution.amplitudes.shape[-1])) for p in parts]
-    columns = [wide, *zip(*(part.solution[1:] for part in parts), strict=True)]
+    columns = [wide, *zip(*(result.solution[1:] for result in parts), strict=True)]
     values = [None if column[0] is None else torch.cat(list(column))[order] for column in columns]
-    return InBetweenResult(torch.cat([part.shapes for part in parts])[order], Solution(*values))  # type: ignore[arg-type]
+    return InBetweenResult(torch.cat([result.shapes for result in parts])[order], Solution(*values))  # type: ignore[arg-type]

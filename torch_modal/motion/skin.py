@@ -29,9 +29,9 @@ LEAST = 4  # vertices of a new bone; fewer leave its rotation undetermined
 EQUAL = 1e-5  # distance of motions that count as one, over the diagonal
 CHUNK = 2**22  # products of bones at vertices, in memory at a time
 TINY, RIDGE = 1e-30, 1e-10
-TIED = 8  # further rounds, in which the rotations of a bone are tied to those in the frames beside
+TIED = 8  # further rounds, in which the rotations of a bone are tied to the rotations in the neighbouring frames
 TIES = 0.01, 1.0  # first and largest weight of it, over the squared error of all vertices; fourfold where bones turn on
-TURN = np.cos(np.radians(15))  # turn between frames beyond that of the bone's vertices
+TURN = np.cos(np.radians(15))  # of a bone between frames, relative to its vertices
 THIN = 1e-4  # part of the identity in the rotation of a bone's vertices, which may lie on a line
 
 
@@ -47,9 +47,9 @@ def bake(
     """A motion as linear blend skinning: bones that move rigidly, and their weights at each vertex.
 
     Bones start from clusters of vertices that move alike, split where the error is largest; then weights and bones are
-    fitted in turns (Le and Deng 2012, Smooth Skinning Decomposition with Rigid Bones). Rotations are tied to those in
-    the frames beside, as players interpolate them. Bones that move as one are merged. Copies of a vertex along seams
-    have equal weights.
+    fitted in turns (Le and Deng 2012, Smooth Skinning Decomposition with Rigid Bones). Rotations are tied to the
+    neighbouring frames, as players interpolate between them. Bones that move as one are merged. Copies of a
+    vertex along seams have equal weights.
 
     Args:
         frames: Vertex positions, two frames or more. Frame 0 is the rest shape. *Shape:* ``(T, V, 3)``.
@@ -73,17 +73,17 @@ def bake(
     shapes, triangles = check_frames(frames, faces)
     n, n_vertices = shapes.shape[:2]
     if n < 2 or n_vertices < LEAST:
-        raise ValueError(f"bones need 2 frames and {LEAST} vertices or more, got {n} of {n_vertices}.")
+        raise ValueError(f"bones need 2 frames and {LEAST} vertices or more, got {n} of {n_vertices}")
     if not isinstance(bones, int) or not 1 <= bones <= n_vertices:
-        raise ValueError(f"bones must be a whole number from 1 to that of the vertices, {n_vertices}; got {bones!r}.")
+        raise ValueError(f"bones must be a whole number from 1 to the number of vertices, {n_vertices}; got {bones!r}")
     if influences not in (1, 2, 3, 4):
-        raise ValueError(f"influences must be 1, 2, 3 or 4 bones of a vertex, got {influences!r}.")
+        raise ValueError(f"influences must be 1, 2, 3 or 4 bones of a vertex, got {influences!r}")
     if tolerance is not None and not 0 < tolerance < np.inf:
-        raise ValueError(f"tolerance must be a positive part of the diagonal, such as 0.001; got {tolerance}.")
+        raise ValueError(f"tolerance must be a positive part of the diagonal, such as 0.001; got {tolerance}")
     when = None if times is None else check_times(times, n, None, "frame")
     diagonal = float(diagonals(shapes[:1])[0])
     if diagonal == 0:
-        raise ValueError("frame 0, the rest shape, is a single point; bones need a shape.")
+        raise ValueError("frame 0, the rest shape, is a single point; bones need a shape")
     like = frames.detach() if isinstance(frames, Tensor) else torch.from_numpy(np.array(frames))
     like = like if like.is_floating_point() else like.double()
     copies = merge_seams(shapes, triangles)
@@ -92,15 +92,15 @@ def bake(
     fit = _Decomposition(torch.from_numpy((shapes[:, first] - centres) / diagonal).to(like.device), influences)
 
     def skin(most: int) -> Skin:
-        weights, made = (found.cpu() for found in fit.solve(most))
+        weights, made = (x.cpu() for x in fit.solve(most))
         after = torch.from_numpy(centres)
         transforms = torch.eye(4, dtype=torch.float64).repeat(*made.shape[:2], 1, 1)
         transforms[..., :3, :3] = made[..., :3]
         transforms[..., :3, 3] = made[..., 3] * diagonal + after - made[..., :3] @ after[0, 0]
-        found = Skin(like[0], weights[copies].to(like), transforms.to(like), 0.0, when)
-        off = found.shapes().double().cpu() - torch.from_numpy(shapes)
-        off = torch.cat([off, _between(found, torch.from_numpy(shapes))]).square().sum(-1).mean().sqrt()
-        return replace(found, error=float(off) / diagonal)
+        fitted = Skin(like[0], weights[copies].to(like), transforms.to(like), 0.0, when)
+        off = fitted.shapes().double().cpu() - torch.from_numpy(shapes)
+        off = torch.cat([off, _halfway_errors(fitted, torch.from_numpy(shapes))]).square().sum(-1).mean().sqrt()
+        return replace(fitted, error=float(off) / diagonal)
 
     best = skin(bones)
     low, high = 0, best.weights.shape[1]
@@ -112,9 +112,9 @@ def bake(
         )
         low = high
     while tolerance is not None and high - low > 1:
-        found = skin(middle := (low + high) // 2)
-        low, high = (low, middle) if found.error <= tolerance else (middle, high)
-        best = found if found.error <= tolerance else best
+        smaller = skin(middle := (low + high) // 2)
+        low, high = (low, middle) if smaller.error <= tolerance else (middle, high)
+        best = smaller if smaller.error <= tolerance else best
     return best
 
 
@@ -129,49 +129,49 @@ class _Decomposition:
 
     def solve(self, most: int) -> tuple[Tensor, Tensor]:
         """Weights in whole parts of :data:`STEPS`, and bones."""
-        bones = self._clusters(most)
-        weights, error = self._weights(bones, self.influences)
+        bones = self._cluster_bones(most)
+        weights, error = self._fit_weights(bones, self.influences)
         for _ in range(ROUNDS):
-            last, bones = error.mean(), self._moved(bones, weights)
-            weights, error = self._weights(bones, self.influences)
+            last, bones = error.mean(), self._fit_bones(bones, weights)
+            weights, error = self._fit_weights(bones, self.influences)
             if error.mean() > 0.98 * last:
                 break
         ties, total = torch.full_like(bones[0, :, 0, 0], TIES[0]), error.sum() + EQUAL**2 * len(error)
         for _ in range(TIED):
-            bones = self._moved(bones, weights, total * ties)
+            bones = self._fit_bones(bones, weights, total * ties)
             steps = bones[1:, ..., :3] @ bones[:-1, ..., :3].mT
-            beyond = (steps * _steps(self.shapes, weights)[0]).sum((-2, -1)) < 1 + 2 * TURN
+            beyond = (steps * _frame_rotations(self.shapes, weights)[0]).sum((-2, -1)) < 1 + 2 * TURN
             ties = torch.where(beyond.any(0), (4 * ties).clamp_max(TIES[1]), ties)
-            weights, error = self._weights(bones, self.influences)
-        weights, bones, ties = self._merged(weights, bones, ties)
+            weights, error = self._fit_weights(bones, self.influences)
+        weights, bones, ties = self._merge_bones(weights, bones, ties)
         whole = (weights * STEPS).floor()
         rank = (weights * STEPS - whole).argsort(1, descending=True).argsort(1)
         weights = (whole + (rank < STEPS - whole.sum(1, keepdim=True))) / STEPS
-        return weights, self._moved(bones, weights, total * ties)
+        return weights, self._fit_bones(bones, weights, total * ties)
 
-    def _clusters(self, most: int) -> Tensor:
+    def _cluster_bones(self, most: int) -> Tensor:
         """Bones of clusters of vertices that move alike; those with the largest errors are halved."""
         weights = torch.ones_like(self.rest[:, :1])
-        bones = self._moved(self.still, weights)
-        weights, error = self._weights(bones, 1)
+        bones = self._fit_bones(self.still, weights)
+        weights, error = self._fit_weights(bones, 1)
         while (n := bones.shape[1]) < most:
             label = weights.argmax(1)
             total, halves = error.new_zeros(n).index_add(0, label, error), []
             for j in total.argsort(descending=True)[: most - n].tolist():
-                own = (label == j).nonzero()[:, 0]
-                if len(own) >= 2 * LEAST and total[j] > EQUAL**2 * len(own):
-                    away = (self.rest[own] - self.rest[own[error[own].argmax()]]).norm(dim=1)
-                    halves.append(torch.zeros_like(error).index_fill(0, own[away <= away.median()], 1))
+                members = (label == j).nonzero()[:, 0]
+                if len(members) >= 2 * LEAST and total[j] > EQUAL**2 * len(members):
+                    away = (self.rest[members] - self.rest[members[error[members].argmax()]]).norm(dim=1)
+                    halves.append(torch.zeros_like(error).index_fill(0, members[away <= away.median()], 1))
             if not halves:
                 break
-            split = self._moved(self.still.repeat(1, len(halves), 1, 1), torch.stack(halves, 1))
+            split = self._fit_bones(self.still.repeat(1, len(halves), 1, 1), torch.stack(halves, 1))
             bones = torch.cat([bones, split], 1)
             for _ in range(4):
-                weights, error = self._weights(bones, 1)
-                bones = self._moved(bones, weights)
+                weights, error = self._fit_weights(bones, 1)
+                bones = self._fit_bones(bones, weights)
         return bones
 
-    def _weights(self, bones: Tensor, influences: int) -> tuple[Tensor, Tensor]:
+    def _fit_weights(self, bones: Tensor, influences: int) -> tuple[Tensor, Tensor]:
         """Weights of least squared distance, and its mean over the frames at each vertex.
 
         Bones are added one by one: that towards which a straight step lowers the distance most.
@@ -179,27 +179,27 @@ class _Decomposition:
         n_frames, n = bones.shape[:2]
         columns, grams = bones.transpose(1, 2).reshape(3 * n_frames, 4 * n), _grams(bones).reshape(n * n, 16)
         weights, errors = self.rest.new_zeros(len(self.rest), n), []
-        for part in torch.arange(len(self.rest), device=bones.device).split(max(1, CHUNK // n**2)):
-            p, x = self.rest[part], self.rows[:, part]
+        for rows in torch.arange(len(self.rest), device=bones.device).split(max(1, CHUNK // n**2)):
+            p, x = self.rest[rows], self.rows[:, rows]
             squares = ((p[:, :, None] * p[:, None]).flatten(1) @ grams.mT).unflatten(1, (n, n))
             products = ((columns.mT @ x).unflatten(0, (n, 4)) * p.mT).sum(1).mT
-            own = squares.diagonal(dim1=1, dim2=2)
-            chosen = (own - 2 * products).argmin(1, keepdim=True)
-            found, error = _convex(squares, products, chosen)
+            norms = squares.diagonal(dim1=1, dim2=2)
+            chosen = (norms - 2 * products).argmin(1, keepdim=True)
+            convex, error = _convex_weights(squares, products, chosen)
             for _ in range(1, min(influences, n)):
-                towards = (found[:, :, None] * squares.gather(1, chosen[:, :, None].expand(-1, -1, n))).sum(1)
-                here = (found * towards.gather(1, chosen)).sum(1, keepdim=True)
-                slope = products - (found * products.gather(1, chosen)).sum(1, keepdim=True) - towards + here
-                length = (own - 2 * towards + here).clamp_min(TINY)
+                towards = (convex[:, :, None] * squares.gather(1, chosen[:, :, None].expand(-1, -1, n))).sum(1)
+                here = (convex * towards.gather(1, chosen)).sum(1, keepdim=True)
+                slope = products - (convex * products.gather(1, chosen)).sum(1, keepdim=True) - towards + here
+                length = (norms - 2 * towards + here).clamp_min(TINY)
                 step = (slope / length).clamp(0, 1)
                 gain = (step * (2 * slope - step * length)).scatter(1, chosen, -1)
                 chosen = torch.cat([chosen, gain.argmax(1, keepdim=True)], 1)
-                found, error = _convex(squares, products, chosen)
-            weights[part] = weights[part].scatter(1, chosen, found)
+                convex, error = _convex_weights(squares, products, chosen)
+            weights[rows] = weights[rows].scatter(1, chosen, convex)
             errors.append((error + x.square().sum(0)).clamp_min(0) / n_frames)
         return weights, torch.cat(errors)
 
-    def _moved(self, bones: Tensor, weights: Tensor, ties: Tensor | None = None) -> Tensor:
+    def _fit_bones(self, bones: Tensor, weights: Tensor, ties: Tensor | None = None) -> Tensor:
         """Bones one after the other, each by the best rigid motion for its part of the vertices.
 
         Ties ``(J,)`` add the squared change of a rotation between frames, without the turn of the bone's vertices.
@@ -208,36 +208,36 @@ class _Decomposition:
         weighted = (weights[:, :, None] * self.rest[:, None]).flatten(1)
         sums, moments = weighted.mT @ weighted, self.rows @ weighted
         columns = bones.transpose(1, 2).reshape(3 * n_frames, 4 * n).clone()
-        steps = None if ties is None else _steps(self.shapes, weights)[0]
-        for own in [slice(4 * j, 4 * j + 4) for j in range(n)] * SWEEPS:
-            *_, mass = middle = sums[own, own][3]
+        steps = None if ties is None else _frame_rotations(self.shapes, weights)[0]
+        for block in [slice(4 * j, 4 * j + 4) for j in range(n)] * SWEEPS:
+            *_, mass = middle = sums[block, block][3]
             if mass > TINY:
-                part = moments[:, own] - columns @ sums[:, own] + columns[:, own] @ sums[own, own]
-                part, middle = part.unflatten(0, (n_frames, 3)) / mass, middle[:3] / mass
-                covariance = part[..., :3] - part[..., 3:] * middle
+                moment = moments[:, block] - columns @ sums[:, block] + columns[:, block] @ sums[block, block]
+                moment, middle = moment.unflatten(0, (n_frames, 3)) / mass, middle[:3] / mass
+                covariance = moment[..., :3] - moment[..., 3:] * middle
                 if ties is None or steps is None:
                     rotation = best_rotation(covariance)
                 else:
-                    j, rotation = own.start // 4, columns[:, own].unflatten(0, (n_frames, 3))[..., :3].clone()
+                    j, rotation = block.start // 4, columns[:, block].unflatten(0, (n_frames, 3))[..., :3].clone()
                     for some in (slice(0, None, 2), slice(1, None, 2)):  # frames whose neighbours are the others
-                        beside = torch.zeros_like(rotation)
-                        beside[1:] += steps[:, j] @ rotation[:-1]
-                        beside[:-1] += steps[:, j].mT @ rotation[1:]
-                        rotation[some] = best_rotation((covariance + ties[j] / mass * beside)[some])
-                shift = part[..., 3] - rotation @ middle
-                columns[:, own] = torch.cat([rotation, shift[..., None]], 2).flatten(0, 1)
+                        neighbours = torch.zeros_like(rotation)
+                        neighbours[1:] += steps[:, j] @ rotation[:-1]
+                        neighbours[:-1] += steps[:, j].mT @ rotation[1:]
+                        rotation[some] = best_rotation((covariance + ties[j] / mass * neighbours)[some])
+                shift = moment[..., 3] - rotation @ middle
+                columns[:, block] = torch.cat([rotation, shift[..., None]], 2).flatten(0, 1)
         return columns.reshape(n_frames, 3, n, 4).transpose(1, 2)
 
-    def _merged(self, weights: Tensor, bones: Tensor, ties: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Without bones that move nothing, or as another one does."""
+    def _merge_bones(self, weights: Tensor, bones: Tensor, ties: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Drop bones that move nothing, and merge bones that move alike."""
         kept = weights.sum(0) * STEPS >= 1
         while True:
             weights, bones, ties = weights[:, kept], bones[:, kept], ties[kept]
             weighted = weights[:, :, None] * self.rest[:, None]
             sums = torch.einsum("vja,vjb->jab", weighted, weighted)
             grams = _grams(bones)
-            own = grams.diagonal().movedim(-1, 0)
-            apart = own[:, None] + own - grams - grams.transpose(0, 1)
+            norms = grams.diagonal().movedim(-1, 0)
+            apart = norms[:, None] + norms - grams - grams.transpose(0, 1)
             off = (apart * sums[:, None]).sum((2, 3)) / (len(bones) * sums[:, 3, 3, None])
             j, k = divmod(int(off.fill_diagonal_(torch.inf).argmin()), len(off))
             if off[j, k] > EQUAL**2:
@@ -246,8 +246,8 @@ class _Decomposition:
             kept = torch.arange(len(off), device=off.device) != j
 
 
-def _steps(x: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-    """Turns of the vertices of each bone from frame to frame, and their centres.
+def _frame_rotations(x: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+    """Rotations of each bone's vertices from frame to frame, and their centres.
 
     *Shape:* ``(T, V, 3), (V, J) -> (T - 1, J, 3, 3), (T, J, 3)``.
     """
@@ -259,21 +259,22 @@ def _steps(x: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
     return turns[1:] @ turns[:-1].mT, centres
 
 
-def _between(skin: Skin, shapes: Tensor) -> Tensor:
-    """Distances half-way between frames of what players show to the mean of both. *Shape:* ``(T - 1, V, 3)``.
+def _halfway_errors(skin: Skin, shapes: Tensor) -> Tensor:
+    """Errors of what players show half-way between frames, against the mean of both. *Shape:* ``(T - 1, V, 3)``.
 
     The mean is taken after the turns of the body and, in its frame, of the bones' vertices, both put back by half.
     """
     bind, turns, shifts = skin.tracks()
     weights, rest, middles = skin.weights.double().cpu(), skin.rest.double().cpu(), bind[1:, :3, 3:]
     rotations = matrix(turns).movedim((0, 1), (2, 3))
-    own = (shapes - shifts[:, :1]) @ rotations[:, 0]
-    steps, centres = _steps(own, weights)
+    local = (shapes - shifts[:, :1]) @ rotations[:, 0]
+    steps, centres = _frame_rotations(local, weights)
     half = exp(0.5 * log(steps))
     played = rotations[:-1, 1:] @ exp(0.5 * log(rotations[:-1, 1:].mT @ rotations[1:, 1:]))
     shift = 0.5 * (shifts[:-1, 1:] + shifts[1:, 1:])[..., None] - played @ middles
     off = blended(weights, torch.cat([played, shift], 3), rest.expand(len(half), -1, -1))
-    for turn, middle, x in ((half, centres[:-1, :, :, None], own[:-1]), (half.mT, centres[1:, :, :, None], own[1:])):
+    centres = centres[..., None]
+    for turn, middle, x in ((half, centres[:-1], local[:-1]), (half.mT, centres[1:], local[1:])):
         off -= 0.5 * blended(weights, torch.cat([turn, middle - turn @ middle], 3), x)
     return off
 
@@ -284,7 +285,7 @@ def _grams(bones: Tensor) -> Tensor:
     return (columns.mT @ columns).unflatten(1, (-1, 4)).unflatten(0, (-1, 4)).transpose(1, 2)
 
 
-def _convex(squares: Tensor, products: Tensor, chosen: Tensor) -> tuple[Tensor, Tensor]:
+def _convex_weights(squares: Tensor, products: Tensor, chosen: Tensor) -> tuple[Tensor, Tensor]:
     """Convex weights ``w`` of k bones of least ``w^T K w - 2 c^T w``, of all 2^k - 1 supports, and that.
 
     *Shape:* ``(n, J, J), (n, J), (n, k) -> (n, k), (n,)``.

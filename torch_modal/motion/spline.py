@@ -39,13 +39,13 @@ class Knots(NamedTuple):
     centres: Tensor
     """Centroids in the caller's coordinates. *Shape:* ``(N + 1, L, 3)``."""
     triangles: Cubics
-    """Of :meth:`~torch_modal.geometry.local_rotations.LocalRotations.step`. *Shape of each:* ``(N, 6, L, F)``."""
+    """Steps by :meth:`~torch_modal.geometry.local_rotations.LocalRotations.step`. *Shape of each:* ``(N, 6, L, F)``."""
     vertices: Cubics
-    """Of the shapes. *Shape of each:* ``(N, L, V, 3)``."""
+    """Positions of the shapes. *Shape of each:* ``(N, L, V, 3)``."""
     turns: Cubics
     """Rotations of the caller's shapes, axis times angle. *Shape of each:* ``(N, L, 3)``."""
     moves: Cubics
-    """Of the centroids. *Shape of each:* ``(N, L, 3)``."""
+    """Positions of the centroids. *Shape of each:* ``(N, L, 3)``."""
 
 
 class Explanation(NamedTuple):
@@ -69,7 +69,7 @@ class Explanation(NamedTuple):
     """Largest distance by which contact or further terms moved a vertex off the spline, in the caller's units.
     *Shape:* ``(...)``."""
     solution: Solution
-    """Of :meth:`Path.solve`: ``status``, ``n_steps``, ``start_weights`` and, with contact, ``n_crossing``."""
+    """From :meth:`Path.solve`: ``status``, ``n_steps``, ``start_weights`` and, with contact, ``n_crossing``."""
 
 
 class Spline(nn.Module):
@@ -133,12 +133,12 @@ class Spline(nn.Module):
         usable = usable.all(1) & ~self.alignment.mirrored(every, torch.ones_like(every[..., 0, 0])).any(1)
         durations = self.times.diff()
 
-        def through(steps: Tensor, dim: int = -1) -> Cubics:
-            def squared(v: Tensor) -> Tensor:
-                found = v.square().sum(dim, keepdim=True)
-                return found + v[:, 4:5].square() if dim == 1 else found  # the entry beside the diagonal counts twice
+        def fit_cubics(steps: Tensor, dim: int = -1) -> Cubics:
+            def squared_norm(v: Tensor) -> Tensor:
+                total = v.square().sum(dim, keepdim=True)
+                return total + v[:, 4:5].square() if dim == 1 else total  # the off-diagonal entry counts twice
 
-            return cubics(steps, durations, self.cyclic, squared, self.scheme)
+            return cubics(steps, durations, self.cyclic, squared_norm, self.scheme)
 
         faces = self.rotations[0].faces
         here, steps = frames_of(shapes[0], faces), []
@@ -149,18 +149,20 @@ class Spline(nn.Module):
             here, unit = there, unit + there.size / len(shapes)
         unit = torch.maximum(unit, SMALLEST * unit.mean(-1, keepdim=True))
         unit = torch.cat([torch.ones_like(unit)[None].expand(3, -1, -1), unit[None].expand(3, -1, -1)])
-        triangles = Cubics(*(unit * part for part in through(torch.stack(steps) / unit, 1)))
-        vertices, moves = through(shapes.diff(dim=0)), through(centres.diff(dim=0))
-        return Knots(usable, shapes, rotations, centres, triangles, vertices, through(log(back.mT)), moves)
+        triangles = Cubics(*(unit * cubic for cubic in fit_cubics(torch.stack(steps) / unit, 1)))
+        vertices, moves = fit_cubics(shapes.diff(dim=0)), fit_cubics(centres.diff(dim=0))
+        return Knots(usable, shapes, rotations, centres, triangles, vertices, fit_cubics(log(back.mT)), moves)
 
     def trajectory(self, knots: Knots, i: int) -> Trajectory:
         """The cubics of the triangles in one interval."""
-        own = frames_of(knots.shapes[i], self.rotations[i].faces)
-        return Trajectory(own.e1, own.e2, own.normal, torch.stack(own[3:]), *(part[i] for part in knots.triangles))
+        start = frames_of(knots.shapes[i], self.rotations[i].faces)
+        return Trajectory(
+            start.e1, start.e2, start.normal, torch.stack(start[3:]), *(cubic[i] for cubic in knots.triangles)
+        )
 
     def straight(self, knots: Knots, i: int, which: Tensor, u: Tensor) -> Tensor:
         """Shapes whose vertices move along cubics. Arguments as for :meth:`forward`."""
-        step, first, last = (part[i][which] for part in knots.vertices)
+        step, first, last = (cubic[i][which] for cubic in knots.vertices)
         wide = u[:, None, None]
         return knots.shapes[i][which] + wide * step + offset(first, last, wide)
 
@@ -177,14 +179,14 @@ class Spline(nn.Module):
         """Shapes of one interval, in the coordinates of the knots' shapes.
 
         Args:
-            knots: Of :meth:`knots`.
+            knots: From :meth:`knots`.
             i: The interval.
             which: The motion of each shape. *Shape:* ``(B,)``.
             u: Times, 0 to 1. *Shape:* ``(B,)``.
-            trajectory: Of :meth:`trajectory`, where it is known.
-            straight: Shapes whose pieces have the centres of those of the result. Default: of :meth:`straight`.
+            trajectory: From :meth:`trajectory`, where it is known.
+            straight: Shapes that give the centres of the pieces. Default: from :meth:`straight`.
                 *Shape:* ``(B, V, 3)``.
-            bending: What the triangles do beforehand, of one motion. *Shape:* ``(6, B, F)``.
+            bending: Turns and strains of the triangles beforehand, of one motion. *Shape:* ``(6, B, F)``.
 
         Returns:
             *Shape:* ``(B, V, 3)``.
@@ -221,9 +223,9 @@ class Spline(nn.Module):
         """The poses at times of one interval. Arguments as for :meth:`forward`."""
         wide = u[:, None]
         start = knots.rotations[i][which]
-        step, first, last = ((part[i][which][:, None] @ start).squeeze(1) for part in knots.turns)
+        step, first, last = ((cubic[i][which][:, None] @ start).squeeze(1) for cubic in knots.turns)
         end = (knots.turns.last[i][which] + knots.turns.step[i][which])[:, None] @ knots.rotations[i + 1][which]
         last = end.squeeze(1) - step
         rotation = start @ exp(wide * step) @ exp(offset(first, last, wide))
-        move, first, last = (part[i][which] for part in knots.moves)
+        move, first, last = (cubic[i][which] for cubic in knots.moves)
         return Pose(rotation, knots.centres[i][which] + wide * move + offset(first, last, wide))

@@ -53,7 +53,7 @@ def subdivide(
 ) -> Tensor:
     """Fill a sequence of key-frames with physically plausible shapes.
 
-    With three key-frames or more, the shapes are those of :class:`torch_modal.Path`, smooth in time: a spline, which
+    With three key-frames or more, the result follows a :class:`torch_modal.Path`, smooth in time: a spline, which
     needs no modes unless there are contacts or terms beyond Eq. 5. Otherwise each level inserts a mid-shape between all
     neighbours, which then serves as a key-frame of the next level (section 3.3 of the paper), with the modes of the
     key-frames around it: of both in the joint space, of the nearest in the paired space.
@@ -75,15 +75,15 @@ def subdivide(
         smooth: False treats each pair of key-frames alone. Default: True where there are three key-frames or more, in
             the joint space.
         preset: As for :class:`torch_modal.InBetween`.
-        objective: What is minimised, in the place of the preset's.
-        solver: How it is solved, in the place of the preset's.
-        contact: True to keep parts from passing through each other, in the place of what the objective says
+        objective: What is minimised, instead of the preset's objective.
+        solver: How it is solved, instead of the preset's solver.
+        contact: True to keep parts from passing through each other, instead of what the objective says
             (docs/contact.md; extra ``contact``). The shapes between two key-frames are pushed apart together, by a
             displacement that is smooth in time.
         mu: Weight of the similarity of Eq. 4, with ``preset="paper"``. Default: the objective's.
         regions: Segments that local interpolation takes, likewise: those that the modes of the two key-frames reach
             worst, in all levels. Default: the solver's.
-        proxy: Vertices of a coarser mesh, by the same edge collapses in all key-frames, that moves in the place of the
+        proxy: Vertices of a coarser mesh, by the same edge collapses in all key-frames, that moves instead of the
             mesh and carries its detail (docs/passengers.md). 0: none. Default: 20,000 for meshes of more than 100,000
             vertices whose bases are not given.
         progress: Reports progress: see :data:`torch_modal.progress.Progress`.
@@ -101,7 +101,7 @@ def subdivide(
             key-frame does.
     """
     keyframes, faces = check_keyframes(keyframes, faces, min_keyframes=2)
-    n_keys, given = len(keyframes), keyframes
+    n_keys, originals = len(keyframes), keyframes
     places = keyframe_places(n_keys, levels, cyclic=cyclic, n_frames=n_frames, times=times)
     made = None if callable(bases) else bases
     if made is not None and proxy:
@@ -133,28 +133,28 @@ def subdivide(
     by_path = smooth or chosen.objective.contact
     sequence = keyframes.new_empty(places[-1] + 1, *keyframes.shape[1:])
     total = (len(places) - 1) * (1 if by_path else levels)
-    own = nullcontext() if by_path else alone()  # splines are torch's work
-    with ProgressReport(total, "in-between shapes", progress) as bar, torch.no_grad(), own:
+    threads = nullcontext() if by_path else alone()  # splines are torch's work
+    with ProgressReport(total, "in-between shapes", progress) as bar, torch.no_grad(), threads:
         if by_path:
             path = Path(made, faces.cpu(), times, cyclic, smooth, objective=chosen.objective, solver=chosen.solver)
-            parts = _along_path(path.to(keyframes.device), keyframes, faces, places)
+            parts = _follow_path(path.to(keyframes.device), keyframes, faces, places)
         else:
-            parts = _by_recursion(keyframes, faces, made, places, levels, n_frames, chosen, bar)
+            parts = _subdivide_pairs(keyframes, faces, made, places, levels, n_frames, chosen, bar)
         for i, shapes in enumerate(parts):
             sequence[places[i]], sequence[places[i] + 1 : places[i + 1]] = keyframes[i], shapes
             bar.update(int(by_path))
         sequence[-1] = keyframes[-1]
     sequence = sequence[:-1] if cyclic else sequence
-    return carrier.carried(sequence, places, given) if carrier else sequence
+    return carrier.carried(sequence, places, originals) if carrier else sequence
 
 
-def _along_path(path: Path, keyframes: Tensor, faces: Tensor, places: Sequence[int]) -> Iterator[Tensor]:
+def _follow_path(path: Path, keyframes: Tensor, faces: Tensor, places: Sequence[int]) -> Iterator[Tensor]:
     """Shapes between the key-frames of each interval."""
     motion = keyframes[None].to(path.dtype)
     knots, left = path.knots(motion), 0
     for i, n in enumerate(b - a for a, b in pairwise(places)):
         u = torch.arange(1, n).to(motion) / n
-        result = path.within(knots, motion, i, torch.zeros_like(u, dtype=torch.int64), u, n_searched=n - 1)
+        result = path.evaluate_interval(knots, motion, i, torch.zeros_like(u, dtype=torch.int64), u, n_searched=n - 1)
         report(result.solution, path.solver)
         if result.solution.n_crossing is not None:
             left += int((result.solution.n_crossing > 0).sum())
@@ -163,7 +163,7 @@ def _along_path(path: Path, keyframes: Tensor, faces: Tensor, places: Sequence[i
         _report_contacts(keyframes, faces, left, places[-1] - len(places) + 1)
 
 
-def _by_recursion(
+def _subdivide_pairs(
     keyframes: Tensor,
     faces: Tensor,
     bases: Sequence[ModalBasis] | Tensor,
@@ -181,16 +181,16 @@ def _by_recursion(
         ends = (i, (i + 1) % len(keyframes))
         layers: dict[tuple[int, int], MidShape] = {}
         for a, b in [(0, 1)] if chosen.objective.space == "joint" else [(0, 1), (0, 0), (1, 1)]:
-            own = bases[[ends[a], ends[b]]] if isinstance(bases, Tensor) else [bases[ends[a]], bases[ends[b]]]
+            pair = bases[[ends[a], ends[b]]] if isinstance(bases, Tensor) else [bases[ends[a]], bases[ends[b]]]
             solver = chosen.solver if a < b else replace(chosen.solver, regions=0)
-            layers[a, b] = MidShape(own, faces.cpu(), objective=chosen.objective, solver=solver).to(keyframes.device)
+            layers[a, b] = MidShape(pair, faces.cpu(), objective=chosen.objective, solver=solver).to(keyframes.device)
             layers[a, b].in_between.core.local = layers[0, 1].in_between.core.local  # the originals' regions
         shapes = keyframes[list(ends)]
         for _ in range(levels):
             if chosen.objective.space == "joint":
                 mids = layers[0, 1](shapes[:-1], shapes[1:])
             else:
-                nearest = _nearest(shapes, edges)
+                nearest = _nearest_ends(shapes, edges)
                 each = zip(nearest[:-1], nearest[1:], shapes[:-1], shapes[1:], strict=True)
                 mids = torch.stack([layers[a, b](x, y) for a, b, x, y in each])
             shapes = torch.cat([torch.stack([shapes[:-1], mids], 1).flatten(0, 1), shapes[-1:]])
@@ -202,8 +202,8 @@ def _by_recursion(
         yield shapes[1:-1]
 
 
-def _nearest(shapes: Tensor, edges: Tensor) -> list[int]:
-    """The end, 0 or 1, that each shape is nearer to in its edge lengths, which no rigid motion changes."""
+def _nearest_ends(shapes: Tensor, edges: Tensor) -> list[int]:
+    """Index, 0 or 1, of the end whose edge lengths are nearer to the lengths of each shape."""
     lengths = torch.linalg.norm(shapes[:, edges[:, 0]] - shapes[:, edges[:, 1]], dim=-1)
     to_first, to_last = ((lengths - lengths[end]).norm(dim=-1) for end in (0, -1))
     return (to_last < to_first).long().tolist()
@@ -254,7 +254,7 @@ def frame_times(
     n_frames: int | None = None,
     times: Tensor | Sequence[float] | None = None,
 ) -> Tensor:
-    """When the frames of :func:`subdivide` are: even within each interval of key-frames. Arguments as there.
+    """Times of the frames of :func:`subdivide`, even within each interval of key-frames. Arguments as there.
 
     Returns:
         *Shape:* ``(T,)``, float64.
@@ -289,7 +289,7 @@ def _report_contacts(keyframes: Tensor, faces: Tensor, left: int, total: int) ->
             where = ", ".join(f"{c:.4g}" for c in shape[mesh.faces[pairs[0]]].mean((0, 1)))
             messages.append(
                 f"key-frame {i} passes through itself: {len(pairs)} pairs of triangles, the first "
-                f"{pairs[0].tolist()} near ({where}); beside it that is tolerated"
+                f"{pairs[0].tolist()} near ({where}); in-betweens next to it may do so too"
             )
     if left:
         messages.append(

@@ -11,8 +11,8 @@ from torch_modal.statistics.variation import Variation
 class Components:
     """Directions in which the shapes of a set vary most, and coordinates along them.
 
-    They are those of rotations and strains of the triangles, weighted by area: a component bends a leg where one of
-    displacements would shear it. There are at most K - 1.
+    They are components of rotations and strains of the triangles, weighted by area: one of them bends a leg, where a
+    component of displacements would shear it. There are at most K - 1.
     """
 
     @lasting
@@ -40,8 +40,8 @@ class Components:
         check_tensor("shapes", shapes, "...", *self._coordinates.mean.shape)
         flat = shapes.reshape(shapes.shape[:-2].numel(), *shapes.shape[-2:]).to(self.directions)
         off = (self._coordinates.of(flat) - self._average) * self._coordinates.shares
-        found = torch.einsum("bjf,njf->bn", off, self.directions)
-        return found.view(*shapes.shape[:-2], len(self)).to(shapes)
+        values = torch.einsum("bjf,njf->bn", off, self.directions)
+        return values.view(*shapes.shape[:-2], len(self)).to(shapes)
 
     def shapes(self, coordinates: Tensor) -> Tensor:
         """The shapes of coordinates, in the pose of the mean; zeros give the average of rotations and strains.
@@ -51,5 +51,5 @@ class Components:
         check_tensor("coordinates", coordinates, "...", "n")
         flat = coordinates.reshape(coordinates.shape[:-1].numel(), coordinates.shape[-1]).to(self.directions)
         bending = self._average + torch.einsum("bn,njf->bjf", flat, self.directions[: flat.shape[1]])
-        found = self._coordinates.shapes(bending) + self._origin
-        return found.view(*coordinates.shape[:-1], *found.shape[1:]).to(coordinates)
+        shapes = self._coordinates.shapes(bending) + self._origin
+        return shapes.view(*coordinates.shape[:-1], *shapes.shape[1:]).to(coordinates)

@@ -10,7 +10,7 @@ from torch_modal.geometry.poisson import Reconstruction
 from torch_modal.geometry.rigid import RigidMotion, best_fit
 from torch_modal.geometry.triangle_frames import Sides, bending_between, bent_sides, frames_of
 
-# Logarithmic strains beyond this, a factor of 3,000, are those of triangles without area.
+# Only triangles without area have logarithmic strains beyond this, a factor of 3,000.
 MOST_STRAIN = 8.0
 
 # Triangles below this part of the mean area have the rotation of a neighbour, passed on in so many rounds, and no
@@ -22,7 +22,7 @@ class BendingCoordinates:
     """Rotation vectors and logarithmic strains of all triangles, seen from a mean shape.
 
     Sums and multiples of them are shapes again: edges keep their lengths where triangles turn. They are the
-    rotation-strain coordinates of Huang et al. 2011 with finite rotations in the place of infinitesimal ones.
+    rotation-strain coordinates of Huang et al. 2011 with finite instead of infinitesimal rotations.
 
     After the columns of the triangles there is one for each piece but the largest, the offset of its centre from the
     motion of the vertices that it follows, and one for each vertex of no face, its displacement; in sizes of the mean.
@@ -47,54 +47,54 @@ class BendingCoordinates:
         total = self.reconstruction.areas.sum()
         pieces = mean.new_tensor([float(self.reconstruction.areas[piece].sum() / total) for piece, _ in loose])
         parts = torch.cat([areas / areas.sum(), pieces, mean.new_zeros(len(self._unused))])
-        #: Weights of squared coordinates: parts of the area, twice beside the diagonal of strains. *Shape:* ``(6, E)``.
+        #: Weights of squared coordinates: parts of the area, twice off the diagonal of strains. *Shape:* ``(6, E)``.
         self.shares = parts * areas.new_tensor([1, 1, 1, 1, 2, 1])[:, None]
 
     def of(self, shapes: Tensor) -> Tensor:
-        """The coordinates of shapes, in the pose in which they fit the mean best. *Shape:* ``(B, V, 3) -> (B, 6, E)``.
+        """Coordinates of shapes, in the pose in which they fit the mean best. *Shape:* ``(B, V, 3) -> (B, 6, E)``.
 
         Rotations of up to a full turn, that neighbours share, are distinguished from their opposites.
         """
-        found, placed = [], self.aligned(shapes)
+        columns, placed = [], self.align(shapes)
         for x in placed:
             rotations = LocalRotations(self.mesh, torch.stack([self.mean, x.detach()]))
-            own = frames_of(x[None], self.faces)
-            turn, strain = bending_between(self.frames, own, rotations.turns(self.mean[None], x[None]))
+            seen = frames_of(x[None], self.faces)
+            turn, strain = bending_between(self.frames, seen, rotations.turns(self.mean[None], x[None]))
             turn, strain = turn[:, 0], strain[:, 0].clamp(-MOST_STRAIN, MOST_STRAIN)
-            areas = own.doubled_areas[0]
+            areas = seen.doubled_areas[0]
             flat = ~self._has_area | (areas <= SMALLEST_AREA * areas.mean())
             flat = flat | ~(turn.isfinite().all(0) & strain.isfinite().all(0))
             strain, above = torch.where(flat, 0, strain), rotations.ancestors[0]
             for _ in range(FLAT_ROUNDS):
                 turn, flat = torch.where(flat, turn[:, above], turn), flat & flat[above]
-            found.append(torch.cat([torch.where(flat, 0, turn), strain]))
-        on_faces = torch.stack(found) if found else placed.new_zeros(0, 6, len(self.faces))
+            columns.append(torch.cat([torch.where(flat, 0, turn), strain]))
+        on_faces = torch.stack(columns) if columns else placed.new_zeros(0, 6, len(self.faces))
         beyond = [
             (torch.einsum("v,bvi->bi", row, placed)[:, None] - centre) @ motion.rotation
-            for row, (centre, motion) in zip(self.centres, self._followed(placed), strict=True)
+            for row, (centre, motion) in zip(self.centres, self._follow_anchors(placed), strict=True)
         ]
         beyond.append(placed[:, self._unused] - self.mean[self._unused])
         offsets = (torch.cat(beyond, 1) / self.size).mT
         return torch.cat([on_faces, torch.cat([offsets, torch.zeros_like(offsets)], 1)], 2)
 
-    def _followed(self, shapes: Tensor) -> list[tuple[Tensor, RigidMotion]]:
+    def _follow_anchors(self, shapes: Tensor) -> list[tuple[Tensor, RigidMotion]]:
         """Centre and motion of each loose piece, by the vertices that it follows. *Shape:* ``(B, V, 3)``."""
-        found = []
+        motions = []
         for row, (_, anchors) in zip(self.centres, self.reconstruction.loose, strict=True):
             before = self.mean[anchors].expand(len(shapes), -1, -1)
             motion = best_fit(before, shapes[:, anchors])
-            found.append((motion.apply((row @ self.mean).expand(len(shapes), 1, -1)), motion))
-        return found
+            motions.append((motion.apply((row @ self.mean).expand(len(shapes), 1, -1)), motion))
+        return motions
 
     def spread(self, fields: Tensor) -> Tensor:
         """Means of fields on the vertices, for each column. *Shape:* ``(..., V) -> (..., E)``."""
         return torch.cat([fields[..., self.faces].mean(-1), fields @ self.centres.mT, fields[..., self._unused]], -1)
 
     def carries(self, vertices: Tensor) -> Tensor:
-        """Columns beyond those of the triangles that move a vertex, as a mask. *Shape:* ``(n,) -> (n, E - F)``."""
+        """Mask of the columns after the triangles' that move each vertex. *Shape:* ``(n,) -> (n, E - F)``."""
         return torch.cat([self.centres[:, vertices].mT > 0, vertices[:, None] == self._unused], 1)
 
-    def aligned(self, shapes: Tensor) -> Tensor:
+    def align(self, shapes: Tensor) -> Tensor:
         """The shapes in the pose in which they fit the mean best. *Shape:* ``(B, V, 3)``."""
         return best_fit(shapes, self.mean.expand_as(shapes), self.reconstruction.areas).apply(shapes)
 
@@ -106,10 +106,12 @@ class BendingCoordinates:
     def shapes(self, coordinates: Tensor) -> Tensor:
         """The shapes of coordinates, in the pose of the mean. *Shape:* ``(B, 6, E) -> (B, V, 3)``."""
         rest = self.mean.mT[:, None].expand(-1, len(coordinates), -1).contiguous()
-        found = self.reconstruction(self.sides(coordinates), rest).movedim(0, -1)
+        shapes = self.reconstruction(self.sides(coordinates), rest).movedim(0, -1)
         offsets = self.size * coordinates[:, :3, len(self.faces) :].mT
         moves = offsets[:, : len(self.centres)].unbind(1)
-        for (piece, _), (_, motion), move in zip(self.reconstruction.loose, self._followed(found), moves, strict=True):
-            found = found.index_add(1, piece, (motion.rotation @ move[..., None]).mT.expand(-1, len(piece), -1))
+        for (piece, _), (_, motion), move in zip(
+            self.reconstruction.loose, self._follow_anchors(shapes), moves, strict=True
+        ):
+            shapes = shapes.index_add(1, piece, (motion.rotation @ move[..., None]).mT.expand(-1, len(piece), -1))
         unused = self.mean[self._unused] + offsets[:, len(moves) :]
-        return self.aligned(found).index_copy(1, self._unused, unused)
+        return self.align(shapes).index_copy(1, self._unused, unused)

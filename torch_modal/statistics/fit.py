@@ -10,7 +10,7 @@ from torch_modal.autograd import transformed
 from torch_modal.contact.active import Pull
 from torch_modal.keyframes.arrays import check_tensor, require_units
 from torch_modal.statistics.local_weights import NOISE, LocalWeights, Observations
-from torch_modal.statistics.variation import Variation, bounded
+from torch_modal.statistics.variation import Variation, bound_weights
 
 # Stiffness of all pulls together, and of one at most, at a size of 100, for exact points. Like the precision of the
 # points, it falls with the square of their standard deviation.
@@ -71,14 +71,14 @@ def fit(
     noise = 0.0 if noise is None else float(noise)
     if not 0 <= noise < torch.inf:
         raise ValueError(f"noise is a standard deviation, zero or more, in the units of the points; got {noise}")
-    about, given = _checked_near(near, k), _checked(points, vertices, weights, v)
-    lead, n, found = given.points.shape[:-2], len(given.vertices), []
-    for own, counts in zip(given.points.reshape(-1, n, 3), given.weights.reshape(-1, n), strict=True):
-        to = Observations(own.to("cpu", torch.float64), given.vertices, counts)
-        found.append(_fit_one(variation, to, about, robust, noise))
-    if not found:
+    about, every = _check_near(near, k), _check_points(points, vertices, weights, v)
+    lead, n, fits = every.points.shape[:-2], len(every.vertices), []
+    for one, counts in zip(every.points.reshape(-1, n, 3), every.weights.reshape(-1, n), strict=True):
+        to = Observations(one.to("cpu", torch.float64), every.vertices, counts)
+        fits.append(_fit_one(variation, to, about, robust, noise))
+    if not fits:
         return Fitted(*(points.new_zeros(*lead, *shape) for shape in ((v, 3), (k, v), (n,), (n,))))
-    return Fitted(*(torch.stack(part).view(*lead, *part[0].shape).to(points) for part in zip(*found, strict=True)))
+    return Fitted(*(torch.stack(field).view(*lead, *field[0].shape).to(points) for field in zip(*fits, strict=True)))
 
 
 def _fit_one(variation: Variation, every: Observations, about: Tensor, robust: bool, noise: float) -> Fitted:
@@ -87,39 +87,39 @@ def _fit_one(variation: Variation, every: Observations, about: Tensor, robust: b
     The steps are constants of the graph. Where a given shape is nearer to the points, it is the result.
     """
     seen = every.weights > 0
-    to = Observations(*(part[seen] for part in every))
+    to = Observations(*(column[seen] for column in every))
     same = "the same vertices of the key-frames"
     require_units("the points", to.points.detach(), same, variation.shapes[:, to.vertices])
-    given = LocalWeights(variation, to, about, noise)
-    factors, to = given.solved(robust)
-    weights = given.weights(factors)
-    assembled = variation.assembled(weights)
+    local = LocalWeights(variation, to, about, noise)
+    factors, to = local.solve(robust)
+    weights = local.weights(factors)
+    assembled = variation.assemble(weights)
     pose = to.pose(assembled)
     with torch.no_grad():
-        stiffness = min(LARGEST_STIFFNESS, STIFFNESS / len(to.points)) * (NOISE * variation.size / given.noise) ** 2
+        stiffness = min(LARGEST_STIFFNESS, STIFFNESS / len(to.points)) * (NOISE * variation.size / local.noise) ** 2
         there = to._replace(points=variation.scale * pose.inverse().apply(to.points))
         pulls = pull(there, stiffness, len(assembled))
-        own = bounded(weights)
-        x = variation.relaxed(assembled, own, *FIRST_ROUND, pulls)
+        mixed = bound_weights(weights)
+        x = variation.relax(assembled, mixed, *FIRST_ROUND, pulls)
         for _ in range(N_ROUNDS):
-            own = variation.mixtures.weights(x)
-            x = variation.relaxed(x, own, *NEXT_ROUND, pulls)
+            mixed = variation.mixtures.weights(x)
+            x = variation.relax(x, mixed, *NEXT_ROUND, pulls)
         step = x - assembled
-        missed = [to.missed_at_best(shape) for shape in variation.shapes]
-        *errors, error = [float((to.weights * each.square()).sum()) for each in (*missed, to.missed(pose.apply(x)))]
+        missed = [to.distances_after_fit(shape) for shape in variation.shapes]
+        *errors, error = [float((to.weights * each.square()).sum()) for each in (*missed, to.distances(pose.apply(x)))]
         k = min(range(len(errors)), key=lambda k: errors[k])
         is_given = error > errors[k] + float(to.weights.sum()) * (SLACK * variation.size) ** 2
     if is_given:
         shape = to.pose(variation.shapes[k]).apply(variation.shapes[k])
-        own = torch.eye(len(errors)).to(x)[k, :, None].expand_as(own)
+        mixed = torch.eye(len(errors)).to(x)[k, :, None].expand_as(mixed)
     else:
         shape = pose.apply(assembled + step)
-    misses, trust = every.missed(shape).detach(), torch.zeros_like(every.weights)
-    misses[seen], trust[seen] = to.missed(shape), to.weights
-    return Fitted(shape, own, misses, trust)
+    misses, trust = every.distances(shape).detach(), torch.zeros_like(every.weights)
+    misses[seen], trust[seen] = to.distances(shape), to.weights
+    return Fitted(shape, mixed, misses, trust)
 
 
-def _checked(points: Tensor, vertices: Tensor, weights: Tensor | None, n_vertices: int) -> Observations:
+def _check_points(points: Tensor, vertices: Tensor, weights: Tensor | None, n_vertices: int) -> Observations:
     """All sets, with vertices and weights on the CPU, *shape* ``(..., n)``; raises for what does not fit."""
     check_tensor("points", points, "...", "n", 3)
     numbers = torch.as_tensor(vertices).cpu()
@@ -130,16 +130,16 @@ def _checked(points: Tensor, vertices: Tensor, weights: Tensor | None, n_vertice
         )
     if not bool(((numbers >= 0) & (numbers < n_vertices)).all()):
         raise ValueError(f"vertices lie in 0 to {n_vertices - 1}; got {int(numbers.min())} to {int(numbers.max())}")
-    given = torch.ones(len(numbers)) if weights is None else torch.as_tensor(weights).detach().cpu()
-    pairs = zip(reversed(given.shape[:-1]), reversed(points.shape[:-2]), strict=False)
-    if given.shape[-1:] != numbers.shape or not all(one == other or 1 in (one, other) for one, other in pairs):
+    trust = torch.ones(len(numbers)) if weights is None else torch.as_tensor(weights).detach().cpu()
+    pairs = zip(reversed(trust.shape[:-1]), reversed(points.shape[:-2]), strict=False)
+    if trust.shape[-1:] != numbers.shape or not all(one == other or 1 in (one, other) for one, other in pairs):
         raise ValueError(
-            f"weights are (..., n) of points (..., n, 3); got {tuple(given.shape)} of {tuple(points.shape)}"
+            f"weights are (..., n) of points (..., n, 3); got {tuple(trust.shape)} of {tuple(points.shape)}"
         )
-    if not bool(((given >= 0) & given.isfinite()).all()):
-        raise ValueError(f"weights are finite and none below zero; got {float(given.min())} to {float(given.max())}")
-    lead = torch.broadcast_shapes(given.shape, points.shape[:-1])
-    every = Observations(points.expand(*lead, 3), numbers.long(), given.double().expand(lead).clone())
+    if not bool(((trust >= 0) & trust.isfinite()).all()):
+        raise ValueError(f"weights are finite and none below zero; got {float(trust.min())} to {float(trust.max())}")
+    lead = torch.broadcast_shapes(trust.shape, points.shape[:-1])
+    every = Observations(points.expand(*lead, 3), numbers.long(), trust.double().expand(lead).clone())
     seen = every.weights > 0
     if not bool(every.points.detach()[seen.to(points.device)].isfinite().all()):
         raise ValueError("points hold numbers that are not finite; give those that were not observed a weight of zero")
@@ -150,7 +150,7 @@ def _checked(points: Tensor, vertices: Tensor, weights: Tensor | None, n_vertice
     return every
 
 
-def _checked_near(near: int | Tensor | None, n: int) -> Tensor:
+def _check_near(near: int | Tensor | None, n: int) -> Tensor:
     """Weights of n shapes; raises unless they add up to one. *Shape:* ``(n,)``, float64."""
     if near is None:
         return torch.full((n,), 1 / n, dtype=torch.float64)

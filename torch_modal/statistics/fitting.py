@@ -26,7 +26,7 @@ def levenberg_marquardt(
         tolerance: Relative decrease of the cost below which the iteration ends.
 
     Returns:
-        *Shape:* ``(n,)``; its cost is at most that of the start.
+        *Shape:* ``(n,)``; its cost is at most the cost of the start.
     """
     value, damping = cost(x), 0.0
     eye = torch.eye(len(x)).to(x)

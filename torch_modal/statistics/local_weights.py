@@ -38,66 +38,66 @@ class Observations(NamedTuple):
         """Rigid motion of a shape on to the points. *Shape:* ``(V, 3)``."""
         return best_fit(x[self.vertices], self.points, self.weights)
 
-    def missed(self, x: Tensor) -> Tensor:
+    def distances(self, x: Tensor) -> Tensor:
         """Distances of the points from their vertices. *Shape:* ``(V, 3) -> (n,)``."""
         return (x[self.vertices] - self.points).norm(dim=-1)
 
-    def missed_at_best(self, x: Tensor) -> Tensor:
+    def distances_after_fit(self, x: Tensor) -> Tensor:
         """Distances after the best rigid motion. *Shape:* ``(V, 3) -> (n,)``."""
-        return self.missed(self.pose(x).apply(x))
+        return self.distances(self.pose(x).apply(x))
 
 
 class LocalWeights:
     r"""Local weights and the rigid motion of least cost.
 
-    The cost of factors ``z`` of the weights' fields is that of their logarithmic posterior density,
+    The cost of factors ``z`` of the weights' fields is their negative logarithmic posterior density,
     :math:`\sum_i |x_i(z) - p_i|^2 / s^2 + |z|^2`. The most likely weights are ``about``, *shape* ``(K,)``.
     """
 
     def __init__(self, variation: Variation, to: Observations, about: Tensor, noise: float = 0.0) -> None:
         self.variation, self.about, self.noise = variation, about, math.hypot(NOISE * variation.size, noise)
-        self.given, self.to = to, to._replace(points=to.points.detach())
+        self.observations, self.to = to, to._replace(points=to.points.detach())
         self.influence = self._influence()
 
     def shape(self, factors: Tensor) -> Tensor:
         """*Shape:* ``(K n,) -> (V, 3)``."""
-        return self.variation.assembled(self.weights(factors))
+        return self.variation.assemble(self.weights(factors))
 
     def weights(self, factors: Tensor) -> Tensor:
         """Local weights, which add up to one at each vertex. *Shape:* ``(K n,) -> (K, V)``."""
-        own = factors.view(len(self.about), -1)
-        return self.about[:, None] + (own - own.mean(0)) @ self.variation.fields
+        rows = factors.view(len(self.about), -1)
+        return self.about[:, None] + (rows - rows.mean(0)) @ self.variation.fields
 
     def cost(self, factors: Tensor, to: Observations, noise: float) -> Tensor:
         """*Shape:* ``(K n,) -> ()``."""
-        missed = to.missed_at_best(self.shape(factors)).square()
+        missed = to.distances_after_fit(self.shape(factors)).square()
         return (to.weights * missed).sum() / noise**2 + factors.square().sum()
 
-    def solved(self, robust: bool) -> tuple[Tensor, Observations]:
+    def solve(self, robust: bool) -> tuple[Tensor, Observations]:
         """Factors of least cost as a function of the points, ``(K n,)``, and the observations with their weights."""
-        factors, trust = self._least(robust)
-        to = self.given._replace(weights=trust)
+        factors, trust = self._minimise(robust)
+        to = self.observations._replace(weights=trust)
         if torch.is_grad_enabled() and to.points.requires_grad:
             factors = _FactorsOfPoints.apply(factors, to.points, self, to)
         return factors, to
 
     @torch.no_grad()
-    def _least(self, robust: bool) -> tuple[Tensor, Tensor]:
+    def _minimise(self, robust: bool) -> tuple[Tensor, Tensor]:
         to, factors = self.to, self.about.new_zeros(len(self.about) * len(self.variation.fields))
 
-        def descended(noise: float, n_steps: int) -> Tensor:
-            cost, linearise = partial(self.cost, to=to, noise=noise), partial(self.linearised, to=to, noise=noise)
+        def descend(noise: float, n_steps: int) -> Tensor:
+            cost, linearise = partial(self.cost, to=to, noise=noise), partial(self.linearise, to=to, noise=noise)
             return levenberg_marquardt(factors, cost, linearise, n_steps, TOLERANCE)
 
         for noise in COARSE_NOISE:
-            factors = descended(noise * self.noise, FEW_STEPS)
+            factors = descend(noise * self.noise, FEW_STEPS)
         for _ in range(ROBUST_ROUNDS if robust else 0):
             # Observations that are missed by more than most have less weight (Geman and McClure).
-            missed = self.to.weights.sqrt() * to.missed_at_best(self.shape(factors))
+            missed = self.to.weights.sqrt() * to.distances_after_fit(self.shape(factors))
             usual = (3 * missed.median()).clamp_min(self.noise)
             to = to._replace(weights=self.to.weights / (1 + (missed / usual) ** 2) ** 2)
-            factors = descended(self.noise, FEW_STEPS)
-        factors = descended(self.noise, MOST_STEPS)
+            factors = descend(self.noise, FEW_STEPS)
+        factors = descend(self.noise, MOST_STEPS)
         for _ in range(LAST_STEPS):
             slope = torch.func.grad(self.cost)(factors, to, self.noise)
             tried = factors - self.newton(factors, to, 0.5 * slope)
@@ -106,7 +106,7 @@ class LocalWeights:
             factors = tried
         return factors, to.weights
 
-    def linearised(self, factors: Tensor, to: Observations, noise: float) -> tuple[Tensor, Tensor]:
+    def linearise(self, factors: Tensor, to: Observations, noise: float) -> tuple[Tensor, Tensor]:
         """Gauss-Newton matrix without the rigid motion, and half the negative gradient. *Shape:* ``(K n,)``."""
         seen = self.shape(factors)[to.vertices]
         off = best_fit(seen, to.points, to.weights).inverse().apply(to.points) - seen
@@ -121,36 +121,36 @@ class LocalWeights:
 
     def jacobian(self, factors: Tensor) -> Tensor:
         """Derivatives of the observed vertices, without loose pieces' rotations. *Shape:* ``(K n,) -> (3m, K n)``."""
-        own = self.variation
-        bending = own.bending(self.weights(factors))
+        variation = self.variation
+        bending = variation.bending(self.weights(factors))
         # Each side depends on its triangle alone. By columns, forward mode would take five times as long.
         with torch.enable_grad():
             leaf = bending.detach().requires_grad_()
-            ends = torch.cat(own.coordinates.sides(leaf[None]))[:, 0]
+            ends = torch.cat(variation.coordinates.sides(leaf[None]))[:, 0]
             slopes = torch.stack([torch.autograd.grad(row.sum(), leaf, retain_graph=True)[0] for row in ends])
-        one, other = slopes[..., : len(own.faces)].split(3)  # (3, 6, F) each
-        fields = own.coordinates.spread(own.fields)
-        moves = own.coordinates.size * torch.eye(3, 6).to(bending)[..., None]
-        carries = own.coordinates.carries(self.to.vertices).to(bending)
+        one, other = slopes[..., : len(variation.faces)].split(3)  # (3, 6, F) each
+        fields = variation.coordinates.spread(variation.fields)
+        moves = variation.coordinates.size * torch.eye(3, 6).to(bending)[..., None]
+        carries = variation.coordinates.carries(self.to.vertices).to(bending)
         rows = []
-        for first, second, carried in zip(*(part.split(CHUNK) for part in (*self.influence, carries)), strict=True):
+        for first, second, carried in zip(*(column.split(CHUNK) for column in (*self.influence, carries)), strict=True):
             at_faces = first[:, None, None] * one + second[:, None, None] * other
             at = torch.cat([at_faces, carried[:, None, None] * moves], -1)  # (n, 3, 6, E)
-            parts = [(at * deviation).sum(2) @ fields.mT for deviation in own.deviations]
+            parts = [(at * deviation).sum(2) @ fields.mT for deviation in variation.deviations]
             rows.append(torch.stack(parts, 2).flatten(2))
         return torch.cat(rows).flatten(0, 1)
 
     def newton(self, factors: Tensor, to: Observations, right: Tensor) -> Tensor:
         """Inverse of half the Hessian, times a vector, by conjugate gradients. *Shape:* ``(K n,)``."""
-        matrix = self.linearised(factors, to, self.noise)[0]
+        matrix = self.linearise(factors, to, self.noise)[0]
         matrix.diagonal().add_(len(matrix) * torch.finfo(matrix.dtype).eps * matrix.diagonal().max())  # its rounding
         factor = torch.linalg.cholesky_ex(matrix).L
         with torch.enable_grad():
-            own = factors.detach().requires_grad_()
-            slope = torch.autograd.grad(0.5 * self.cost(own, to, self.noise), own, create_graph=True)[0]
+            leaf = factors.detach().requires_grad_()
+            slope = torch.autograd.grad(0.5 * self.cost(leaf, to, self.noise), leaf, create_graph=True)[0]
 
         return conjugate_gradients(
-            lambda x: torch.autograd.grad(slope, own, x, retain_graph=True)[0],
+            lambda x: torch.autograd.grad(slope, leaf, x, retain_graph=True)[0],
             lambda x: torch.cholesky_solve(x[:, None], factor)[:, 0],
             torch.dot,
             right,
@@ -159,19 +159,19 @@ class LocalWeights:
 
     def _influence(self) -> tuple[Tensor, Tensor]:
         """Part of both sides of each triangle in each observed place. *Shape:* ``(n, F)`` each."""
-        own, to = self.variation, self.to
-        n, v = len(to.points), len(own.coordinates.mean)
+        variation, to = self.variation, self.to
+        n, v = len(to.points), len(variation.coordinates.mean)
         parts = to.weights.new_zeros(n, v).scatter(1, to.vertices[:, None], 1)
-        reconstruction = own.coordinates.reconstruction
+        reconstruction = variation.coordinates.reconstruction
         for piece, anchors in reconstruction.loose:
             # A loose piece goes where the vertices go that it follows.
             parts[:, anchors] += parts[:, piece].sum(1, keepdim=True) / len(anchors)
-        first, second = (parts.new_zeros(1, n, len(own.faces)).requires_grad_() for _ in range(2))
+        first, second = (parts.new_zeros(1, n, len(variation.faces)).requires_grad_() for _ in range(2))
         with torch.enable_grad():
             weights, signs = reconstruction.weights, reconstruction.signs
             edges = edge_means((first, second), weights, reconstruction.sides, signs, len(reconstruction.edges))
-            found = reconstruction.poisson(reconstruction.poisson.pulls(edges), parts.new_zeros(n, v, 1))
-            of_first, of_second = torch.autograd.grad((found[..., 0] * parts).sum(), (first, second))
+            response = reconstruction.poisson(reconstruction.poisson.pulls(edges), parts.new_zeros(n, v, 1))
+            of_first, of_second = torch.autograd.grad((response[..., 0] * parts).sum(), (first, second))
         return of_first[0], of_second[0]
 
 
@@ -179,8 +179,8 @@ class _FactorsOfPoints(torch.autograd.Function):
     """Factors of least cost, with their derivatives in the observed points by the implicit function theorem."""
 
     @staticmethod
-    def forward(ctx: Any, factors: Tensor, points: Tensor, given: LocalWeights, to: Observations) -> Tensor:
-        ctx.given, ctx.to = given, to._replace(points=points.detach())
+    def forward(ctx: Any, factors: Tensor, points: Tensor, problem: LocalWeights, to: Observations) -> Tensor:
+        ctx.problem, ctx.to = problem, to._replace(points=points.detach())
         ctx.save_for_backward(factors, points)
         return factors.clone()
 
@@ -192,9 +192,9 @@ class _FactorsOfPoints(torch.autograd.Function):
                 "the graph; take the gradient without create_graph"
             )
         factors, points = ctx.saved_tensors
-        turned = ctx.given.newton(factors, ctx.to, grad)
+        turned = ctx.problem.newton(factors, ctx.to, grad)
         with torch.enable_grad():
-            own, to_points = factors.detach().requires_grad_(), points.detach().requires_grad_()
-            cost = 0.5 * ctx.given.cost(own, ctx.to._replace(points=to_points), ctx.given.noise)
-            slope = torch.autograd.grad(cost, own, create_graph=True)[0]
+            leaf, to_points = factors.detach().requires_grad_(), points.detach().requires_grad_()
+            cost = 0.5 * ctx.problem.cost(leaf, ctx.to._replace(points=to_points), ctx.problem.noise)
+            slope = torch.autograd.grad(cost, leaf, create_graph=True)[0]
             return None, -torch.autograd.grad(slope, to_points, turned)[0], None, None

@@ -69,7 +69,7 @@ class Variation:
         #: Size of the mean, in the caller's units.
         self.size = self.coordinates.size
         #: The given shapes, turned on to the mean. *Shape:* ``(K, V, 3)``.
-        self.shapes = self.coordinates.aligned(shapes)
+        self.shapes = self.coordinates.align(shapes)
         bending = self.coordinates.of(shapes)
         #: Mean of the coordinates of all shapes, and how each differs. *Shape:* ``(6, E)``, ``(K, 6, E)``.
         self.average = bending.mean(0)
@@ -94,12 +94,12 @@ class Variation:
         """Coordinates of local weights. *Shape:* ``(K, V) -> (6, E)``."""
         return self.average + torch.einsum("ke,kje->je", self.coordinates.spread(weights), self.deviations)
 
-    def assembled(self, weights: Tensor) -> Tensor:
+    def assemble(self, weights: Tensor) -> Tensor:
         """Shape of local weights by rotations and strains, in the pose of the mean. *Shape:* ``(K, V) -> (V, 3)``."""
         return self.coordinates.shapes(self.bending(weights)[None])[0]
 
     @torch.no_grad()
-    def relaxed(
+    def relax(
         self, x: Tensor, weights: Tensor, n_steps: int, n_products: int, pulls: FreeEnergy | None = None
     ) -> Tensor:
         """Newton steps of all vertices towards weighted means of the lengths and angles of the given shapes.
@@ -107,10 +107,10 @@ class Variation:
         The shape is in the pose of the mean; the pulls are an energy at a size of 100. *Shape:* ``(V, 3), (K, V)``.
         """
         energy = self.fine.energy
-        rest = trees.mapped(energy.mixed(self.rest, weights), lambda part: part[None])
+        rest = trees.mapped(energy.mixed(self.rest, weights), lambda measure: measure[None])
         reference = energy.against(rest, self.stiffness)
-        beside = [] if pulls is None else [pulls]
-        return self.fine.towards(self.scale * x[None], reference, n_steps, n_products, beside)[0] / self.scale
+        further = [] if pulls is None else [pulls]
+        return self.fine.towards(self.scale * x[None], reference, n_steps, n_products, further)[0] / self.scale
 
     # ----------------------------------------------------------------------------------------------------- new members
     def draw(
@@ -131,7 +131,7 @@ class Variation:
         weights = torch.empty(n, len(self), dtype=torch.float64)
         factors = torch.empty(n, len(self), len(self.fields) - 1, dtype=torch.float64)
         for i in range(n):
-            # Gamma variates by their logarithms: those of small concentrations underflow.
+            # Logarithms of gamma variates: small concentrations underflow.
             drawn = torch._standard_gamma(shape + 1, generator=generator).log()
             drawn = drawn + torch.rand(len(self), dtype=torch.float64, generator=generator, device=device).log() / shape
             weights[i] = torch.softmax(drawn, 0)
@@ -154,13 +154,13 @@ class Variation:
         """
         logarithms = weights.clamp_min(torch.finfo(weights.dtype).tiny).log()[:, None]
         for i in range(ROUNDS + 1):
-            part = 0 if i == ROUNDS else SMOOTHER**i
-            own = torch.softmax(logarithms + part * factors @ self.fields[1:], 0)
-            x = self.relaxed(self.assembled(own), own, STEPS, PRODUCTS)
+            locality = 0 if i == ROUNDS else SMOOTHER**i
+            local = torch.softmax(logarithms + locality * factors @ self.fields[1:], 0)
+            x = self.relax(self.assemble(local), local, STEPS, PRODUCTS)
             if self.folds(x) <= self._most_folds:
-                return x, own
+                return x, local
         first = int(weights.argmax())
-        return self.shapes[first].clone(), one_hot(weights.argmax(), len(self)).to(own)[:, None].expand_as(own)
+        return self.shapes[first].clone(), one_hot(weights.argmax(), len(self)).to(local)[:, None].expand_as(local)
 
     @cached_property
     def _most_folds(self) -> int:
@@ -179,8 +179,8 @@ class Patches:
 
     def __init__(self, mean: Tensor, reconstruction: Reconstruction) -> None:
         graph, used = _graph(mean, reconstruction), np.unique(reconstruction.faces.numpy())
-        centres, found = farthest_apart(graph, used, N_PATCHES)
-        nearest, distances = found.min(axis=0), torch.from_numpy(found)
+        centres, from_centres = farthest_apart(graph, used, N_PATCHES)
+        nearest, distances = from_centres.min(axis=0), torch.from_numpy(from_centres)
         reach = OVERLAP * nearest[np.isfinite(nearest)].max()
         bumps = torch.exp(-2 * (distances / max(reach, np.finfo(float).tiny)) ** 2)
         #: Part of each vertex that belongs to each patch. *Shape:* ``(P, V)``.
@@ -235,15 +235,15 @@ class LocalMixtures:
         spread, whole = (matrix.diagonal(dim1=-2, dim2=-1).mean(-1) for matrix in (centred, gram))
         spread = torch.maximum(spread, torch.finfo(x.dtype).eps * whole)  # shapes may be equal
         system = centred + EVENNESS * spread[:, None, None] * torch.eye(n).to(x)
-        found = torch.linalg.solve(system, right)
-        return bounded((found - found.mean(-1, keepdim=True)).mT @ self.patches.shares + 1 / n)
+        solution = torch.linalg.solve(system, right)
+        return bound_weights((solution - solution.mean(-1, keepdim=True)).mT @ self.patches.shares + 1 / n)
 
 
-def bounded(weights: Tensor) -> Tensor:
-    """Weights nearer to even ones, where those below zero add up to more than a bound. *Shape:* ``(K, V)``."""
+def bound_weights(weights: Tensor) -> Tensor:
+    """Move weights towards even ones where the negative ones add up to more than a bound. *Shape:* ``(K, V)``."""
     below = -weights.clamp_max(0).sum(0)
-    part = (MOST_BELOW_ZERO / below.clamp_min(MOST_BELOW_ZERO)).clamp_max(1)
-    return 1 / len(weights) + part * (weights - 1 / len(weights))
+    ratio = (MOST_BELOW_ZERO / below.clamp_min(MOST_BELOW_ZERO)).clamp_max(1)
+    return 1 / len(weights) + ratio * (weights - 1 / len(weights))
 
 
 def _graph(mean: Tensor, reconstruction: Reconstruction) -> sparse.csr_matrix:
