@@ -103,7 +103,7 @@ def test_result_is_the_same_each_time_and_nothing_given_changes(name: str, made:
 
 
 @every_layer
-def test_dtype(name: str, made: Made) -> None:
+def test_float32_is_near_float64(name: str, made: Made) -> None:
     single = copy.deepcopy(made.layer).float()
     for layer in [single] if name.startswith(OF_ONE_DTYPE) else [single, made.layer]:
         found = made.call(made.x.float(), layer)
@@ -113,7 +113,7 @@ def test_dtype(name: str, made: Made) -> None:
 
 
 @every_layer
-def test_autocast(name: str, made: Made) -> None:
+def test_autocast_computes_in_float32(name: str, made: Made) -> None:
     layer, x = copy.deepcopy(made.layer).float(), made.x.float()
     truth = made.call(x, layer)
     with torch.autocast("cpu", torch.bfloat16):
@@ -139,7 +139,7 @@ def test_meta_device(name: str, made: Made) -> None:
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
 @every_layer
-def test_gpu(name: str, made: Made) -> None:
+def test_a_gpu_gives_the_same(name: str, made: Made) -> None:
     found = made.call(made.x.cuda(), copy.deepcopy(made.layer).cuda())
     assert found.is_cuda
     assert_near(found.cpu(), made.truth, 1e-8)
@@ -193,7 +193,7 @@ def test_batch_is_a_loop(name: str, made: Made) -> None:
 
 
 @pytest.mark.parametrize("name", [name for name in BATCHED if name not in CONTACT])
-def test_vmap(name: str, made: Made) -> None:
+def test_vmap_is_a_loop(name: str, made: Made) -> None:
     """A transform may be the first that uses a layer."""
     both, new = torch.stack([made.x, 1.01 * made.x + 0.01 * made.x.sin()]), made.case.make(made.shapes)
     slopes = torch.stack([gradient(made.call, x) for x in both])
@@ -307,7 +307,7 @@ def test_loaded_state(name: str, how: str, made: Made) -> None:
 
 @pytest.mark.slow
 @every_layer
-def test_compiled(name: str, made: Made) -> None:
+def test_a_compiled_call_gives_the_same(name: str, made: Made) -> None:
     """What a layer makes at its first use is made outside of the trace: SciPy cannot be traced."""
     torch.compiler.reset()  # what was compiled often is not compiled again
     new = made.case.make(made.shapes)
@@ -315,7 +315,7 @@ def test_compiled(name: str, made: Made) -> None:
 
 
 @every_layer
-def test_copies(name: str, made: Made) -> None:
+def test_copies_give_the_same(name: str, made: Made) -> None:
     for twin in (copy.deepcopy(made.layer), pickle.loads(pickle.dumps(made.layer))):
         assert torch.equal(made.call(made.x, twin), made.truth)
         twin.share_memory()

@@ -45,7 +45,7 @@ class TestValues:
         "lead, t_shape, expected",
         [((), (), ()), ((), (3,), (3,)), ((2,), (2,), (2,)), ((2, 1), (3,), (2, 3)), ((3, 2), (3, 1), (3, 2))],
     )
-    def test_cardinality(
+    def test_leading_dimensions_broadcast(
         self, layer: InBetween, bars: Shapes, lead: tuple[int, ...], t_shape: tuple[int, ...], expected: tuple[int, ...]
     ) -> None:
         x_a, x_b = (x.expand(*lead, -1, -1) for x in bars.keyframes[:2])
@@ -325,8 +325,8 @@ class TestTorch:
         (lambda layer, a, b: layer(a[:, :2], b, 0.5), r"got \(164, 2\)"),
         (lambda layer, a, b: layer(a.long(), b, 0.5), "x_a must be floating-point"),
         (lambda layer, a, b: layer(a.numpy(), b, 0.5), "x_a is a ndarray; pass a tensor"),
-        (lambda layer, a, b: layer(a.expand(2, -1, -1), b.expand(3, -1, -1), 0.5), "does not broadcast"),
-        (lambda layer, a, b: layer(a.expand(3, -1, -1), b, torch.rand(4)), r"t of shape \(4,\) .* x_a\[:, None\]"),
+        (lambda layer, a, b: layer(a.expand(2, -1, -1), b.expand(3, -1, -1), 0.5), "do not broadcast"),
+        (lambda layer, a, b: layer(a.expand(3, -1, -1), b, torch.rand(4)), r"t \(4,\); .* x_a\[:, None\]"),
         *((lambda layer, a, b, t=t: layer(a, b, times(0.5, t)), r"t lies in \[0, 1\]") for t in (-0.1, 1.5, math.nan)),
     ],
 )

@@ -65,7 +65,7 @@ def exported(layer: tm.ModalDecoder, given: tuple[Tensor, ...]) -> torch.export.
 
 
 @pytest.mark.parametrize("n, dtype", [(2, DOUBLE), (2, torch.float32), pytest.param(3, DOUBLE, marks=pytest.mark.slow)])
-def test_export(n: int, dtype: torch.dtype, bars: Shapes) -> None:
+def test_an_exported_decoder_gives_the_same(n: int, dtype: torch.dtype, bars: Shapes) -> None:
     x, basis, times = bars.keyframes[:n], bars.bases[0], torch.arange(n).double() ** 2
     layer = tm.ModalDecoder(x, bars.faces, times, basis.reference, basis.modes).to(dtype)
     generator = torch.Generator().manual_seed(0)

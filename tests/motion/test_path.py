@@ -81,7 +81,7 @@ def test_keyframes_bit_for_bit(path: Path, motion: Shapes) -> None:
     ("lead", "t_shape", "expected"),
     [((), (), ()), ((), (3,), (3,)), ((2,), (2,), (2,)), ((2, 1), (3,), (2, 3)), ((2,), (), (2,)), ((0,), (), (0,))],
 )
-def test_cardinality(
+def test_leading_dimensions_broadcast(
     path: Path, motion: Shapes, lead: tuple[int, ...], t_shape: tuple[int, ...], expected: tuple[int, ...]
 ) -> None:
     keyframes = motion.keyframes.expand(*lead, -1, -1, -1)
@@ -273,7 +273,7 @@ def test_gradients_reach_a_term(motion: Shapes) -> None:
     [
         *((lambda path, x, at=at: path(x, at), "between the times of .*, 0 and 4") for at in (-0.1, 4.2, math.nan)),
         (lambda path, x: path(x[:4], 0.5), r"shape \(\.\.\., 5, 164, 3\); got \(4, 164, 3\)"),
-        (lambda path, x: path(x.expand(2, -1, -1, -1), torch.rand(3)), "does not broadcast against motions"),
+        (lambda path, x: path(x.expand(2, -1, -1, -1), torch.rand(3)), r"keyframes \(2,\), t \(3,\); for"),
         (lambda path, x: path.insert(2.0), "already"),
     ],
 )

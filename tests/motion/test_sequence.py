@@ -234,7 +234,7 @@ def test_linear_sequence(scattered: Shapes) -> None:
         ({"regions": 2}, "the joint space has one"),
     ],
 )
-def test_exception(options: dict[str, Any], message: str, scattered: Shapes) -> None:
+def test_what_subdivide_refuses(options: dict[str, Any], message: str, scattered: Shapes) -> None:
     with pytest.raises(ValueError, match=message):
         subdivide(scattered.keyframes, scattered.faces, **{"bases": scattered.bases, "levels": 1, **options})
 

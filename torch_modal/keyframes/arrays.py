@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from torch_modal.arrays import IntArray
+from torch_modal.autograd import broadcast_shapes
 from torch_modal.errors import MeshError
 from torch_modal.geometry.connectivity import merge_seams
 
@@ -107,6 +108,23 @@ def check_tensor(
         raise ValueError(f"{name} is on {x.device}, the other tensors on {device}; move one with .to()")
     if finite and not bool(x.isfinite().all()):
         raise ValueError(f"{name} has entries that are not finite")
+
+
+def broadcast_leading(hint: str = "", **leading: torch.Size) -> torch.Size:
+    """Common leading dimensions of several arguments.
+
+    Args:
+        hint: A remedy, for the message.
+        leading: Leading dimensions of each argument, under its name.
+
+    Raises:
+        ValueError: They do not broadcast.
+    """
+    try:
+        return broadcast_shapes(*leading.values())
+    except RuntimeError:
+        got = ", ".join(f"{name} {tuple(shape)}" for name, shape in leading.items())
+        raise ValueError(f"leading dimensions do not broadcast: {got}{hint and '; '}{hint}") from None
 
 
 class WeldedKeyframes(NamedTuple):

@@ -3,10 +3,10 @@
 import torch
 from torch import Tensor
 
-from torch_modal.autograd import broadcast_shapes, lasting, made_outside, once, traced, untraced
+from torch_modal.autograd import lasting, made_outside, once, traced, untraced
 from torch_modal.inbetween.results import InBetweenResult, report, with_exact_keyframes
 from torch_modal.inbetween.settings import Objective, Preset, Solver, settings
-from torch_modal.keyframes.arrays import check_tensor
+from torch_modal.keyframes.arrays import broadcast_leading, check_tensor
 from torch_modal.layers.base import Bases, InBetweenLayer, basis_buffers
 
 MOST_BELOW_ZERO = 0.25
@@ -98,13 +98,7 @@ class Blend(InBetweenLayer):
         """The leading dimensions of the result, of arguments that are checked."""
         check_tensor("weights", weights, "...", "K", device=self.bases[0].reference.device)
         self.check_shapes(weights.shape[-1], keyframes=keyframes)
-        try:
-            lead = broadcast_shapes(keyframes.shape[:-3], weights.shape[:-1])
-        except RuntimeError:
-            raise ValueError(
-                f"weights of shape {tuple(weights.shape)} do not broadcast against sets of key-frames of "
-                f"{tuple(keyframes.shape[:-3])}"
-            ) from None
+        lead = broadcast_leading(keyframes=keyframes.shape[:-3], weights=weights.shape[:-1])
         if not traced(weights):
             made_outside(_check_weights, weights)
         return lead

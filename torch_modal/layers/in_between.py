@@ -3,10 +3,11 @@
 import torch
 from torch import Tensor
 
-from torch_modal.autograd import broadcast_shapes, lasting, made_outside, traced, untraced
+from torch_modal.autograd import lasting, made_outside, traced, untraced
 from torch_modal.geometry.crossings import require_contact
 from torch_modal.inbetween.results import InBetweenResult, report, with_exact_keyframes
 from torch_modal.inbetween.settings import Objective, Preset, Solver, settings
+from torch_modal.keyframes.arrays import broadcast_leading
 from torch_modal.layers.base import Bases, InBetweenLayer, basis_buffers
 
 
@@ -93,13 +94,8 @@ class InBetween(InBetweenLayer):
         """The in-betweens, and how each minimisation went, without a warning. Arguments as for :meth:`forward`."""
         self.check_shapes(x_a=x_a, x_b=x_b)
         times = torch.as_tensor(t, dtype=self.dtype, device=x_a.device)
-        try:
-            lead = broadcast_shapes(x_a.shape[:-2], x_b.shape[:-2], times.shape)
-        except RuntimeError:
-            raise ValueError(
-                f"t of shape {tuple(times.shape)} does not broadcast against key-frames of {tuple(x_a.shape[:-2])} and "
-                f"{tuple(x_b.shape[:-2])}; for all times of all pairs pass x_a[:, None] and x_b[:, None]"
-            ) from None
+        hint = "for all times of all pairs pass x_a[:, None] and x_b[:, None]"
+        lead = broadcast_leading(hint, x_a=x_a.shape[:-2], x_b=x_b.shape[:-2], t=times.shape)
         if traced(times):
             times = torch.where((times >= 0) & (times <= 1), times, torch.nan)
         else:

@@ -12,13 +12,13 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from torch_modal.autograd import broadcast_shapes, full_precision, lasting, require_numbers, traced, untraced
+from torch_modal.autograd import full_precision, lasting, require_numbers, traced, untraced
 from torch_modal.elastic.backend import TorchBackend
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.local_rotations import Trajectory
 from torch_modal.geometry.rotations import exp
 from torch_modal.geometry.triangle_frames import Frames, bend, frames, sides
-from torch_modal.keyframes.arrays import check_tensor
+from torch_modal.keyframes.arrays import broadcast_leading, check_tensor
 from torch_modal.keyframes.check import checked_arrays
 from torch_modal.motion.cubics import evaluate_by_interval
 from torch_modal.motion.spline import Knots, Spline
@@ -155,7 +155,7 @@ class ModalDecoder(nn.Module):
             check_tensor("motions", motions, "...", 6)
         knots = self.knots if keyframes is None else self.spline.knots(keyframes[None])
         t = torch.as_tensor(t, dtype=self.times.dtype, device=amplitudes.device)
-        lead = broadcast_shapes(amplitudes.shape[:-1], t.shape)
+        lead = broadcast_leading(amplitudes=amplitudes.shape[:-1], t=t.shape)
         a = amplitudes.expand(*lead, -1).reshape(-1, self.n_modes)
         segment, u = self.locate(t.expand(lead).reshape(-1))
         size = max(1, CHUNK // self.keyframes.shape[1])

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from torch_modal.autograd import broadcast_shapes, full_precision, lasting, require_numbers, untraced
+from torch_modal.autograd import full_precision, lasting, require_numbers, untraced
 from torch_modal.contact.active import refuse_transforms
 from torch_modal.contact.in_between import push_apart
 from torch_modal.elastic.backend import choose
@@ -21,7 +21,7 @@ from torch_modal.inbetween.alignment import Pose
 from torch_modal.inbetween.comparison import SLACK_OF_PATHS, no_worse
 from torch_modal.inbetween.results import InBetweenResult, of_bodies, report, unminimised, with_exact_keyframes
 from torch_modal.inbetween.settings import Objective, Preset, Solver, settings
-from torch_modal.keyframes.arrays import as_faces
+from torch_modal.keyframes.arrays import as_faces, broadcast_leading
 from torch_modal.keyframes.check import checked_surface
 from torch_modal.layers.base import Bases, BasisBuffers, PreciseModule, basis_buffers
 from torch_modal.layers.blend import Blend
@@ -316,13 +316,8 @@ class Path(PreciseModule):
         rounding = torch.finfo(t.dtype).eps if isinstance(t, Tensor) and t.is_floating_point() else 0.0
         t = torch.as_tensor(t, dtype=self.times.dtype, device=keyframes.device)
         leading = keyframes.shape[:-3]
-        try:
-            lead = broadcast_shapes(leading, t.shape)
-        except RuntimeError:
-            raise ValueError(
-                f"t of shape {tuple(t.shape)} does not broadcast against motions of {tuple(leading)}; for all times "
-                "of all motions pass keyframes[:, None]"
-            ) from None
+        hint = "for all times of all motions pass keyframes[:, None]"
+        lead = broadcast_leading(hint, keyframes=leading, t=t.shape)
         flat = keyframes.to(self.dtype).reshape(-1, *keyframes.shape[-3:])
         which = torch.arange(len(flat), device=t.device).reshape(leading).expand(lead).reshape(-1)
         segment, u = locate_times(t.expand(lead).reshape(-1), self.times, self.cyclic, rounding)

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torch_modal.autograd import transformed
 from torch_modal.contact.active import Pull
-from torch_modal.keyframes.arrays import check_tensor, require_units
+from torch_modal.keyframes.arrays import broadcast_leading, check_tensor, require_units
 from torch_modal.statistics.local_weights import NOISE, LocalWeights, Observations
 from torch_modal.statistics.variation import Variation, bound_weights
 
@@ -130,16 +130,12 @@ def _check_points(points: Tensor, vertices: Tensor, weights: Tensor | None, n_ve
         )
     if not bool(((numbers >= 0) & (numbers < n_vertices)).all()):
         raise ValueError(f"vertices lie in 0 to {n_vertices - 1}; got {int(numbers.min())} to {int(numbers.max())}")
-    trust = torch.ones(len(numbers)) if weights is None else torch.as_tensor(weights).detach().cpu()
-    pairs = zip(reversed(trust.shape[:-1]), reversed(points.shape[:-2]), strict=False)
-    if trust.shape[-1:] != numbers.shape or not all(one == other or 1 in (one, other) for one, other in pairs):
-        raise ValueError(
-            f"weights are (..., n) of points (..., n, 3); got {tuple(trust.shape)} of {tuple(points.shape)}"
-        )
+    trust = torch.as_tensor(torch.ones(len(numbers)) if weights is None else weights).detach().cpu().double()
+    check_tensor("weights", trust, "...", len(numbers))
+    lead = (*broadcast_leading(points=points.shape[:-2], weights=trust.shape[:-1]), len(numbers))
     if not bool(((trust >= 0) & trust.isfinite()).all()):
         raise ValueError(f"weights are finite and none below zero; got {float(trust.min())} to {float(trust.max())}")
-    lead = torch.broadcast_shapes(trust.shape, points.shape[:-1])
-    every = Observations(points.expand(*lead, 3), numbers.long(), trust.double().expand(lead).clone())
+    every = Observations(points.expand(*lead, 3), numbers.long(), trust.expand(lead).clone())
     seen = every.weights > 0
     if not bool(every.points.detach()[seen.to(points.device)].isfinite().all()):
         raise ValueError("points hold numbers that are not finite; give those that were not observed a weight of zero")
