@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from torch_modal.data.space import ShapeSpace
+from torch_modal.keyframes.arrays import check_tensor
 
 
 class ShapeBatch(NamedTuple):
@@ -87,13 +88,10 @@ class ShapeBatch(NamedTuple):
 
 def check_shapes(shapes: Any, space: ShapeSpace | None) -> None:
     """Raise a ValueError unless given shapes are a batch of shapes of a space, or one of them."""
-    v: Any = "V" if space is None else space.n_vertices
-    shape, dtype = (tuple(shapes.shape), shapes.dtype) if isinstance(shapes, Tensor) else ((), type(shapes).__name__)
-    fits = len(shape) in (2, 3) and shape[-1] == 3 and (space is None or shape[-2] == v)
-    if not fits or dtype not in (torch.float32, torch.float64):
-        raise ValueError(
-            f"shapes must be float32 or float64 of the shape (B, {v}, 3) or ({v}, 3); got {shape} of {dtype}"
-        )
+    lead = () if isinstance(shapes, Tensor) and shapes.dim() == 2 else ("B",)
+    check_tensor("shapes", shapes, *lead, "V" if space is None else space.n_vertices, 3)
+    if shapes.dtype not in (torch.float32, torch.float64):
+        raise ValueError(f"shapes must be float32 or float64; got {shapes.dtype}")
 
 
 def check_labels(shape: Sequence[int], labels: Mapping[str, Tensor | None]) -> None:

@@ -295,17 +295,19 @@ class Path(PreciseModule):
                 rows = torch.full_like(even, motion, dtype=torch.int64)
                 pose, known, ends = pose_at(rows, even)
                 x = core.alignment.bring(self._spline_shapes(knots, flat, i, rows, even).shapes, pose)
-                pulls = torch.stack([1 - even, even], -1)
-                pulls = torch.ones_like(pulls[:, :1]) if known is None else pulls
-                rests = RestShapes(x[:, None] if known is None else known, pulls, layer.stiffness_of(even, even.shape))
+                if known is None:  # shapes on the spline are compared with themselves
+                    known, weights = x[:, None], torch.ones_like(even)[:, None]
+                else:
+                    weights = torch.stack([1 - even, even], -1)
+                rests = RestShapes(known, weights, layer.stiffness_of(even, even.shape))
                 last = len(self.pairs) - 1
                 goes_on = self.smooth and (self.cyclic or i > 0), self.smooth and (self.cyclic or i < last)
                 both = torch.stack([ends, flat[motion, pair]])
                 displacement = push_apart(core, x, even, rests, pose, both, goes_on)
-            mine = torch.nonzero(which == motion).flatten()
-            pose = pose_at(which[mine], u[mine])[0]
-            pushed, left[mine] = displacement.apply(core.alignment.bring(result.shapes[mine], pose), u[mine])
-            shapes = shapes.index_copy(0, mine, core.alignment.restore(pushed, pose))
+            chosen = torch.nonzero(which == motion).flatten()
+            pose = pose_at(which[chosen], u[chosen])[0]
+            pushed, left[chosen] = displacement.apply(core.alignment.bring(result.shapes[chosen], pose), u[chosen])
+            shapes = shapes.index_copy(0, chosen, core.alignment.restore(pushed, pose))
         return InBetweenResult(shapes, result.solution._replace(n_crossing=left))
 
     def _flatten(self, keyframes: Tensor, t: Tensor | float) -> tuple[Tensor, Tensor, Tensor, Tensor, torch.Size]:

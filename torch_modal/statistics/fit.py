@@ -12,7 +12,7 @@ from torch_modal.keyframes.arrays import broadcast_leading, check_tensor, requir
 from torch_modal.statistics.local_weights import NOISE, LocalWeights, Observations
 from torch_modal.statistics.variation import Variation, bound_weights
 
-# Stiffness of all pulls together, and of one at most, at a size of 100, for exact points. Like the precision of the
+# Stiffness of all springs together, and of one at most, at a size of 100, for exact points. Like the precision of the
 # points, it falls with the square of their standard deviation.
 STIFFNESS, LARGEST_STIFFNESS = 2000.0, 100.0
 
@@ -36,7 +36,7 @@ class Fitted(NamedTuple):
     """Final weight of each point: the given one, less for outliers. *Shape:* ``(n,)``."""
 
 
-def pull(to: Observations, stiffness: float, n_vertices: int) -> Pull:
+def point_springs(to: Observations, stiffness: float, n_vertices: int) -> Pull:
     """``stiffness sum_i weights_i |x_i - p_i|^2`` of one shape, but for a constant where points share a vertex."""
     weights = to.weights.new_zeros(n_vertices).index_add(0, to.vertices, stiffness * to.weights)
     weighted = stiffness * to.weights[:, None] * to.points
@@ -86,8 +86,8 @@ def _fit_one(variation: Variation, every: Observations, about: Tensor, robust: b
 
     The steps are constants of the graph. Where a given shape is nearer to the points, it is the result.
     """
-    seen = every.weights > 0
-    to = Observations(*(column[seen] for column in every))
+    observed = every.weights > 0
+    to = Observations(*(column[observed] for column in every))
     same = "the same vertices of the key-frames"
     require_units("the points", to.points.detach(), same, variation.shapes[:, to.vertices])
     local = LocalWeights(variation, to, about, noise)
@@ -98,12 +98,12 @@ def _fit_one(variation: Variation, every: Observations, about: Tensor, robust: b
     with torch.no_grad():
         stiffness = min(LARGEST_STIFFNESS, STIFFNESS / len(to.points)) * (NOISE * variation.size / local.noise) ** 2
         there = to._replace(points=variation.scale * pose.inverse().apply(to.points))
-        pulls = pull(there, stiffness, len(assembled))
+        springs = point_springs(there, stiffness, len(assembled))
         mixed = bound_weights(weights)
-        x = variation.relax(assembled, mixed, *FIRST_ROUND, pulls)
+        x = variation.relax(assembled, mixed, *FIRST_ROUND, springs)
         for _ in range(N_ROUNDS):
             mixed = variation.mixtures.weights(x)
-            x = variation.relax(x, mixed, *NEXT_ROUND, pulls)
+            x = variation.relax(x, mixed, *NEXT_ROUND, springs)
         step = x - assembled
         missed = [to.distances_after_fit(shape) for shape in variation.shapes]
         *errors, error = [float((to.weights * each.square()).sum()) for each in (*missed, to.distances(pose.apply(x)))]
@@ -115,7 +115,7 @@ def _fit_one(variation: Variation, every: Observations, about: Tensor, robust: b
     else:
         shape = pose.apply(assembled + step)
     misses, trust = every.distances(shape).detach(), torch.zeros_like(every.weights)
-    misses[seen], trust[seen] = to.distances(shape), to.weights
+    misses[observed], trust[observed] = to.distances(shape), to.weights
     return Fitted(shape, mixed, misses, trust)
 
 

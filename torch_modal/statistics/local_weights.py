@@ -192,9 +192,9 @@ class _FactorsOfPoints(torch.autograd.Function):
                 "the graph; take the gradient without create_graph"
             )
         factors, points = ctx.saved_tensors
-        turned = ctx.problem.newton(factors, ctx.to, grad)
+        adjoint = ctx.problem.newton(factors, ctx.to, grad)
         with torch.enable_grad():
             leaf, to_points = factors.detach().requires_grad_(), points.detach().requires_grad_()
             cost = 0.5 * ctx.problem.cost(leaf, ctx.to._replace(points=to_points), ctx.problem.noise)
             slope = torch.autograd.grad(cost, leaf, create_graph=True)[0]
-            return None, -torch.autograd.grad(slope, to_points, turned)[0], None, None
+            return None, -torch.autograd.grad(slope, to_points, adjoint)[0], None, None

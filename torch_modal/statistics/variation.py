@@ -30,7 +30,7 @@ N_PATCHES = 40
 # Radius of a patch over the largest distance of a vertex from the nearest centre.
 OVERLAP = 1.5
 
-# Stiffness, relative to the variance of its shapes, that pulls the weights of a patch to even ones.
+# Stiffness, relative to the variance of its shapes, that draws the weights of a patch to even ones.
 EVENNESS = 0.01
 
 # Largest sum of the weights below zero.
@@ -100,16 +100,16 @@ class Variation:
 
     @torch.no_grad()
     def relax(
-        self, x: Tensor, weights: Tensor, n_steps: int, n_products: int, pulls: FreeEnergy | None = None
+        self, x: Tensor, weights: Tensor, n_steps: int, n_products: int, springs: FreeEnergy | None = None
     ) -> Tensor:
         """Newton steps of all vertices towards weighted means of the lengths and angles of the given shapes.
 
-        The shape is in the pose of the mean; the pulls are an energy at a size of 100. *Shape:* ``(V, 3), (K, V)``.
+        The shape is in the pose of the mean; the springs are an energy at a size of 100. *Shape:* ``(V, 3), (K, V)``.
         """
         energy = self.fine.energy
         rest = trees.mapped(energy.mixed(self.rest, weights), lambda measure: measure[None])
         reference = energy.against(rest, self.stiffness)
-        further = [] if pulls is None else [pulls]
+        further = [] if springs is None else [springs]
         return self.fine.towards(self.scale * x[None], reference, n_steps, n_products, further)[0] / self.scale
 
     # ----------------------------------------------------------------------------------------------------- new members
@@ -179,7 +179,8 @@ class Patches:
 
     def __init__(self, mean: Tensor, reconstruction: Reconstruction) -> None:
         graph, used = _graph(mean, reconstruction), np.unique(reconstruction.faces.numpy())
-        centres, from_centres = farthest_apart(graph, used, N_PATCHES)
+        # A patch of one vertex would have no moments.
+        centres, from_centres = farthest_apart(graph, used, min(N_PATCHES, len(used) // 2))
         nearest, distances = from_centres.min(axis=0), torch.from_numpy(from_centres)
         reach = OVERLAP * nearest[np.isfinite(nearest)].max()
         bumps = torch.exp(-2 * (distances / max(reach, np.finfo(float).tiny)) ** 2)
@@ -227,9 +228,9 @@ class LocalMixtures:
         masses, n = self.patches.masses, self.moments.shape[1]
         products = torch.stack([(masses * row) @ self.columns for row in x.mT], 1).unflatten(2, (n, 3))
         cross = products.transpose(1, 2) - (masses @ x)[:, None, :, None] * self.centres[:, :, None, :]
-        turns = best_rotation(cross)  # (P, K, 3, 3)
-        gram = torch.einsum("pkab,pklbc,plac->pkl", turns, self.moments, turns)
-        right = (cross * turns).sum((-1, -2)) - gram.mean(-1)
+        rotations = best_rotation(cross)  # (P, K, 3, 3)
+        gram = torch.einsum("pkab,pklbc,plac->pkl", rotations, self.moments, rotations)
+        right = (cross * rotations).sum((-1, -2)) - gram.mean(-1)
         right, centred = right - right.mean(-1, keepdim=True), gram - gram.mean(-1, keepdim=True)
         centred = centred - centred.mean(-2, keepdim=True)
         spread, whole = (matrix.diagonal(dim1=-2, dim2=-1).mean(-1) for matrix in (centred, gram))
