@@ -18,6 +18,7 @@ from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from solids import as_it_is, box, eigenmodes, element_hessian, lumped_mass, surface
 from timing import limit_threads
 
+from torch_modal.elastic.backend import WarpBackend
 from torch_modal.elastic.energy import RestShapes
 from torch_modal.elastic.implicit import ConvergenceWarning
 from torch_modal.inbetween.settings import Objective, Solver
@@ -194,6 +195,14 @@ def wait_until(holds: Callable[[], bool], seconds: float = 100.0) -> None:
     while not holds():
         assert time.monotonic() < end, f"not within {seconds} s"
         time.sleep(0.05)
+
+
+@pytest.fixture(params=["warp", "torch"])
+def backend(request: pytest.FixtureRequest) -> str:
+    """Name of each backend, but for Warp where it does not work."""
+    if request.param == "warp" and not WarpBackend.works():
+        pytest.skip("no Warp")
+    return str(request.param)
 
 
 def random_rotation(generator: torch.Generator) -> torch.Tensor:

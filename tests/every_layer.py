@@ -63,12 +63,17 @@ class Random(torch.nn.Module):
 
     def __init__(self, kind: type[tm.ShapeAugmentation], shapes: Shapes) -> None:
         super().__init__()
-        self.own = kind(p=1.0, space=tm.ShapeSpace(shapes.bases, shapes.faces, times=None))
+        self.own = kind(p=1.0, space=space(shapes))
 
     def forward(self, x: Tensor) -> Tensor:
         with torch.random.fork_rng():
             torch.manual_seed(0)
             return self.own(x)
+
+
+def space(shapes: Shapes) -> tm.ShapeSpace:
+    """Of all key-frames, without tables."""
+    return tm.ShapeSpace(shapes.bases, shapes.faces, times=None)
 
 
 def in_between(shapes: Shapes, **options: Any) -> tm.InBetween:
@@ -181,3 +186,13 @@ TRANSFORMS: dict[str, Case] = {
 }
 
 CASES = {**LAYERS, **TRANSFORMS}
+
+FUNCTIONS: dict[str, Case] = {
+    "subdivide": Case(
+        lambda s: s, lambda s, x: tm.subdivide(x, s.faces, 1, bases=s.bases, preset="fast", progress=False)
+    ),
+    "linear_sequence": Case(lambda s: s, lambda _, x: tm.linear_sequence(x, tm.keyframe_places(3, 1))),
+    "fit": Case(space, lambda space, x: space.fit(x[1, ::5], torch.arange(0, x.shape[1], 5)).shape),
+    "components": Case(space, lambda space, x: space.components().coordinates(x)),
+    "self_contacts": Case(lambda s: s, lambda s, x: tm.self_contacts(x, s.faces).number),
+}

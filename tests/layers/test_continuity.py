@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import Shapes
-from shapes import apart
+from shapes import apart, diagonal
 from torch import Tensor
 
 import torch_modal as tm
@@ -38,14 +38,8 @@ def run_of_trex(data_dir: Path, frames: list[int], n_modes: int) -> Shapes:
 
 @pytest.fixture(scope="module")
 def trex(data_dir: Path) -> Shapes:
-    """Two frames whose steps of all vertices are shortened; one more frame."""
-    return run_of_trex(data_dir, [0, 8, 16], 15)
-
-
-@pytest.fixture(scope="module")
-def creature() -> Shapes:
-    sample = load_sample("creature")
-    return shapes_of(sample.keyframes[:3].double(), sample.faces, 15)
+    """Two frames whose steps of all vertices are shortened."""
+    return run_of_trex(data_dir, [0, 8], 15)
 
 
 def largest_jump(layer: tm.InBetween, x_a: Tensor, x_b: Tensor, n: int) -> float:
@@ -66,37 +60,38 @@ def largest_jump(layer: tm.InBetween, x_a: Tensor, x_b: Tensor, n: int) -> float
     return found
 
 
-@pytest.mark.parametrize("preset", ["accurate", "fast"])
-class TestOneFunction:
-    @torch.no_grad()
-    def test_of_time_across_known_jumps(self, hand: Shapes, preset: Any) -> None:
-        """The minimiser that is not anchored jumps by 5 % of the diagonal at 0.5679."""
-        layer = tm.InBetween(hand.bases, hand.faces, preset)
-        assert largest_jump(layer, *hand.keyframes, 61) < 1e-4
+every_preset = pytest.mark.parametrize("preset", ["accurate", "fast"])
 
-    @torch.no_grad()
-    def test_of_time_where_steps_are_shortened(self, trex: Shapes, preset: Any) -> None:
-        layer = tm.InBetween(trex.bases[:2], trex.faces, preset)
-        assert largest_jump(layer, *trex.keyframes[:2], 61) < 1e-4
 
-    @torch.no_grad()
-    def test_of_the_keyframes(self, hand: Shapes, preset: Any, generator: torch.Generator) -> None:
-        layer = tm.InBetween(hand.bases, hand.faces, preset)
-        size = (hand.keyframes[0].amax(0) - hand.keyframes[0].amin(0)).norm()
-        noise = 1e-10 * size * torch.randn(hand.keyframes.shape, dtype=DOUBLE, generator=generator)
-        for t in (0.3333, 0.5679, 0.9115):
-            assert apart(layer(*hand.keyframes, t), layer(*(hand.keyframes + noise), t)) < 1e-6
+@every_preset
+@pytest.mark.parametrize("name", ["hand", "trex"])
+@torch.no_grad()
+def test_shapes_do_not_jump_in_time(name: str, preset: Any, request: pytest.FixtureRequest) -> None:
+    """The minimiser that is not anchored jumps by 5 % of the diagonal at 0.5679 of the hand."""
+    shapes = request.getfixturevalue(name)
+    assert largest_jump(tm.InBetween(shapes.bases, shapes.faces, preset), *shapes.keyframes, 61) < 1e-4
 
-    @torch.no_grad()
-    def test_reversed(self, creature: Shapes, preset: Any) -> None:
-        x_a, x_b = creature.keyframes[:2]
-        forth = tm.InBetween(creature.bases[:2], creature.faces, preset)
-        back = tm.InBetween(creature.bases[:2][::-1], creature.faces, preset)
-        assert apart(forth(x_a, x_b, 0.37), back(x_b, x_a, 0.63)) < 1e-6
+
+@every_preset
+@torch.no_grad()
+def test_shapes_do_not_jump_with_the_key_frames(hand: Shapes, preset: Any, generator: torch.Generator) -> None:
+    layer = tm.InBetween(hand.bases, hand.faces, preset)
+    noise = 1e-10 * diagonal(hand.keyframes) * torch.randn(hand.keyframes.shape, dtype=DOUBLE, generator=generator)
+    for t in (0.3333, 0.5679, 0.9115):
+        assert apart(layer(*hand.keyframes, t), layer(*(hand.keyframes + noise), t)) < 1e-6
+
+
+@every_preset
+@torch.no_grad()
+def test_key_frames_exchanged_give_the_same_shapes_backwards(preset: Any) -> None:
+    sample, t = load_sample("creature"), torch.tensor([0.0, 0.37, 0.5], dtype=DOUBLE)
+    x_a, x_b, _ = (creature := shapes_of(sample.keyframes[:3].double(), sample.faces, 15)).keyframes
+    forth, back = (tm.InBetween(bases, creature.faces, preset) for bases in (creature.bases[:2], creature.bases[1::-1]))
+    assert apart(forth(x_a, x_b, t), back(x_b, x_a, 1 - t)) < 1e-6
 
 
 @torch.no_grad()
-def test_of_time_where_the_modal_solve_leaves_slivers(data_dir: Path) -> None:
+def test_shapes_do_not_jump_where_the_modal_solve_leaves_slivers(data_dir: Path) -> None:
     """Full bending stiffness there moves a vertex by 0.36 % of the diagonal within 1e-5."""
     shapes = run_of_trex(data_dir, [0, 12], 30)
     layer = tm.InBetween(shapes.bases, shapes.faces)

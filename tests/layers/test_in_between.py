@@ -12,7 +12,7 @@ import torch
 import trimesh
 from bodies import bend, twisted_plate
 from conftest import Shapes, modal
-from shapes import apart, diagonal
+from shapes import diagonal
 from torch import Tensor
 from torch.func import grad
 
@@ -416,14 +416,6 @@ def test_other_bases_in_functional_call_are_refused(bars: Shapes) -> None:
                 torch.func.functional_call(one, state, (x[0], x[1], 0.4))
 
 
-@pytest.mark.parametrize("preset", ["accurate", "fast"])
-def test_key_frames_exchanged(preset: Any, bars: Shapes) -> None:
-    """The same shapes, backwards in time."""
-    x, t = bars.keyframes, times(0.0, 0.3, 0.5)
-    one, other = (InBetween(bases, bars.faces, preset) for bases in (bars.bases[:2], bars.bases[1::-1]))
-    assert apart(one(x[0], x[1], t), other(x[1], x[0], 1 - t)) < 1e-9
-
-
 def test_modes_that_span_all_shapes() -> None:
     """Nothing is left of the difference then: its column was rounding, another on the fine mesh than on the coarse."""
     ball = trimesh.creation.icosahedron()
@@ -438,3 +430,45 @@ def test_modes_that_span_all_shapes() -> None:
             found.append(tm.InBetween(bases, faces, preset, objective=free)(first, second, 0.5))
     for one in found:
         torch.testing.assert_close(one, found[0], rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize("kind", ["side", "line", "point"])
+def test_gradients_at_a_triangle_without_area_have_a_bound(hands: Shapes, kind: str, backend: str) -> None:
+    layer = tm.InBetween([hands.bases[0], hands.bases[4]], hands.faces, solver=tm.Solver(backend=backend))
+    a, b, c = hands.faces[50]
+
+    def gradient(x: Tensor) -> Tensor:
+        x = x.clone().requires_grad_()
+        return torch.autograd.grad(layer(x[0], x[1], 0.4).square().sum(), x)[0]
+
+    x = hands.keyframes[[0, 4]]
+    truth = gradient(x)
+    x[1, a] = 0.5 * (x[1, b] + x[1, c]) if kind == "line" else x[1, b]
+    if kind == "point":
+        x[1, c] = x[1, b]
+    assert gradient(x).norm() < 1.2 * truth.norm()
+
+
+def test_a_key_frame_is_returned_beside_one_that_is_not_finite(small_bars: Shapes) -> None:
+    layer = tm.InBetween(small_bars.bases[:2], small_bars.faces)
+    x_a, x_b = small_bars.keyframes[:2]
+    leaf = x_a.clone().requires_grad_()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        for t in (0, torch.tensor(0.0, dtype=torch.float64)):
+            shape = layer(leaf, x_b * torch.nan, t)
+            assert torch.equal(shape, x_a)
+            (gradient,) = torch.autograd.grad(shape.sum(), leaf)
+            assert gradient.isfinite().all()
+        assert layer(leaf, x_b * torch.nan, 0.5).isnan().all()
+
+
+def test_other_units_than_those_of_the_bases_are_told_once(small_bars: Shapes, backend: str) -> None:
+    solver = tm.Solver(backend=backend)
+    layer = tm.InBetween(small_bars.bases[:2], small_bars.faces, solver=solver)
+    with pytest.warns(tm.MeshWarning, match=r"are 4 times as large as the shapes"):
+        layer.solve(*(4 * small_bars.keyframes[:2]), 0.5)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        layer.solve(*(4 * small_bars.keyframes[:2]), 0.5)
+        tm.InBetween(small_bars.bases[:2], small_bars.faces, solver=solver).solve(*(2 * small_bars.keyframes[:2]), 0.5)

@@ -1,4 +1,7 @@
-"""What must hold of every layer and random transform: one check for each promise, over one table."""
+"""What holds of every layer, random transform and function: one check for each promise, over one table.
+
+Layers are also compiled, exported, mapped over times, and given nothing. ``docs/promises.md`` names the tests.
+"""
 
 import copy
 import gc
@@ -9,20 +12,24 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cache
 from multiprocessing.connection import Connection
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from conftest import Shapes, random_rotation
-from every_layer import CASES, LAYERS
-from torch import Tensor
+from every_layer import CASES, FUNCTIONS, LAYERS, TRANSFORMS, Step, in_between
+from torch import Tensor, nn
+from torch._dynamo.testing import CompileCounterWithBackend
 from torch.func import functional_call, grad, jvp, vmap
 from torch.multiprocessing import get_context
 
 import torch_modal as tm
 
 DOUBLE = torch.float64
+TIMES = torch.tensor([0.5, 1.5, 1.0, 0.0], dtype=DOUBLE)
+THIRDS = torch.full((3,), 1 / 3, dtype=DOUBLE)
 CONTACT = {"InBetween, contact", "Path, contact"}
 OF_ONE_DTYPE = ("ModalDecoder", "Passengers", "GaussNewtonStep")
 """Layers that are cast to the dtype of what they are given."""
@@ -39,12 +46,17 @@ class Made:
     """A layer, made once for all checks that leave it as it is."""
 
     def __init__(self, name: str, shapes: Shapes) -> None:
-        self.case, self.shapes, self.x = CASES[name], shapes, shapes.keyframes
+        self.case, self.shapes, self.x = {**CASES, **FUNCTIONS}[name], shapes, shapes.keyframes
         self.layer = self.case.make(shapes)
         self.truth = self.call(self.x)
 
     def call(self, x: Tensor, layer: Any = None) -> Tensor:
         return self.case.call(self.layer if layer is None else layer, x)
+
+
+@pytest.fixture(scope="module")
+def bar_space(bars: Shapes) -> tm.ShapeSpace:
+    return tm.ShapeSpace(bars.bases, bars.faces)
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +66,7 @@ def known(small_bars: Shapes) -> Callable[[str], Made]:
 
 @pytest.fixture
 def made(name: str, known: Callable[[str], Made]) -> Made:
-    if name in CONTACT:
+    if name in {*CONTACT, "self_contacts"}:
         pytest.importorskip("ipctk")
         pytest.importorskip("igl")
     return known(name)
@@ -94,7 +106,7 @@ def tensors_of(value: Any, seen: set[int]) -> Iterator[Tensor]:
 # ------------------------------------------------------------------------------------------------------------ numbers
 
 
-@every_layer
+@pytest.mark.parametrize("name", [*CASES, *FUNCTIONS])
 def test_result_is_the_same_each_time_and_nothing_given_changes(name: str, made: Made) -> None:
     before, state = made.x.clone(), torch.get_rng_state()
     assert torch.equal(made.call(made.x), made.truth)
@@ -125,13 +137,28 @@ def test_autocast_computes_in_float32(name: str, made: Made) -> None:
         assert_near(slope, gradient(lambda x: made.call(x, layer), x.detach()), 1e-4)
 
 
+class Called(nn.Module):
+    """The call of a layer as a module, to export it."""
+
+    def __init__(self, made: Made) -> None:
+        super().__init__()
+        self.layer, self.run = made.layer, made.case.call
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.run(self.layer, x)
+
+
 @every_layer
-def test_meta_device(name: str, made: Made) -> None:
+def test_layers_that_need_numbers_say_so_by_name(name: str, made: Made) -> None:
+    """On the meta device and in exports; others run there."""
     layer, x = copy.deepcopy(made.layer), made.x.to("meta")
     if NEEDS_NUMBERS.match(name):
-        own = "InBetween" if name.startswith("MidShape") else name.split(",")[0]
-        with pytest.raises(RuntimeError, match=f"{own} takes steps that depend on"):
+        said = f"{'InBetween' if name.startswith('MidShape') else name.split(',')[0]} takes steps that depend on"
+        with pytest.raises(RuntimeError, match=said):
             made.call(x, layer.to("meta"))
+        if name != "ModalDecoder":  # its times decide, which an export keeps
+            with pytest.raises(RuntimeError, match=said):
+                torch.export.export(Called(made), (made.x,), strict=False)
     else:
         found = made.call(x, layer.to("meta"))
         assert found.is_meta and found.shape == made.truth.shape
@@ -281,6 +308,33 @@ def test_nothing_is_left_of_a_gradient(name: str, made: Made) -> None:
         gc.enable()
 
 
+# ------------------------------------------------------------------------------------------------- random transforms
+
+
+@pytest.mark.parametrize("name", TRANSFORMS)
+def test_one_generator_decides_everything(name: str, bars: Shapes, bar_space: tm.ShapeSpace) -> None:
+    def drawn(seed: int) -> Tensor:
+        transform = getattr(tm, name)(p=1.0, space=bar_space, generator=torch.Generator().manual_seed(seed))
+        return transform(bars.keyframes)  # type: ignore[no-any-return]
+
+    torch.manual_seed(1)
+    first = drawn(0)
+    torch.manual_seed(2)
+    assert torch.equal(drawn(0), first) and not torch.equal(drawn(1), first)
+    assert torch.equal(*(bar_space.sample(2, torch.Generator().manual_seed(3)) for _ in range(2)))
+
+
+@pytest.mark.parametrize("name", TRANSFORMS)
+def test_sequences_are_batches(name: str, bars: Shapes, bar_space: tm.ShapeSpace) -> None:
+    transform = getattr(tm, name)(p=1.0, space=bar_space, generator=torch.Generator().manual_seed(0))
+    frames = torch.lerp(bars.keyframes[0], bars.keyframes[1], torch.linspace(0, 1, 5)[:, None, None].double())
+    assert transform(frames).shape == frames.shape
+    labels = torch.arange(frames.shape[1]).expand(5, -1)
+    both = tm.AugmentationSequential(transform, data_keys=["shapes", "vertex_labels"], space=bar_space)
+    moved, kept = both(frames, labels)
+    assert moved.shape == frames.shape and torch.equal(kept, labels)
+
+
 # -------------------------------------------------------------------------------------------------- state and copies
 
 
@@ -387,3 +441,155 @@ def test_no_array_is_a_view_of_a_tensor(name: str, made: Made) -> None:
         while isinstance(base, np.ndarray) and base.base is not None:
             base = base.base
         assert not isinstance(base, Tensor), (array.dtype, array.shape)
+
+
+# ------------------------------------------------------------------------------------------------------------- the page
+
+
+def test_the_order_of_vertices_stays(bars: Shapes) -> None:
+    """Vertices and faces in any order, and vertices that no face names."""
+    generator = torch.Generator().manual_seed(0)
+    order, faces_order = (torch.randperm(n, generator=generator) for n in (bars.keyframes.shape[1], len(bars.faces)))
+    rank = torch.empty_like(order).scatter_(0, order, torch.arange(len(order)))
+    shuffled = torch.cat([bars.keyframes[:, order], torch.full((3, 2, 3), 7.0, dtype=torch.float64)], 1)
+    faces = rank[bars.faces][faces_order]
+    frames = tm.subdivide(shuffled, faces, 1, n_modes=6, preset="fast", progress=False)
+    assert torch.equal(frames[::2], shuffled)
+    plain = tm.subdivide(bars.keyframes, bars.faces, 1, n_modes=6, preset="fast", progress=False)
+    torch.testing.assert_close(frames[1, rank], plain[1], rtol=0, atol=0.02)
+
+
+def test_each_promise_is_kept_by_a_test() -> None:
+    """The page names the tests."""
+    root = Path(__file__).parents[2]
+    page = (root / "docs" / "promises.md").read_text()
+    named = re.findall(r"`(tests/\S+?::\w+)`", page)
+    assert len(named) >= 8
+    for name in named:
+        file, _, test = name.partition("::")
+        assert f"def {test}" in (root / file).read_text(), name
+
+
+# -------------------------------------------------------------------------------------------------------------- nothing
+
+
+@pytest.mark.parametrize(
+    ("name", "call"),
+    [
+        ("InBetween", lambda layer, x: layer(x[0], x[1], TIMES[:0])),
+        ("Blend", lambda layer, x: layer(x, THIRDS.expand(0, 3))),
+        ("Path", lambda layer, x: layer(x, TIMES[:0])),
+        ("Path, pairs", lambda layer, x: layer(x, TIMES[:0])),
+        ("Path, contact", lambda layer, x: layer(x, TIMES[:0])),
+        ("ModalDecoder", lambda layer, x: layer(torch.zeros(0, 3, dtype=DOUBLE), 0.5)),
+        ("ModalDecoder", lambda layer, x: layer(torch.zeros(3, dtype=DOUBLE), TIMES[:0])),
+        *((name, lambda layer, x: layer(x[:0])) for name in CASES if name.startswith("Random")),
+    ],
+)
+def test_no_times_and_no_shapes(name: str, call: Any, small_bars: Shapes) -> None:
+    found = call(CASES[name].make(small_bars), small_bars.keyframes)
+    assert found.shape[0] == 0 and found.shape[-1] == 3
+
+
+def test_no_points_and_nobody_in_a_pool(bars: Shapes, small_bars: Shapes) -> None:
+    x = small_bars.keyframes
+    assert tm.Passengers(x[0], small_bars.faces, x[0, :0])(x).shape == (3, 0, 3)
+    space, none = tm.ShapeSpace(bars.bases, bars.faces), bars.keyframes[:0]
+    for kind in (tm.RandomBlend, tm.RandomExtrapolation, tm.RandomInBetween, tm.RandomModalDeformation):
+        assert kind(p=1.0, space=space)(none, pool=tm.ShapeBatch.of_keyframes(space, none)).shape == none.shape
+    fitted = space.fit(bars.keyframes[:0, :40], torch.arange(40))
+    one = space.fit(bars.keyframes[0, :40], torch.arange(40))
+    assert [part.shape[1:] for part in fitted] == [part.shape for part in one]
+
+
+# -------------------------------------------------------------------------------------------- times, compile and export
+
+
+@pytest.mark.parametrize("name", ["Path", "Path, pairs", "ModalDecoder"])
+def test_mapped_times(name: str, small_bars: Shapes) -> None:
+    layer, x = CASES[name].make(small_bars), small_bars.keyframes
+    if name == "ModalDecoder":
+        x = torch.linspace(-1, 1, layer.n_modes, dtype=DOUBLE)
+
+    def slope(t: Tensor) -> Tensor:
+        return grad(lambda u: layer(x, u).square().sum())(t)
+
+    torch.testing.assert_close(vmap(lambda t: layer(x, t))(TIMES), layer(x, TIMES), rtol=0, atol=1e-12)
+    # At a key-frame itself, steps of all vertices start from rounding.
+    between = TIMES + torch.tensor([0, 0, 0.1, 0.1])
+    slopes = torch.stack([slope(t) for t in between])
+    torch.testing.assert_close(vmap(slope)(between), slopes, rtol=0, atol=1e-7)
+    both = torch.stack([x, 1.1 * x])
+    found = vmap(lambda y, t: layer(y, t))(both, TIMES[:2])
+    torch.testing.assert_close(found, layer(both, TIMES[:2]), rtol=0, atol=1e-12)
+    for call in (vmap(lambda t: layer(x, t)), grad(lambda t: layer(x, t[0]).sum())):
+        with pytest.raises(ValueError, match="t lies between the times"):
+            call(TIMES + 9)
+
+
+def test_steps_of_one_sample(small_bars: Shapes) -> None:
+    made, x = Step(small_bars), small_bars.keyframes
+    placement = made.step.energy.place(x[0], made.shell.against(x[1]))
+    with pytest.raises(ValueError, match=r"amplitudes have the shape \(B, n\).* got \(3,\): .*pass a\[None\]"):
+        made.step(torch.zeros(3, dtype=DOUBLE), placement)
+
+
+class Net(nn.Module):
+    """A small network that predicts the second key-frame and the time of a layer, and a loss of the in-between."""
+
+    def __init__(self, layer: nn.Module, x: Tensor) -> None:
+        super().__init__()
+        torch.manual_seed(0)
+        self.layer, self.body = layer, nn.Linear(x[0].numel(), x[0].numel() + 1, dtype=DOUBLE)
+
+    def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        out = torch.tanh(self.body(x[0].flatten()))
+        shape = self.layer(x[0], x[1] + 0.05 * out[:-1].view_as(x[1]), out[-1].sigmoid())
+        return shape, torch.relu(shape).square().sum()
+
+
+@pytest.mark.parametrize("backend", ["eager", pytest.param("inductor", marks=pytest.mark.slow)])
+def test_compiled_network_around_a_layer(backend: str, small_bars: Shapes) -> None:
+    """What surrounds the solve is compiled, in two graphs; the solve is not traced, which would take minutes."""
+    if backend == "inductor":
+        from torch._inductor import cpp_builder, exc
+
+        try:
+            cpp_builder.get_cpp_compiler()
+        except exc.InvalidCxxCompiler:
+            pytest.skip("there is no C++ compiler, which Inductor needs")
+    torch.compiler.reset()
+    net, x = Net(in_between(small_bars), small_bars.keyframes), small_bars.keyframes[:2].clone()
+    counter = CompileCounterWithBackend(backend)
+    compiled = torch.compile(net, backend=counter)
+    found = []
+    for call in (net, compiled):
+        shape, loss = call(x)
+        found.append([shape, *torch.autograd.grad(loss, list(net.body.parameters()))])
+    torch.testing.assert_close(found[1], found[0], rtol=1e-10, atol=1e-12)
+    assert counter.frame_count == 2
+    compiled(x * 1.01)
+    assert counter.frame_count == 2, "other numbers are compiled again"
+
+
+@pytest.mark.parametrize(
+    "name", ["Passengers", "ShellEnergy", "ShellLoss", pytest.param("GaussNewtonStep", marks=pytest.mark.slow)]
+)
+def test_export_of_what_reads_no_numbers(name: str, small_bars: Shapes) -> None:
+    layer, x = CASES[name].make(small_bars), small_bars.keyframes
+    n = 1 if name == "Passengers" else 2
+    batch = 2 if name == "GaussNewtonStep" else 3  # PyTorch bounds its batch by the layout of matrices
+    given = (x[:2].clone(), x[1:].clone())[:n]
+    sizes = ({0: torch.export.Dim("batch")},) * n if batch > 2 else None
+    program = torch.export.export(layer, given, dynamic_shapes=sizes, strict=False).module()
+    other = (1.01 * x[:batch], x.flip(0)[:batch])[:n]
+    torch.testing.assert_close(program(*other), layer(*other), rtol=0, atol=1e-12)
+
+
+@pytest.mark.slow
+def test_export_of_fixed_steps(small_bars: Shapes) -> None:
+    solver = tm.Solver(local_steps=0, gradient="unroll", max_steps=3)
+    layer, (x_a, x_b) = in_between(small_bars, solver=solver), small_bars.keyframes[:2]
+    exported = torch.export.export(layer, (x_a, x_b, TIMES[:1]), strict=False).module()
+    others = (1.01 * x_a, x_b + 0.1 * x_a, TIMES[:1] + 0.1)
+    torch.testing.assert_close(exported(*others), layer(*others), rtol=0, atol=1e-12)
