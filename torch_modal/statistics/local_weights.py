@@ -1,6 +1,7 @@
 """Local weights of a set's shapes, and the rigid motion, that bring them closest to a few observed points."""
 
 import math
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -11,7 +12,6 @@ from torch_modal.autograd import recorded
 from torch_modal.elastic.steps import conjugate_gradients
 from torch_modal.geometry.rigid import RigidMotion, best_fit, centroid, infinitesimal_motions
 from torch_modal.geometry.triangle_frames import edge_means
-from torch_modal.statistics.fitting import levenberg_marquardt
 from torch_modal.statistics.variation import Variation
 
 # Standard deviation, in sizes of the shape, of exact points from shapes of local weights, which have one of one: no
@@ -25,6 +25,9 @@ FEW_STEPS, MOST_STEPS, TOLERANCE, ROBUST_ROUNDS, LAST_STEPS, PRODUCTS = 5, 30, 1
 
 # Rows of the Jacobian that are computed together.
 CHUNK = 32
+
+# Larger dampings that are tried for one step.
+MOST_TRIALS = 8
 
 
 class Observations(NamedTuple):
@@ -198,3 +201,42 @@ class _FactorsOfPoints(torch.autograd.Function):
             cost = 0.5 * ctx.problem.cost(leaf, ctx.to._replace(points=to_points), ctx.problem.noise)
             slope = torch.autograd.grad(cost, leaf, create_graph=True)[0]
             return None, -torch.autograd.grad(slope, to_points, adjoint)[0], None, None
+
+
+def levenberg_marquardt(
+    x: Tensor,
+    cost: Callable[[Tensor], Tensor],
+    linearise: Callable[[Tensor], tuple[Tensor, Tensor]],
+    n_steps: int,
+    tolerance: float,
+) -> Tensor:
+    """Minimise a sum of squares by Gauss-Newton steps, damped where the cost does not fall.
+
+    Args:
+        x: Start. *Shape:* ``(n,)``.
+        cost: The sum of squares. *Shape:* ``(n,) -> ()``.
+        linearise: Gauss-Newton matrix and half the negative gradient. *Shape:* ``(n,) -> (n, n), (n,)``.
+        n_steps: Maximum number of steps.
+        tolerance: Relative decrease of the cost below which the iteration ends.
+
+    Returns:
+        *Shape:* ``(n,)``; its cost is at most the cost of the start.
+    """
+    value, damping = cost(x), 0.0
+    eye = torch.eye(len(x)).to(x)
+    for _ in range(n_steps):
+        matrix, downhill = linearise(x)
+        for _ in range(MOST_TRIALS):
+            tried = x + torch.linalg.solve_ex(matrix + damping * eye, downhill).result
+            lower = cost(tried)
+            if lower < value:
+                break
+            damping = max(10 * damping, 1.0)
+        else:
+            return x
+        damping = damping / 10 if damping > 1 else 0.0
+        has_converged = value - lower < tolerance * value
+        x, value = tried, lower
+        if has_converged:
+            return x
+    return x
