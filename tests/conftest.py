@@ -177,14 +177,15 @@ def listen_to_ctrl_c() -> None:
 
 
 def processes(mark: str) -> list[str]:
-    """Command lines of running processes that have a text in them, such as a folder they work in."""
+    """Command lines of running processes that have a text in them or in their working directory."""
     found = []
     for folder in Path("/proc").glob("[0-9]*"):
         try:
             command = (folder / "cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace")
+            place = os.readlink(folder / "cwd")
         except OSError:
             continue
-        if mark in command:
+        if mark in command or mark in place:
             found.append(command)
     return found
 

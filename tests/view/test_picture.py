@@ -269,13 +269,13 @@ def test_without_pyvista_matplotlib_draws_and_says_nothing(tmp_path, monkeypatch
     [
         ("import os, signal; os.kill(os.getpid(), signal.SIGSEGV)", "signal SIGSEGV"),
         ("raise ImportError('No module named pyvista')", "exit code 1.*No module named pyvista"),
-        ("import time; time.sleep(60)", "within 0.5 s"),
+        ("import time; time.sleep(60)", "no result after the timeout of 0.5 s"),
         ("pass", "left no images"),
         ("import numpy as np; np.save('images.npy', np.full((3, 2, 2, 3), 255, np.uint8))", "empty"),
     ],
 )
 def test_failures_of_the_child_fall_back_to_matplotlib(tmp_path, monkeypatch, code, reason):
-    monkeypatch.setattr(drawing, "_child_command", lambda: [sys.executable, "-c", code])
+    monkeypatch.setattr(drawing, "package_command", lambda _: [sys.executable, "-c", code])
     if "sleep" in code:
         monkeypatch.setattr(drawing, "CHILD_SECONDS", 0.5)
     rows, faces = {"a": growing(3)}, np.asarray(BALL.faces)

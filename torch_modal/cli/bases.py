@@ -86,7 +86,6 @@ def add_precompute(sub: argparse.ArgumentParser) -> None:
         "one, says when each is, and when the first comes again if it is a cycle (default: even times)"
     )
     add("--sequence", action="store_true", help=text)
-    add("--retry", action="store_true", help="try sets again that failed before")
     add_modes(sub)
     text = "replace stored sets that this command did not write (default: refuse those sets)"
     add_common(sub, text, "keep tetrahedra and modes in this cache as well (default: keep the bases only)")
@@ -100,14 +99,14 @@ def precompute(args: argparse.Namespace) -> int:
     A set is a folder that directly holds two or more meshes of one connectivity. The output
     mirrors the tree, with the key-frames and bases of each set as safetensors. Every set has a
     process and a time limit of its own: one that crashes, hangs or is refused is named at the
-    end, and the others go on. The same command again continues where it stopped, and
-    recomputes sets whose files or options changed.
+    end, and the others go on. The same command again continues where it stopped: it computes
+    the sets that have no bases, and those whose files or options changed.
 
     exit status: 0 all sets have their bases, 3 some have not, 1 an error, 130 interrupted
 
     Examples:
       torch-modal precompute shapes --out bases
-      torch-modal precompute shapes --out bases --workers 4 --timeout 120 --retry
+      torch-modal precompute shapes --out bases --workers 4 --timeout 120
       on machines that share their files, with a Dask cluster:
         torch-modal precompute shapes --out bases --scheduler tcp://HOST:8786
     """
@@ -120,7 +119,7 @@ def precompute(args: argparse.Namespace) -> int:
     from torch_modal.data.precompute_tree import precompute_tree
 
     cache_dir = args.cache_dir and os.path.abspath(os.path.expanduser(args.cache_dir))
-    same = picked(args, "method", "mesher", "timeout", "retry", "overwrite", "sequence")
+    same = picked(args, "method", "mesher", "timeout", "overwrite", "sequence")
     options, where = Options(n_modes=args.modes, cache_dir=cache_dir, **same), picked(args, "workers", "scheduler")
     bar = not args.quiet and sys.stderr.isatty()
     records = precompute_tree(args.root, args.out, options, **where, say=reporter(args), bar=bar)

@@ -11,7 +11,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from torch_modal.data.precompute_set import DONE, FAILED, Options, Record, run_set
+from torch_modal.data.precompute_set import DONE, Options, Record, run_set
 from torch_modal.data.tree import find_keyframe_sets
 from torch_modal.extras import require
 from torch_modal.modes.parallel import n_cpus
@@ -33,7 +33,7 @@ def precompute_tree(
     """Compute the bases of every key-frame set below a folder.
 
     Each set has a process and a time limit of its own (:func:`~torch_modal.data.precompute_set.run_set`): if one fails,
-    the others go on. Sets with a result are skipped, unless their files or the options changed.
+    the others go on. Sets with bases of the same files and options are skipped.
 
     Args:
         root: The folder tree. See :func:`~torch_modal.data.tree.find_keyframe_sets` for what a set is.
@@ -41,7 +41,7 @@ def precompute_tree(
         options: Options of the sets.
         workers: Sets at a time; by default one for each processor.
         scheduler: Address of the scheduler of a Dask cluster, such as ``tcp://HOST:8786``, on whose workers the sets
-            are computed in the place of this machine, one at a time in each of their threads.
+            are computed instead of on this machine, one at a time in each of their threads.
         say: Receives lines: one for each computed set, and the summary.
         bar: Whether to show a progress bar, and lines of failed sets only.
 
@@ -120,7 +120,7 @@ def _result(future: Future[tuple[Record, bool]]) -> tuple[Record, bool]:
     except CancelledError as error:
         raise ConnectionError("the cluster dropped a set, or is gone; start the same command again to go on") from error
     except Exception as error:  # the set killed several machines, or a machine lacks the package or the folders
-        return Record(FAILED, " ".join(f"{type(error).__name__}: {error}".split())), True
+        return Record(reason=" ".join(f"{type(error).__name__}: {error}".split())), True
 
 
 def _line(name: str, record: Record) -> str:

@@ -1,35 +1,64 @@
-"""Child processes that may crash or hang: running them, and how they ended."""
+"""Child processes that may crash or hang: running them, and errors that say how they ended."""
 
 import contextlib
 import os
 import signal
 import subprocess
+import sys
 import threading
 import time
 from collections.abc import Sequence
 from pathlib import Path
 
+from torch_modal.modes.parallel import StoppedError
+
 POLL = 0.5
+
+
+class ChildError(RuntimeError):
+    """A child process was killed after its timeout, or ended with an error; ``code`` is None or the exit status."""
+
+    def __init__(self, reason: str, code: int | None = None) -> None:
+        super().__init__(reason)
+        self.code = code
+
+
+def package_command(function: str) -> list[str]:
+    """Command of a new interpreter that calls a function of this package, named as ``module:function``."""
+    program = "import sys, pkgutil; sys.path[:0] = {sys.argv[1]} - {*sys.path}; pkgutil.resolve_name(sys.argv[2])()"
+    return [sys.executable, "-c", program, str(Path(__file__).resolve().parents[2]), function]
 
 
 def run_child(
     command: Sequence[str],
     folder: Path,
     timeout: float,
-    stop: threading.Event,
+    stop: threading.Event | None = None,
     job: bytes = b"",
     environment: dict[str, str] | None = None,
     grace: float = 0.0,
-) -> tuple[int | None, str]:
-    """Run a program in a folder, until it ends, its seconds are over, or ``stop`` is set.
+) -> None:
+    """Run a program in a folder until it ends.
 
-    It leads a session of its own, which is killed as a whole, so that Ctrl-C reaches this process alone; what it reads,
-    first the job, ends with this process. With a ``grace``, it is interrupted so many seconds before it is killed.
+    The program leads a session of its own, which is killed as a whole, so that Ctrl-C reaches this process alone. Its
+    standard input holds the job, and is closed when this process ends.
 
-    Returns:
-        Its exit status, None if it was killed; and its output.
+    Args:
+        command: The program and its arguments.
+        folder: The working directory, which also gets the output as ``log.txt``.
+        timeout: Seconds until the program is killed.
+        stop: Event that also ends the program.
+        job: Content of its standard input.
+        environment: Its environment variables; by default those of this process.
+        grace: Seconds between interrupting the program and killing it.
+
+    Raises:
+        ChildError: The program ended with an error, or after the timeout.
+        StoppedError: ``stop`` was set.
     """
-    end, code = time.monotonic() + timeout, None
+    if not command[0]:
+        raise ChildError("sys.executable is empty, so that no child process can be started; use a normal interpreter")
+    stop, end, code = stop or threading.Event(), time.monotonic() + timeout, None
     with (folder / "log.txt").open("wb") as log:  # a full pipe would block it
         process = subprocess.Popen(
             command,
@@ -59,10 +88,18 @@ def run_child(
                 os.killpg(process.pid, signal.SIGKILL) if hasattr(os, "killpg") else process.kill()
         with contextlib.suppress(OSError):
             process.communicate()  # closes the pipe
-    return code, (folder / "log.txt").read_text(errors="replace")
+    if code is None and stop.is_set():
+        raise StoppedError
+    if code is None:
+        raise ChildError(f"no result after the timeout of {timeout:g} s")
+    if code:
+        lines = (folder / "log.txt").read_text(errors="replace").split("\n")
+        last = next((line.strip() for line in reversed(lines) if line.strip()), "")  # of a traceback, the error
+        hint = "perhaps memory ran out" if code == -getattr(signal, "SIGKILL", 0) else last
+        raise ChildError(f"its process ended with {_describe_exit(code)}" + (f" ({hint})" if hint else ""), code)
 
 
-def describe_exit(code: int) -> str:
+def _describe_exit(code: int) -> str:
     """``exit code 1`` or ``signal SIGSEGV``."""
     if code >= 0:
         return f"exit code {code}"
@@ -70,8 +107,3 @@ def describe_exit(code: int) -> str:
         return f"signal {signal.Signals(-code).name}"
     except ValueError:
         return f"signal {-code}"
-
-
-def last_line(text: str) -> str:
-    """The last line that is not blank; of a traceback, the error."""
-    return next((line.strip() for line in reversed(text.splitlines()) if line.strip()), "")

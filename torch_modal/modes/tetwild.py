@@ -16,8 +16,7 @@ from scipy.spatial import cKDTree
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.geometry.connectivity import double_areas
 from torch_modal.modes.lattice import Lattice
-from torch_modal.modes.parallel import StoppedError
-from torch_modal.modes.processes import describe_exit, last_line, run_child
+from torch_modal.modes.processes import ChildError, run_child
 from torch_modal.modes.surface import CanonicalSurface, clearances, self_proximity
 from torch_modal.modes.tetrahedra import Tetrahedra, TetrahedralizationError, oriented, without_debris
 from torch_modal.progress import logger
@@ -147,31 +146,20 @@ class Auto:
 
 def _run_worker(points: FloatArray, faces: IntArray, settings: TetWild, stop: threading.Event) -> Tetrahedra:
     """Run the worker process on a surface with a bounding-box diagonal of 100 and read its result."""
-    if not sys.executable:
-        raise TetrahedralizationError(
-            "sys.executable is empty, so no worker process can be started. Run in a normal interpreter"
-        )
     with tempfile.TemporaryDirectory(prefix="torch_modal-", ignore_cleanup_errors=True) as folder:
         job, result = (Path(folder) / name for name in ("job.npz", "result.npz"))
         np.savez(job, vertices=points, faces=faces, **asdict(settings))
         # In the folder, as fTetWild leaves a __tracked_surface.stl where it runs.
         command = [sys.executable, str(WORKER), str(job), str(result)]
-        code, said = run_child(command, Path(folder), settings.timeout, stop)
-        if code is None and stop.is_set():
-            raise StoppedError
-        if code is None:
-            raise TetrahedralizationError(
-                f"no result after the timeout of {settings.timeout:g} s. "
-                "Give a longer timeout, a larger edge_length_fac, or a surface without self-intersections"
-            )
-        if code != 0:
-            over = f"its processor_time of {settings.processor_time:g} s is over"
-            tail = over if code == _TIME_IS_OVER else last_line(said)
-            raise TetrahedralizationError(
-                f"the worker process ended with {describe_exit(code)}{f' ({tail})' if tail else ''}. "
-                "Check the surface for self-intersections and degenerate faces, or try other settings",
-                lasting=code in _OWN_FAILURES,
-            )
+        try:
+            run_child(command, Path(folder), settings.timeout, stop)
+        except ChildError as error:
+            reason, advice = str(error), "a surface without self-intersections and degenerate faces, or other settings"
+            if error.code is None:
+                advice = "a longer timeout, a larger edge_length_fac, or a surface without self-intersections"
+            elif error.code == _TIME_IS_OVER:
+                reason = f"its processor_time of {settings.processor_time:g} s is over"
+            raise TetrahedralizationError(f"{reason}. Try {advice}", lasting=error.code in _OWN_FAILURES) from error
         try:
             with result.open("rb") as file, np.load(file) as arrays:  # np.load leaves damaged files open
                 return Tetrahedra(arrays["vertices"], arrays["tets"])

@@ -6,8 +6,6 @@ neither EGL nor OSMesa exists; then matplotlib draws.
 
 import importlib.util
 import logging
-import subprocess
-import sys
 import tempfile
 import warnings
 from pathlib import Path
@@ -18,13 +16,14 @@ from numpy.typing import NDArray
 
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.geometry.vectors import vertex_normals
-from torch_modal.modes.processes import describe_exit, last_line
+from torch_modal.modes.processes import package_command, run_child
 
 logger = logging.getLogger("torch_modal")
 
 ByteArray = NDArray[np.uint8]
 
 CHILD_SECONDS = 300.0
+DRAW_SCENE = "torch_modal.view.drawing:_draw_scene"  # runs in the child process
 SMOOTH_FACES = 30_000  # matplotlib draws at least so many
 LIGHTS = (((-2, 3, 4), 0.82), ((4, 1, 3), 0.30), ((0, -3, 2), 0.14))  # directions as the viewer sees them; brightness
 SURFACE = {"ambient": 0.25, "diffuse": 0.85, "specular": 0.08, "specular_power": 12}
@@ -124,12 +123,7 @@ def draw_points(points: FloatArray, color: tuple[float, ...], half_size: FloatAr
     return (255 * image.reshape(pixels[1], over, pixels[0], over, 3).mean(axis=(1, 3))).round().astype(np.uint8)
 
 
-def _child_command() -> list[str]:
-    program = "import sys; sys.path.insert(0, sys.argv[1]); from torch_modal.view import drawing; drawing._child_main()"
-    return [sys.executable, "-c", program, str(Path(__file__).parents[2])]
-
-
-def _child_main() -> None:
+def _draw_scene() -> None:
     """Draw the scene of the current folder, where the images go too."""
     with np.load("scene.npz") as stored:
         scene = Scene(**{name: stored[name] for name in Scene._fields})
@@ -140,14 +134,8 @@ def _draw_in_child(scene: Scene) -> ByteArray:
     """Images from pyvista in a process of its own; RuntimeError with the reason if that fails."""
     with tempfile.TemporaryDirectory(prefix="torch_modal-") as folder:
         np.savez(Path(folder, "scene.npz"), **scene._asdict())
-        try:
-            # The folder is the working directory so that a core file goes with it.
-            done = subprocess.run(_child_command(), cwd=folder, capture_output=True, timeout=CHILD_SECONDS, check=False)
-        except subprocess.TimeoutExpired:
-            raise RuntimeError(f"it did not finish within {CHILD_SECONDS:g} s") from None
-        if done.returncode != 0:
-            said = last_line(done.stderr.decode(errors="replace"))
-            raise RuntimeError(f"its process ended with {describe_exit(done.returncode)}{said and f': {said}'}")
+        # The folder is the working directory so that a core file goes with it.
+        run_child(package_command(DRAW_SCENE), Path(folder), CHILD_SECONDS)
         stored = Path(folder, "images.npy")
         if not stored.is_file():
             raise RuntimeError("it left no images")
