@@ -18,7 +18,6 @@ import torch_modal as tm
 from torch_modal.cli import demo
 from torch_modal.cli import main as cli
 from torch_modal.data.samples import load_sample
-from torch_modal.io.cache import Cache
 from torch_modal.io.frames import save_frames
 from torch_modal.modes import lattice as lattice_module
 from torch_modal.modes.extract import MESHERS
@@ -348,18 +347,6 @@ def test_demo_compares_with_the_truth_at_its_times() -> None:
     assert demo.errors(sample, sequence, levels=2).tolist() == 3 * [[0.0, 1.0]]
     torch.testing.assert_close(demo.errors(sample, 2 * sequence, levels=2), torch.tensor(3 * [[1.0, 8.0]]))
     assert demo.errors(sample, sequence[::2], levels=1).tolist() == [[0.0, 1.0]]
-
-
-def test_cache_is_measured_and_cleared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    stranger = tmp_path / "notes.txt"
-    stranger.write_text("mine")
-    Cache.at(tmp_path).get("tets", {}, {}, lambda: {"x": np.zeros(2**18)})
-    assert cli.main(["cache", "--cache-dir", str(tmp_path)]) == 0
-    assert f"1 entries, 2.0 MiB in {tmp_path}" in capsys.readouterr().out
-    assert cli.main(["cache", "--clear", "--cache-dir", str(tmp_path)]) == 0
-    assert "1 entries, 2.0 MiB removed" in capsys.readouterr().out
-    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
-    assert stranger.read_text() == "mine"
 
 
 def test_times_of_keyframes_are_respected(meshes: list[str], tmp_path: Path) -> None:

@@ -14,9 +14,9 @@ from safetensors.torch import load_file, save_file
 
 import torch_modal as tm
 from torch_modal.codec.sequence import STORED
-from torch_modal.data.in_betweens import FORMAT, VERSION, read_table
+from torch_modal.data.in_betweens import FORMAT, VERSION
 from torch_modal.data.stored import SET_FILE, StoredSet, write_set
-from torch_modal.io.tensors import write_tensors
+from torch_modal.io.tensors import read_tensors, write_tensors
 
 N_IN_NUMBERS = 60
 """Places among the numbers; beside all bytes of short headers."""
@@ -54,7 +54,12 @@ def made(kind: str, bars: Shapes, folder: Path) -> Case:
     if kind == "table":
         path, key = folder / "between-0-1.safetensors", {"key": "abc"}
         write_tensors(path, FORMAT, VERSION, {"shapes": bars.keyframes[:2].float().repeat(2, 1, 1)}, key)
-        return Case(path, lambda: [read_table(path, key)], refuses=False)
+
+        def load_table() -> list[Any]:
+            stored = read_tensors(path, FORMAT, VERSION, key)
+            return [None if stored is None else stored["shapes"]]
+
+        return Case(path, load_table, refuses=False)
     bases = [basis.truncate(2) for basis in bars.bases[:2]]
     write_set(folder / "set", bars.keyframes[:2], bars.faces, bases, ["a", "b"], times=[1.0, 2.0, 4.0], cyclic=True)
 

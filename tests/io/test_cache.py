@@ -19,11 +19,8 @@ from torch_modal.elastic.stretch import Stretch
 from torch_modal.io import cache as cache_module
 from torch_modal.io.cache import (
     Cache,
-    CacheContent,
     CacheWarning,
     ContentError,
-    cache_content,
-    clear_cache,
     content_digest,
     default_cache_dir,
     entry_name,
@@ -142,24 +139,6 @@ def test_default_folder(monkeypatch: pytest.MonkeyPatch) -> None:
     assert default_cache_dir() == Path.home() / ".cache" / "torch_modal"
 
 
-def test_content_and_clearing(tmp_path: Path) -> None:
-    assert cache_content(tmp_path / "none") == clear_cache(tmp_path / "none") == CacheContent(0, 0)
-    compute = Counted()
-    get(tmp_path, compute, k=1)
-    get(tmp_path, compute, k=2)
-    entries = list(tmp_path.iterdir())
-    remains = tmp_path / f".{entries[0].name}.123-abcd.tmp"
-    remains.write_bytes(b"half")
-    for name in ("mine.safetensors", "notes.txt"):
-        (tmp_path / name).write_text("mine")
-    wanted = CacheContent(3, 4 + sum(path.stat().st_size for path in entries))
-    assert cache_content(tmp_path) == wanted
-    assert clear_cache(tmp_path) == wanted
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["mine.safetensors", "notes.txt"]
-    assert_right(get(tmp_path, compute, k=1))
-    assert compute.calls == 3
-
-
 # ------------------------------------------------------------------------------------------- the limit of its size
 ENTRY = np.zeros(2**14)  # 128 KiB
 
@@ -175,6 +154,10 @@ def kept(cache: Cache, n: int) -> list[int]:
     return [i for i in range(n) if (cache.folder / entry_name("thing", {}, {"number": i})).exists()]
 
 
+def size_of(folder: Path) -> int:
+    return sum(path.stat().st_size for path in folder.iterdir())
+
+
 def test_the_least_recently_used_make_room(tmp_path: Path) -> None:
     cache = Cache(tmp_path, limit=10 * 2**17 + 10 * 2**10)  # ten of them, with their heads
     for i in range(10):
@@ -183,7 +166,7 @@ def test_the_least_recently_used_make_room(tmp_path: Path) -> None:
     keep(cache, 0)
     keep(cache, 10)
     assert kept(cache, 11) == [0, *range(3, 11)], "nine tenths of the limit, and the first was used last"
-    assert cache_content(tmp_path).n_bytes <= cache.limit
+    assert size_of(tmp_path) <= cache.limit
 
 
 def test_an_entry_above_the_limit_is_kept_alone_beside_files_of_others(tmp_path: Path) -> None:
@@ -225,7 +208,7 @@ def test_several_processes_share_the_limit(tmp_path: Path) -> None:
     ]
     for writer in writers:
         assert writer.wait(timeout=120) == 0, writer.communicate()[1].decode()
-    assert 0 < cache_content(tmp_path).n_bytes <= 5 * 2**17
+    assert 0 < size_of(tmp_path) <= 5 * 2**17
 
 
 @pytest.mark.parametrize(

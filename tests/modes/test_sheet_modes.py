@@ -15,7 +15,6 @@ from sheets import rectangle
 import torch_modal as tm
 from torch_modal.data.samples import load_sample
 from torch_modal.geometry.canonical import size
-from torch_modal.io.cache import cache_content
 from torch_modal.keyframes.check import MeshError, MeshWarning
 from torch_modal.modes import extract
 from torch_modal.modes.eigen import ModalAnalysisError
@@ -245,7 +244,7 @@ def test_where_no_shell_can_be_had(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_cache_knows_the_method(capsule: Mesh, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = str(tmp_path)
     shell = extract_modes(*capsule, 4, method="shell", cache_dir=folder)
-    assert cache_content(tmp_path).n_entries == 1
+    assert len(list(tmp_path.iterdir())) == 1
     solid = extract_modes(*capsule, 4, method="solid", cache_dir=folder)
     assert not torch.equal(shell.modes, solid.modes)
     monkeypatch.setattr(extract, "lowest_modes", None)

@@ -1,4 +1,4 @@
-"""Commands on modes: ``modes``, ``precompute`` and ``cache`` of ``torch-modal``."""
+"""Commands on modes: ``modes`` and ``precompute`` of ``torch-modal``."""
 
 import argparse
 import os
@@ -6,7 +6,6 @@ import sys
 from pathlib import Path
 
 from torch_modal.cli.arguments import (
-    CACHE_DIR,
     add_common,
     add_modes,
     check_output,
@@ -124,29 +123,3 @@ def precompute(args: argparse.Namespace) -> int:
     bar = not args.quiet and sys.stderr.isatty()
     records = precompute_tree(args.root, args.out, options, **where, say=reporter(args), bar=bar)
     return 0 if all(record.status == DONE for record in records.values()) else INCOMPLETE
-
-
-def add_cache(sub: argparse.ArgumentParser) -> None:
-    """Arguments of ``cache``."""
-    sub.add_argument("--clear", action="store_true", help="remove what is in it; other files in the folder stay")
-    sub.add_argument("--cache-dir", metavar="DIR", help=CACHE_DIR)
-
-
-def cache(args: argparse.Namespace) -> None:
-    """Size of the cache of tetrahedra and modes.
-
-    Say how large the cache is, where tetrahedra and modes are kept between runs.
-
-    It never takes more than 4 GiB, or what the environment variable TORCH_MODAL_CACHE_LIMIT
-    says (500M, 10G): what was not used for the longest makes room for what is new.
-
-    Examples:
-      torch-modal cache --clear
-    """
-    from torch_modal.io import cache as cached
-
-    folder = args.cache_dir or cached.default_cache_dir()
-    n_entries, n_bytes = cached.clear_cache(folder) if args.clear else cached.cache_content(folder)
-    size = f"{n_entries} entries, {n_bytes / 2**20:.1f} MiB"
-    limit = f"{cached.size_limit() / 2**20:g} MiB"
-    print(f"{size} removed from {folder}" if args.clear else f"{size} in {folder} (limit: {limit})")

@@ -41,7 +41,6 @@ COMMANDS: dict[str, tuple[Callable[[Any], None], Callable[[Any], int | None]]] =
     "precompute": (bases.add_precompute, bases.precompute),
     "view": (view.add_arguments, view.run),
     "demo": (demo.add_arguments, demo.run),
-    "cache": (bases.add_cache, bases.cache),
 }
 """Of each command: a function that declares its arguments, and one that runs it (None or an exit status), whose
 docstring is its help: summary, description and examples with empty lines between them."""

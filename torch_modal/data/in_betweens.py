@@ -18,7 +18,7 @@ from torch_modal.elastic.minimise import Status
 from torch_modal.inbetween.results import InBetweenResult
 from torch_modal.inbetween.settings import Settings
 from torch_modal.io.cache import CacheWarning, ContentError, code_digest, content_digest
-from torch_modal.io.tensors import TensorFile, write_tensors
+from torch_modal.io.tensors import read_tensors, write_tensors
 from torch_modal.layers.in_between import InBetween
 from torch_modal.modes.basis import ModalBasis
 from torch_modal.motion.path import Path as MotionPath
@@ -87,7 +87,7 @@ class InBetweens:
             if of_keyframes:
                 return self.of_keyframes(first, second, t[rows])
             layer = self._layer(first, second, x_a)
-            return _checked(layer.solve(starts[rows], ends[rows], t[rows]), first, second)
+            return _check_converged(layer.solve(starts[rows], ends[rows], t[rows]), first, second)
 
         return by_kind(torch.stack([torch.minimum(i, j), torch.maximum(i, j), keyframes.long()], 1), solve)
 
@@ -99,7 +99,7 @@ class InBetweens:
         if i > j:
             return self.of_keyframes(j, i, 1 - t)  # one table serves both ways
         if self.times is None:
-            return _checked(self._solved(i, j, t), i, j)
+            return _check_converged(self._solve(i, j, t), i, j)
         return interpolate(self.table(i, j), t.to("cpu", self.dtype)).to(t)
 
     def table(self, i: int, j: int) -> Tensor:
@@ -115,16 +115,16 @@ class InBetweens:
         times = self.times
         if times is None:
             raise ValueError("a space of times=None solves each in-between: it has no tables")
-        return self._tables.get((i, j), lambda: self._stored_or_solved(i, j, times))
+        return self._tables.get((i, j), lambda: self._read_or_solve(i, j, times))
 
-    def _stored_or_solved(self, i: int, j: int, times: int) -> Tensor:
-        def solved() -> tuple[Tensor, bool]:
+    def _read_or_solve(self, i: int, j: int, times: int) -> Tensor:
+        def compute() -> tuple[Tensor, bool]:
             with torch.no_grad():
-                result = self._solved(i, j, torch.linspace(0, 1, times, dtype=torch.float64))
-            return _checked(result, i, j).to(self.dtype), bool(result.solution.usable.all())
+                result = self._solve(i, j, torch.linspace(0, 1, times, dtype=torch.float64))
+            return _check_converged(result, i, j).to(self.dtype), bool(result.solution.usable.all())
 
         key = None if self.folder is None else self._key(i, j)
-        return stored_or_made((self.folder or Path()) / f"between-{i}-{j}.safetensors", key, solved)
+        return read_or_compute(self.folder, f"between-{i}-{j}", key, compute)
 
     def _layer(self, i: int, j: int, like: Tensor) -> InBetween:
         def made() -> InBetween:
@@ -133,7 +133,7 @@ class InBetweens:
 
         return self._solvers.get((i, j, like.dtype, like.device), made)
 
-    def _solved(self, i: int, j: int, t: Tensor) -> InBetweenResult:
+    def _solve(self, i: int, j: int, t: Tensor) -> InBetweenResult:
         """Solve between two key-frames: along the motion if they follow each other in it, else of the pair."""
         motion, span = self.motion, None if self.motion is None else self.motion.span(i, j)
         bases = [self.bases[i], self.bases[j]] if span is None else self.bases
@@ -204,27 +204,26 @@ def interpolate(table: Tensor, t: Tensor) -> Tensor:
     return sum(weight[:, None, None] * table[start + i] for i, weight in enumerate(weights))  # type: ignore[return-value]
 
 
-def stored_or_made(path: Path, key: dict[str, str] | None, make: Callable[[], tuple[Tensor, bool]]) -> Tensor:
-    """A table from its file; or a new one, which is written if there is a key and it is worth keeping."""
-    if key is not None and (stored := read_table(path, key)) is not None:
-        return stored
-    table, kept = make()
-    if key is not None and kept:
+def read_or_compute(
+    folder: Path | None, name: str, key: dict[str, str] | None, compute: Callable[[], tuple[Tensor, bool]]
+) -> Tensor:
+    """A table from its file in a folder; or a new one, which is written there if it is worth keeping.
+
+    Without a folder or a key, tables are neither read nor written.
+    """
+    if folder is None or key is None:
+        return compute()[0]
+    path = folder / f"{name}.safetensors"
+    if (stored := read_tensors(path, FORMAT, VERSION, key)) is not None:
+        return stored["shapes"]
+    table, keep = compute()
+    if keep:
         with contextlib.suppress(OSError):  # the folder may not be writable
             write_tensors(path, FORMAT, VERSION, {"shapes": table}, key)
     return table
 
 
-def read_table(path: Path, key: dict[str, str]) -> Tensor | None:
-    """A memory-mapped table; None if it is missing, damaged, or of another key."""
-    with contextlib.suppress(OSError, ValueError):
-        file = TensorFile(path, FORMAT, VERSION, ("shapes",))
-        if file.metadata == {"format": FORMAT, "version": VERSION, **key}:
-            return file.tensor("shapes")
-    return None
-
-
-def _checked(result: InBetweenResult, i: int, j: int) -> Tensor:
+def _check_converged(result: InBetweenResult, i: int, j: int) -> Tensor:
     """The in-betweens; raises for invalid shapes and warns of unconverged ones."""
     if not bool(result.shapes.isfinite().all()):
         raise ValueError(

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torch_modal.autograd import Recent, lasting
-from torch_modal.data.in_betweens import InBetweens, stored_or_made, versions
+from torch_modal.data.in_betweens import InBetweens, read_or_compute, versions
 from torch_modal.data.stored import Motion, StoredSet
 from torch_modal.data.strain import mode_scales
 from torch_modal.geometry.canonical import size
@@ -230,17 +230,15 @@ class ShapeSpace:
 
         Arguments and shape as for :meth:`sample`, in the dtype of the tables.
         """
-        folder, settings = self.in_betweens.folder, (n, concentration, locality)
+        settings = (n, concentration, locality)
 
-        def drawn() -> tuple[Tensor, bool]:
+        def draw() -> tuple[Tensor, bool]:
             generator = torch.Generator().manual_seed(0)
             return self.sample(n, generator, concentration=concentration, locality=locality), True
 
         def table() -> Tensor:
-            if folder is None:
-                return drawn()[0]
             content = content_digest([*versions(), self._keyframes, self.faces, str(self.dtype), *settings])
-            return stored_or_made(folder / "between-all.safetensors", {"content": content}, drawn)
+            return read_or_compute(self.in_betweens.folder, "between-all", {"content": content}, draw)
 
         return self._made.get(settings, table)
 

@@ -13,25 +13,25 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torch_modal.io.tensors import TensorFile, bytes_of, write_tensors
+from torch_modal.io.tensors import bytes_of, read_tensors, write_tensors
 from torch_modal.version import __version__
 
 CACHE_VERSION = 6  # part of every key: raise it when the algorithm of cached results changes
 CACHE_VARIABLE = "TORCH_MODAL_CACHE"
 LIMIT_VARIABLE = "TORCH_MODAL_CACHE_LIMIT"
 DEFAULT_LIMIT = 4 * 2**30
-KEPT_PART = 0.9  # of the limit is left after entries were removed, so that not each new entry removes others
+KEPT_FRACTION = 0.9  # of the limit: what is left after entries were removed, so that not each new entry removes others
 ABANDONED = 3600.0  # seconds after which a partial file belongs to no running process
 FORMAT = "torch_modal.cache"
 SUFFIX = ".safetensors"
-_OWN_NAME = re.compile(r"[a-z]+-[0-9a-f]{64}\.safetensors|\.[a-z]+-[0-9a-f]{64}\.safetensors\..+\.tmp")
+_ENTRY_NAME = re.compile(r"[a-z]+-[0-9a-f]{64}\.safetensors|\.[a-z]+-[0-9a-f]{64}\.safetensors\..+\.tmp")
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -95,14 +95,10 @@ class Cache:
         if self.folder is None:
             return dict(compute())
         path = self.folder / entry_name(kind, inputs, parameters)
-        with contextlib.suppress(OSError, ValueError):  # missing or damaged
-            file = TensorFile(path, FORMAT, str(CACHE_VERSION))
-            if file.metadata.get("entry") != path.name:
-                raise ValueError(f"{path} holds another's content")
-            found = {name: tensor.numpy() for name, tensor in file.tensors().items()}
+        if (stored := read_tensors(path, FORMAT, str(CACHE_VERSION), {"entry": path.name})) is not None:
             with contextlib.suppress(OSError):  # removed meanwhile, or not writable
                 os.utime(path)  # the time of the last use
-            return found
+            return {name: tensor.numpy().copy() for name, tensor in stored.items()}  # entries may be removed
         result = compute()
         tensors = {name: torch.from_numpy(np.array(array)) for name, array in result.items()}
         try:
@@ -119,16 +115,23 @@ class Cache:
         return dict(result)
 
     def _make_room(self, newest: Path) -> None:
-        """Remove entries that were not used for the longest, if all take too much; the newest stays in any case."""
-        entries = _entries(newest.parent)
+        """Remove the entries that were not used for the longest time, if all take too much; the newest one stays.
+
+        Entries and partial files are known by their names: the user's own files in the folder stay.
+        """
+        entries = []
+        for path in newest.parent.iterdir():
+            if _ENTRY_NAME.fullmatch(path.name):
+                with contextlib.suppress(FileNotFoundError):  # another process removed it
+                    entries.append((path, path.stat()))
         total = sum(stat.st_size for _, stat in entries)
         if total <= self.limit:
             return
-        for path, stat in entries:
+        for path, stat in sorted(entries, key=lambda entry: entry[1].st_mtime_ns):
             being_written = path.suffix != SUFFIX and time.time() - stat.st_mtime < ABANDONED
             if path == newest or being_written:
                 continue
-            if total <= KEPT_PART * self.limit:
+            if total <= KEPT_FRACTION * self.limit:
                 break
             total -= stat.st_size
             with contextlib.suppress(OSError):  # another process removed it, or has it open
@@ -139,40 +142,6 @@ def entry_name(kind: str, inputs: Mapping[str, NDArray[Any]], parameters: Mappin
     """Name of the file of a result, from all that it depends on and the version of the cache."""
     key = content_digest([CACHE_VERSION, kind, sorted(inputs.items()), sorted(parameters.items())])
     return f"{kind}-{key}{SUFFIX}"
-
-
-class CacheContent(NamedTuple):
-    """Size of a cache folder."""
-
-    n_entries: int
-    n_bytes: int
-
-
-def cache_content(cache_dir: str | os.PathLike[str] | None = None) -> CacheContent:
-    """Number of entries in a cache folder, by default :func:`default_cache_dir`, and their size."""
-    entries = _entries(cache_dir)
-    return CacheContent(len(entries), sum(stat.st_size for _, stat in entries))
-
-
-def clear_cache(cache_dir: str | os.PathLike[str] | None = None) -> CacheContent:
-    """Remove the entries of a cache folder, and partial files of killed processes, not others; what was removed."""
-    sizes = []
-    for path, stat in _entries(cache_dir):
-        with contextlib.suppress(FileNotFoundError):
-            path.unlink()
-            sizes.append(stat.st_size)
-    return CacheContent(len(sizes), sum(sizes))
-
-
-def _entries(cache_dir: str | os.PathLike[str] | None) -> list[tuple[Path, os.stat_result]]:
-    """Entries and partial ones, known by their names; a user's own files may lie beside them. The oldest come first."""
-    folder = default_cache_dir() if cache_dir is None else Path(cache_dir).expanduser()
-    found = []
-    for path in folder.iterdir() if folder.is_dir() else ():
-        if _OWN_NAME.fullmatch(path.name):
-            with contextlib.suppress(FileNotFoundError):  # another process may be clearing
-                found.append((path, path.stat()))
-    return sorted(found, key=lambda entry: entry[1].st_mtime_ns)
 
 
 # ----------------------------------------------------------------------------------------------------------- digests

@@ -5,10 +5,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import torch
 from scipy.spatial.transform import Rotation
 
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.errors import MeshError
+from torch_modal.geometry.skin import blended
 from torch_modal.io.asset import Asset, Material, Part, as_png_or_jpeg
 from torch_modal.io.gltf import ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER, WHITE, Document, Json, world_transforms
 from torch_modal.io.normals import carry_together
@@ -129,9 +131,11 @@ class GltfAsset(Asset):
             inverse = document.floats(skin["inverseBindMatrices"]).reshape(-1, 1, 4, 4).swapaxes(2, 3)
             bones = (local[0] @ local[1:] @ inverse)[:, :, :3].swapaxes(0, 1)
             joints, weights = document.accessor(read["JOINTS_0"]), document.floats(read["WEIGHTS_0"])
-            points = np.pad(document.floats(read["POSITION"]), ((0, 0), (0, 1)), constant_values=1)
-            for shape, moved in zip(frames[:, primitive.points], bones, strict=True):
-                shape[:] = np.einsum("pk,pkab,pb->pa", weights, moved[joints], points, optimize=True)
+            points = document.floats(read["POSITION"])
+            by_bone = np.zeros((len(points), half - 1))
+            np.add.at(by_bone, (np.arange(len(points))[:, None], joints), weights)
+            arrays = (by_bone, bones, np.repeat(points[None], len(bones), axis=0))
+            frames[:, primitive.points] = blended(*map(torch.from_numpy, arrays)).numpy()
         return frames
 
     # ------------------------------------------------------------------------------------------------ the file again

@@ -6,6 +6,7 @@ has a row of SHA-256 for the header and for each other tensor, in the order of t
 others, so that opening a large file does not read its numbers; each tensor is compared with its row when it is read.
 """
 
+import contextlib
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
@@ -90,6 +91,15 @@ class TensorFile:
     def tensors(self) -> dict[str, Tensor]:
         """Copies of all tensors, which do not depend on the file any more."""
         return {name: self.tensor(name).clone() for name in self.shapes}
+
+
+def read_tensors(path: Path, format: str, version: str, metadata: Mapping[str, Any]) -> dict[str, Tensor] | None:
+    """Memory-mapped tensors of a file; None if it is missing or damaged, or has other metadata."""
+    with contextlib.suppress(OSError, ValueError):
+        file = TensorFile(path, format, version)
+        if file.metadata == {"format": format, "version": version, **metadata}:
+            return {name: file.tensor(name) for name in file.shapes}
+    return None
 
 
 def _digest(name: str, tensor: Tensor) -> bytes:
