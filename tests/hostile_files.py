@@ -243,7 +243,7 @@ def read_and_write(path: Path, out: Path) -> str:
         tm.save_mesh(asset.positions, asset.faces, out / "c.glb", asset=asset)
         if path.suffix == ".ply":
             still = np.tile(np.eye(3), (len(asset.positions), 1, 1))
-            PointFile(path).moved(asset.positions, still, still)
+            PointFile(path).move(asset.positions, still, still)
     except (ValueError, FileNotFoundError) as error:
         if path.suffix == ".ply":
             with contextlib.suppress(ValueError):

@@ -14,7 +14,7 @@ import pytest
 
 import torch_modal as tm
 from torch_modal.cli import main as cli
-from torch_modal.io.files import temporary_beside, write_file
+from torch_modal.io.files import atomic_write, write_file
 from torch_modal.io.formats import ANIMATION_FORMATS, Animation, OutputFormat
 from torch_modal.progress import ProgressReport
 
@@ -57,7 +57,7 @@ def test_verbose_says_what_is_written(
 # ------------------------------------------------------------------------------------------------------ errors of files
 def test_write_errors_name_the_users_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     wanted = tmp_path / "missing" / "a.glb"
-    with pytest.raises(FileNotFoundError) as caught, temporary_beside(wanted):
+    with pytest.raises(FileNotFoundError) as caught, atomic_write(wanted):
         pass
     assert caught.value.filename == str(wanted) and ".tmp" not in str(caught.value)
 
@@ -68,7 +68,7 @@ def test_write_errors_name_the_users_path(tmp_path: Path, monkeypatch: pytest.Mo
     with pytest.raises(OSError, match=r"No space left on device: '[^']*/b\.glb'") as caught_again:
         write_file(tmp_path / "b.glb", b"x")
     assert caught_again.value.errno == errno.ENOSPC and list(tmp_path.iterdir()) == []
-    with pytest.raises(PermissionError) as other, temporary_beside(tmp_path / "c.glb"):
+    with pytest.raises(PermissionError) as other, atomic_write(tmp_path / "c.glb"):
         raise PermissionError(errno.EACCES, "of another file", "/elsewhere")
     assert other.value.filename == "/elsewhere"
 

@@ -15,7 +15,7 @@ import torch_modal as tm
 from torch_modal.cli import main as cli
 from torch_modal.data import precompute_set
 from torch_modal.data.precompute_set import Options, Record, read_record
-from torch_modal.data.precompute_tree import printable
+from torch_modal.data.precompute_tree import escape_name
 from torch_modal.data.stored import LABELS_FILE, SET_FILE, StoredSet, find_sets, write_set
 from torch_modal.io.frames import save_frames
 
@@ -154,7 +154,7 @@ def test_names_that_are_no_text(bench: Bench) -> None:
     assert bench.run() == 3
     assert bench.record("a").status == "done" and read_record(bench.out / name) is None
     assert bench.run() == 3 and "refuse" in bench.computed()[-1]
-    assert [printable(name) for name in ("a/ü", "a\nb", "\udcff")] == ["a/ü", "'a\\nb'", "\\udcff"]
+    assert [escape_name(name) for name in ("a/ü", "a\nb", "\udcff")] == ["a/ü", "'a\\nb'", "\\udcff"]
 
 
 def test_processes_have_one_thread_and_as_many_run_as_asked(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,7 +12,7 @@ from conftest import Shapes, random_rotation
 from scipy import sparse
 
 from torch_modal.autograd import linear_map
-from torch_modal.data.random_transforms import mirror
+from torch_modal.data.random_transforms import extrapolate
 from torch_modal.geometry import sparse as sparse_systems
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.poisson import Poisson, Reconstruction
@@ -271,7 +271,7 @@ def test_mirror_continues_a_bend(generator: torch.Generator) -> None:
         )
 
     solver = Reconstruction(x, faces)
-    found = mirror(x[None], bent(0.8)[None], solver)[0]
+    found = extrapolate(x[None], bent(0.8)[None], solver)[0]
     truth = bent(-0.8)
     error = best_fit(found, truth, solver.areas).apply(found) - truth
     linear = 2 * x - bent(0.8)
@@ -282,7 +282,7 @@ def test_mirror_continues_a_bend(generator: torch.Generator) -> None:
     rotation, move = random_rotation(generator), torch.tensor([1.0, 2.0, 3.0], dtype=F64)
     centre = (solver.areas[:, None] * x).sum(0) / solver.areas.sum()
     moved = (x - centre) @ rotation.T + centre + move
-    torch.testing.assert_close(mirror(x[None], moved[None], solver)[0], (x - centre) @ rotation + centre - move)
+    torch.testing.assert_close(extrapolate(x[None], moved[None], solver)[0], (x - centre) @ rotation + centre - move)
 
 
 def test_mirror_is_the_linear_one_for_small_steps(bars: Shapes) -> None:
@@ -291,7 +291,7 @@ def test_mirror_is_the_linear_one_for_small_steps(bars: Shapes) -> None:
     field = torch.sin(x)
     errors = []
     for size in (1e-2, 1e-3, 1e-4):
-        found = mirror(x[None], (x + size * field)[None], solver)[0]
+        found = extrapolate(x[None], (x + size * field)[None], solver)[0]
         errors.append(float((found - (x - size * field)).norm() / (size * field).norm()))
     # Position and velocity are continuous at the ends: what differs is of second order.
     assert errors[1] == pytest.approx(errors[0] / 10, rel=0.1)

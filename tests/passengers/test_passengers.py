@@ -198,7 +198,7 @@ def test_many_points_are_bound_in_parts(bars: Shapes, monkeypatch: pytest.Monkey
     x, points = bars.keyframes[0], around(bars.keyframes[0], bars.faces, 50, 0.02)
     anchors = torch.randint(-1, len(x), (50,), generator=torch.Generator().manual_seed(0))
     whole = tm.Passengers(x, bars.faces, points, anchors).weights.toarray()
-    monkeypatch.setattr(bound, "CHUNK", 7)
+    monkeypatch.setattr(bound, "POINTS_AT_ONCE", 7)
     np.testing.assert_array_equal(tm.Passengers(x, bars.faces, points, anchors).weights.toarray(), whole)
 
 

@@ -68,7 +68,7 @@ def test_detail_is_that_of_both_ends(rough: tuple[Tensor, Tensor]) -> None:
 
 @pytest.mark.parametrize("proxy", [-1, 20, 0.5])
 def test_sizes(bars: Shapes, proxy: float) -> None:
-    with pytest.raises(ValueError, match="from 100 on"):
+    with pytest.raises(ValueError, match="at least 100"):
         tm.subdivide(bars.keyframes, bars.faces, proxy=proxy)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="bases belong to the whole mesh"):
         tm.subdivide(bars.keyframes, bars.faces, bases=bars.bases, proxy=120)

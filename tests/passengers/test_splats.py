@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from torch_modal.cli import main as cli
 from torch_modal.io.frames import save_frames
 from torch_modal.io.ply import PlyFile
-from torch_modal.io.points import PointFile, harmonics, rotated_harmonics
+from torch_modal.io.points import PointFile, evaluate_harmonics, rotate_harmonics
 
 NAMES = ["x", "y", "z", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3)), *(f"f_rest_{i}" for i in range(45))]
 NAMES += ["opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
@@ -42,10 +42,10 @@ def test_harmonics_turn_with_the_function(degree: int) -> None:
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
 
     def seen(values: np.ndarray, at: np.ndarray) -> np.ndarray:
-        basis = np.concatenate([harmonics(at, d) for d in range(1, degree + 1)], -1)
+        basis = np.concatenate([evaluate_harmonics(at, d) for d in range(1, degree + 1)], -1)
         return np.asarray(np.einsum("p...j,pcj->pc...", np.broadcast_to(basis, (40, 25, n)), values))
 
-    found = seen(rotated_harmonics(coefficients, turns), directions)
+    found = seen(rotate_harmonics(coefficients, turns), directions)
     np.testing.assert_allclose(found, seen(coefficients, directions @ turns), atol=1e-12)
 
 
@@ -59,7 +59,7 @@ def test_a_splat_is_the_same_seen_from_a_body_that_turned(tmp_path: Path, bars: 
     assert given.is_splats
     turn = Rotation.from_rotvec([0.3, -2.0, 1.0])
     many = np.broadcast_to(turn.as_matrix(), (50, 3, 3))
-    (tmp_path / "moved.ply").write_bytes(given.moved(given.positions @ turn.as_matrix().T, many, 2 * many))
+    (tmp_path / "moved.ply").write_bytes(given.move(given.positions @ turn.as_matrix().T, many, 2 * many))
     moved = columns(tmp_path / "moved.ply")
 
     def covariance(own: np.ndarray) -> np.ndarray:
@@ -73,7 +73,7 @@ def test_a_splat_is_the_same_seen_from_a_body_that_turned(tmp_path: Path, bars: 
     np.testing.assert_allclose(np.linalg.norm(quaternions, axis=1), 1, atol=1e-6)
     for name in ("opacity", "f_dc_0", "f_dc_2"):
         assert np.array_equal(moved[name], rows[name])
-    back = PointFile(tmp_path / "moved.ply").moved(given.positions, many.transpose(0, 2, 1), 0.5 * many)
+    back = PointFile(tmp_path / "moved.ply").move(given.positions, many.transpose(0, 2, 1), 0.5 * many)
     (tmp_path / "back.ply").write_bytes(back)
     for name in NAMES[9:54]:
         np.testing.assert_allclose(columns(tmp_path / "back.ply")[name], rows[name], atol=1e-5)

@@ -121,5 +121,5 @@ class TestRandomBlend:
         distances = torch.tensor([[far(x, y) for y in members.double()] for x in found])
         assert float(distances.amin(1).max()) < 1e-5
         assert sorted(set(distances.argmin(1).tolist())) == [0, 1, 2]
-        with pytest.raises(ValueError, match="members is 1 or more"):
+        with pytest.raises(ValueError, match="members must be 1 or more"):
             tm.RandomBlend(members=0)

@@ -21,7 +21,7 @@ from torch_modal.cli.main import main
 from torch_modal.errors import MeshError
 from torch_modal.registration.landmarks import read_landmarks
 from torch_modal.registration.load import load_keyframes
-from torch_modal.view.page_data import LEVELS, pack_faces, pack_group
+from torch_modal.view.page_data import GRID_STEPS, pack_faces, pack_group
 from torch_modal.view.page_input import read_shapes
 
 NASTY = "</script><script>document.title='broken'</script><img src=x onerror=\"document.title='broken'\">&amp;'"
@@ -70,7 +70,7 @@ def test_frames_come_back_within_half_a_step(generator: torch.Generator) -> None
         guess = 2 * numbers[n - 1] - numbers[n - 2] if n > 1 else numbers[0] if n else 0
         numbers[n] = (guess + residual[n]) % 2**16
     assert np.abs(group["origin"] + group["step"] * numbers - frames).max() <= 0.5001 * group["step"]
-    assert group["step"] == pytest.approx(np.ptp(frames, axis=(0, 1)).max() / LEVELS)
+    assert group["step"] == pytest.approx(np.ptp(frames, axis=(0, 1)).max() / GRID_STEPS)
 
 
 def test_faces_come_back(ball: tuple[np.ndarray, np.ndarray]) -> None:
@@ -368,7 +368,7 @@ def page(chrome: Any, tmp_path: Path, ball: tuple[np.ndarray, np.ndarray], growi
 
 
 def test_frames_change(page: Opened, growing: np.ndarray) -> None:
-    step = 1.6 * 4 / LEVELS
+    step = 1.6 * 4 / GRID_STEPS
     start, small = page.pixels(), page.drawn_area()
     assert page.reddish() > 1000, "a key-frame"
     assert page.text("#readout") == "frame 0 / 6"

@@ -243,15 +243,15 @@ def test_camera_directions(view, up, expected):
 def test_what_rests_stays_and_what_travels_is_followed():
     ball = np.asarray(BALL.vertices)
     rest = np.stack([ball, 1.2 * ball + np.array([0.2, 0, 0])])[None]
-    moved, _ = picture.centred(rest)
+    moved, _ = picture.fit_into_cells(rest)
     np.testing.assert_allclose(moved[0, 1] - moved[0, 0], rest[0, 1] - rest[0, 0], atol=1e-12)
     far = np.stack([ball, ball + np.array([9, 0, 0])])[None]
     both = np.concatenate([far, far + np.array([0, 0.3, 0])])
-    moved, half = picture.centred(both)
+    moved, half = picture.fit_into_cells(both)
     np.testing.assert_allclose(moved[:, 1], moved[:, 0], atol=1e-12)  # followed
     np.testing.assert_allclose(moved[1] - moved[0], np.broadcast_to([0, 0.3, 0], moved[0].shape), atol=1e-12)
     assert half[0] == pytest.approx(1.06 * 1, rel=0.03)
-    moved, half = picture.centred(np.concatenate([far, far + np.array([0, 7, 0])]))  # rows apart too: each by itself
+    moved, half = picture.fit_into_cells(np.concatenate([far, far + np.array([0, 7, 0])]))  # rows apart, too
     assert np.abs(moved).max() <= 1.0 + 1e-12
 
 

@@ -1,4 +1,4 @@
-"""Types of arguments, options that several commands share, and checks of output paths before any work."""
+"""Types of arguments, options that several commands share, and checks of output paths."""
 
 import argparse
 import os
@@ -40,13 +40,13 @@ def file_name(suffixes: Collection[str]) -> Callable[[str], Path]:
 
 
 def add_levels(sub: argparse.ArgumentParser, lowest: int) -> None:
-    """``--levels`` of subdivision."""
+    """Add ``--levels`` of subdivision."""
     text = "how often the number of intervals doubles (default: %(default)s, 8 frames an interval)"
     sub.add_argument("--levels", type=number(int, lowest), metavar="L", default=3, help=text)
 
 
 def add_modes(sub: argparse.ArgumentParser) -> None:
-    """Options of `extract_bases`."""
+    """Add options of `extract_bases`."""
     add, default = sub.add_argument, "(default: %(default)s)"
     text = f"elastic modes of each key-frame; 20 to 100 are usual {default}"
     add("--modes", type=number(int, 1), default=30, metavar="N", help=text)
@@ -57,7 +57,7 @@ def add_modes(sub: argparse.ArgumentParser) -> None:
 
 
 def add_registration(sub: argparse.ArgumentParser) -> None:
-    """Options of the registration of meshes of different connectivity."""
+    """Add options of the registration of meshes of different connectivity."""
     text = "lines of vertex numbers, counted from 0, or of coordinates: a column for each mesh"
     sub.add_argument("--landmarks", type=Path, metavar="FILE", help=text)
     text = "the meshes are different subjects; may need five landmarks or more"
@@ -69,7 +69,7 @@ def add_common(
     overwrite: str = "replace files that exist (default: refuse)",
     cache_dir: str | None = CACHE_DIR,
 ) -> None:
-    """The group "files and messages"; ``cache_dir`` is the help of that option, None if the command has no cache."""
+    """Add the group "files and messages"; ``cache_dir`` is that option's help, None for commands without a cache."""
     group = sub.add_argument_group("files and messages")
     group.add_argument("--overwrite", action="store_true", help=overwrite)
     if cache_dir:
@@ -80,28 +80,28 @@ def add_common(
     group.add_argument("--quiet", action="store_true", help="report warnings and errors only")
 
 
-def picked(args: argparse.Namespace, *names: str) -> dict[str, Any]:
-    """Arguments that functions know by the same names."""
+def pick_options(args: argparse.Namespace, *names: str) -> dict[str, Any]:
+    """Keyword arguments for functions whose parameters have the same names as the options."""
     return {name: getattr(args, name) for name in names}
 
 
-def caching(args: argparse.Namespace) -> dict[str, Any]:
-    """Options of computations that are kept in the cache."""
+def cache_options(args: argparse.Namespace) -> dict[str, Any]:
+    """Options of functions that cache their results."""
     return {"cache_dir": args.cache_dir, "cache": not args.no_cache, "progress": False if args.quiet else None}
 
 
 def mode_options(args: argparse.Namespace) -> dict[str, Any]:
     """Options of `extract_bases`."""
-    return {"n_modes": args.modes, **picked(args, "method", "mesher"), **caching(args)}
+    return {"n_modes": args.modes, **pick_options(args, "method", "mesher"), **cache_options(args)}
 
 
 def register_options(args: argparse.Namespace) -> dict[str, Any]:
     """Options of `register`."""
-    return {"landmarks": args.landmarks, "same_subject": not args.across, **caching(args)}
+    return {"landmarks": args.landmarks, "same_subject": not args.across, **cache_options(args)}
 
 
 def reporter(args: argparse.Namespace) -> Callable[[str], None]:
-    """Print a line at once, unless --quiet; escapes characters that the terminal cannot show."""
+    """A function that prints a line at once, unless --quiet; it escapes characters that the terminal cannot show."""
 
     def report(line: str) -> None:
         if not args.quiet:
@@ -112,7 +112,7 @@ def reporter(args: argparse.Namespace) -> Callable[[str], None]:
 
 
 def is_file(args: argparse.Namespace, suffixes: Collection[str]) -> bool:
-    """Decide whether --out names a file of one of these endings, or a folder; leaves with the usage for other files."""
+    """True if --out names a file with one of these endings, False for a folder; other files are a usage error."""
     if args.out.suffix.lower() in suffixes:
         return True
     # An ending has letters, unlike the number of a version; a folder that exists may have any name.
@@ -123,7 +123,7 @@ def is_file(args: argparse.Namespace, suffixes: Collection[str]) -> bool:
 
 
 def check_output(files: Sequence[Path], inputs: Iterable[Path], overwrite: bool) -> None:
-    """Raise ValueError if files could not or must not be written, those that are read among them."""
+    """Raise a ValueError if files cannot be written, exist already, or are among the inputs."""
     read = {os.path.realpath(path) for path in inputs}
     for file in files:
         if os.path.realpath(file) in read:

@@ -12,7 +12,7 @@ from torch_modal.cli.arguments import (
     is_file,
     mode_options,
     number,
-    picked,
+    pick_options,
     reporter,
 )
 
@@ -20,7 +20,7 @@ INCOMPLETE = 3  # exit status of `precompute` when some sets have no bases
 
 
 def add_modes_command(sub: argparse.ArgumentParser) -> None:
-    """Arguments of ``modes``."""
+    """Add the arguments of ``modes``."""
     sub.add_argument("meshes", nargs="+", type=Path, metavar="MESH", help="key-frames of one connectivity")
     text = "FILE.safetensors for one mesh, or a folder for a file of each mesh's name"
     sub.add_argument("--out", type=Path, required=True, metavar="FILE_OR_FOLDER", help=text)
@@ -29,7 +29,7 @@ def add_modes_command(sub: argparse.ArgumentParser) -> None:
 
 
 def modes(args: argparse.Namespace) -> None:
-    """Vibration modes of key-frames, as safetensors.
+    """Compute vibration modes of key-frames, as safetensors.
 
     Compute the vibration modes of key-frames: the lowest elastic modes of the solid
     that each surface encloses, restricted to the surface, or of the surface itself
@@ -71,7 +71,7 @@ def modes(args: argparse.Namespace) -> None:
 
 
 def add_precompute(sub: argparse.ArgumentParser) -> None:
-    """Arguments of ``precompute``."""
+    """Add the arguments of ``precompute``."""
     add = sub.add_argument
     add("root", type=Path, metavar="DIR", help="the folder tree with the key-frames")
     add("--out", type=Path, required=True, metavar="DIR", help="where the bases go")
@@ -86,12 +86,12 @@ def add_precompute(sub: argparse.ArgumentParser) -> None:
     )
     add("--sequence", action="store_true", help=text)
     add_modes(sub)
-    text = "replace stored sets that this command did not write (default: refuse those sets)"
+    text = "replace stored sets that this command did not write (default: refuse them)"
     add_common(sub, text, "keep tetrahedra and modes in this cache as well (default: keep the bases only)")
 
 
 def precompute(args: argparse.Namespace) -> int:
-    """Bases of every key-frame set of a folder tree, in several processes or machines.
+    """Compute the bases of every key-frame set of a folder tree, on one or several machines.
 
     Compute the bases of every key-frame set below a folder.
 
@@ -118,8 +118,9 @@ def precompute(args: argparse.Namespace) -> int:
     from torch_modal.data.precompute_tree import precompute_tree
 
     cache_dir = args.cache_dir and os.path.abspath(os.path.expanduser(args.cache_dir))
-    same = picked(args, "method", "mesher", "timeout", "overwrite", "sequence")
-    options, where = Options(n_modes=args.modes, cache_dir=cache_dir, **same), picked(args, "workers", "scheduler")
+    settings = pick_options(args, "method", "mesher", "timeout", "overwrite", "sequence")
+    options = Options(n_modes=args.modes, cache_dir=cache_dir, **settings)
+    where = pick_options(args, "workers", "scheduler")
     bar = not args.quiet and sys.stderr.isatty()
     records = precompute_tree(args.root, args.out, options, **where, say=reporter(args), bar=bar)
     return 0 if all(record.status == DONE for record in records.values()) else INCOMPLETE

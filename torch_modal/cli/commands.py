@@ -12,7 +12,7 @@ CROSSES = 3  # exit status of `check` when parts newly pass through each other
 
 
 def add_register(sub: argparse.ArgumentParser) -> None:
-    """Arguments of ``register``."""
+    """Add the arguments of ``register``."""
     sub.add_argument("meshes", nargs=2, type=Path, metavar="MESH", help="the template, and the target")
     text = f"the template laid onto the target, {', '.join(MESH_FORMATS)}"
     sub.add_argument("--out", type=file_name(MESH_FORMATS), required=True, metavar="FILE", help=text)
@@ -22,7 +22,7 @@ def add_register(sub: argparse.ArgumentParser) -> None:
 
 
 def register(args: argparse.Namespace) -> None:
-    """One mesh's connectivity laid onto others.
+    """Lay one mesh's connectivity onto another.
 
     Lay the connectivity of the first mesh onto another mesh of the same subject, or,
     with --across, of another one. Key-frames of different connectivity
@@ -45,19 +45,19 @@ def register(args: argparse.Namespace) -> None:
 
     template, target = map(tm.open_asset, args.meshes)
     report, options = reporter(args), register_options(args)
-    found = tm.register(template.positions, template.faces, target.positions, target.faces, **options)
-    report(found.summary())
-    if found.doubtful:
-        why = f"the result is doubtful: {'; '.join(found.warnings)}"
+    result = tm.register(template.positions, template.faces, target.positions, target.faces, **options)
+    report(result.summary())
+    if result.doubtful:
+        why = f"the result is doubtful: {'; '.join(result.warnings)}"
         if not args.keep_doubtful:
             raise ValueError(f"{why}. To help it, {ADVICE}; --keep-doubtful writes it all the same")
         warnings.warn(why, stacklevel=2)
-    save_mesh(found.positions, template.faces, args.out, args.overwrite, template)
+    save_mesh(result.positions, template.faces, args.out, args.overwrite, template)
     report(f"written: {args.out}")
 
 
 def add_check(sub: argparse.ArgumentParser) -> None:
-    """Arguments of ``check``."""
+    """Add the arguments of ``check``."""
     add = sub.add_argument
     add("meshes", nargs="+", type=Path, metavar="MESH", help="meshes of one connectivity")
     add("--keyframes", nargs="+", type=Path, default=[], metavar="FILE", help="meshes whose own crossings are known")
@@ -67,7 +67,7 @@ def add_check(sub: argparse.ArgumentParser) -> None:
 
 
 def check(args: argparse.Namespace) -> int:
-    """Parts that pass through each other, in key-frames and results.
+    """Find parts that pass through each other, in key-frames and results.
 
     Count for each mesh the triangles that pass through others, and colour them in a
     picture. All meshes have the same faces.
@@ -94,14 +94,14 @@ def check(args: argparse.Namespace) -> int:
     shapes, faces = tm.load_keyframes([*args.keyframes, *args.meshes])
     welded = tm.weld_seams(shapes, faces)
     keyframes, shapes = welded.keyframes[:n], welded.keyframes[n:]
-    found = tm.self_contacts(shapes, welded.faces, keyframes if n else None)
+    contacts = tm.self_contacts(shapes, welded.faces, keyframes if n else None)
     used = shapes[0][welded.faces.unique()]
     diagonal = float((used.amax(0) - used.amin(0)).norm())
-    columns = {"pairs": found.number, **({"new": found.n_new} if n else {}), "far": found.n_far}
+    columns = {"pairs": contacts.number, **({"new": contacts.n_new} if n else {}), "far": contacts.n_far}
     width = max(len(str(mesh)) for mesh in args.meshes)
     report(" " * width + "".join(f"{name:>9s}" for name in (*columns, "depth")))
     for i, mesh in enumerate(args.meshes):
-        deepest = 100 * float(found.depth[i].max()) / diagonal
+        deepest = 100 * float(contacts.depth[i].max()) / diagonal
         report(f"{mesh!s:{width}s}" + "".join(f"{int(c[i]):9d}" for c in columns.values()) + f"{deepest:7.2f} %")
     report(
         "pairs of triangles that cross; far: of two parts that went through each other"
@@ -110,8 +110,8 @@ def check(args: argparse.Namespace) -> int:
     )
     if args.picture:
         marks = shapes.new_zeros(shapes.shape[:2])  # of each vertex: 0, 1 for a crossing, 2 for a new one
-        for value, chosen in ((1.0, slice(None)), (2.0, found.new)):
-            marks[found.shape[chosen].repeat_interleave(6), welded.faces[found.pairs[chosen]].flatten()] = value
+        for value, chosen in ((1.0, slice(None)), (2.0, contacts.new)):
+            marks[contacts.shape[chosen].repeat_interleave(6), welded.faces[contacts.pairs[chosen]].flatten()] = value
         tm.render_sequence(
             {"crossings": shapes},
             welded.faces,
@@ -123,11 +123,11 @@ def check(args: argparse.Namespace) -> int:
             overwrite=args.overwrite,
         )
         report(f"picture: {args.picture}")
-    return CROSSES if bool(found.n_far.any()) else 0
+    return CROSSES if bool(contacts.n_far.any()) else 0
 
 
 def add_carry(sub: argparse.ArgumentParser) -> None:
-    """Arguments of ``carry``."""
+    """Add the arguments of ``carry``."""
     add, text = sub.add_argument, "meshes of one connectivity; the points lie on the first"
     add("meshes", nargs="+", type=Path, metavar="MESH", help=text)
     add("--points", type=Path, required=True, metavar="FILE.ply", help="points, or splats")
@@ -136,11 +136,11 @@ def add_carry(sub: argparse.ArgumentParser) -> None:
 
 
 def carry(args: argparse.Namespace) -> None:
-    """Points, scans or splats that follow a sequence of meshes.
+    """Move points, scans or splats with a sequence of meshes.
 
     Bind the points of a PLY file to the first mesh, and move them with all others: a scan,
     markers, an accessory, or the splats of 3D Gaussian splatting, whose axes, scales and
-    harmonics turn along. All that the file has besides stays as it is.
+    harmonics follow. Everything else in the file stays as it is.
 
     Examples:
       torch-modal subdivide open.obj fist.obj --out hand/
@@ -156,17 +156,17 @@ def carry(args: argparse.Namespace) -> None:
     from torch_modal.io.points import PointFile
     from torch_modal.progress import ProgressReport
 
-    given = PointFile(args.points)
+    cloud = PointFile(args.points)
     shapes, faces = tm.load_keyframes(args.meshes)
-    passengers = tm.Passengers(shapes[0], faces, torch.from_numpy(given.positions).to(shapes))
+    passengers = tm.Passengers(shapes[0], faces, torch.from_numpy(cloud.positions).to(shapes))
     with ProgressReport(len(files), "meshes", False if args.quiet else None) as bar, torch.no_grad():
 
-        def moved() -> Iterator[tuple[Path, bytes]]:
+        def moved_files() -> Iterator[tuple[Path, bytes]]:
             for file, x in zip(files, shapes, strict=True):
                 parts = (passengers(x), passengers.rotations(x), passengers.gradients(x))
-                yield file, given.moved(*(part.double().numpy() for part in parts))
+                yield file, cloud.move(*(values.double().numpy() for values in parts))
                 bar.update()
 
-        write_files(moved())
-    kind = "splats" if given.is_splats else "points"
+        write_files(moved_files())
+    kind = "splats" if cloud.is_splats else "points"
     reporter(args)(f"{len(passengers)} {kind}: {files[0]} to {files[-1].name}")

@@ -1,4 +1,4 @@
-"""``torch-modal demo``: the main job on the sample key-frames, beside linear interpolation and the truth."""
+"""``torch-modal demo``: the main job on the sample key-frames, next to linear interpolation and the truth."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ PICTURE_TIMES = {"creature": (1.0, 1.5, 2.0, 2.5, 3.0), "hand": (0.0, 0.25, 0.5,
 
 
 def add_arguments(sub: argparse.ArgumentParser) -> None:
-    """Arguments of ``demo``."""
+    """Add the arguments of ``demo``."""
     add, folder = sub.add_argument, Path("torch-modal-demo")
     add("--out", type=Path, default=folder, metavar="FOLDER", help="where the files go (default: %(default)s)")
     add("--sample", choices=list(PICTURE_TIMES), help="only this one (default: both)")
@@ -35,7 +35,7 @@ def run(args: argparse.Namespace) -> None:
     Run the main job on the samples that come with the package: a galloping creature
     (a cycle of six key-frames) and a closing hand (two key-frames).
 
-    For each it writes an animation (GLB) and a picture of the sequence beside linear
+    For each it writes an animation (GLB) and a picture of the sequence next to linear
     interpolation and the truth, and prints how far both are from the true frames.
 
     Examples:
@@ -72,10 +72,10 @@ def run(args: argparse.Namespace) -> None:
             duration=sample.seconds,
             overwrite=True,
         )
-        found = {"linear": tm.linear_sequence(keyframes, places), "torch_modal": frames}
+        sequences = {"linear": tm.linear_sequence(keyframes, places), "torch_modal": frames}
         times = [when for when in PICTURE_TIMES[name] if (when * n).is_integer()]
         known = dict(enumerate(keyframes)) | dict(zip(sample.true_times, sample.truth, strict=True))
-        rows = {method: x[[int(when * n) for when in times]] for method, x in reversed(found.items())}
+        rows = {method: x[[int(when * n) for when in times]] for method, x in reversed(sequences.items())}
         tm.render_sequence(
             {"true": torch.stack([known[when] for when in times]), **rows},
             faces,
@@ -85,7 +85,7 @@ def run(args: argparse.Namespace) -> None:
             view=sample.view,
             overwrite=True,
         )
-        for method, x in found.items():
+        for method, x in sequences.items():
             edges, volumes = errors(sample, x, args.levels).T
             off = f"{100 * edges.mean():.1f} % (worst {100 * edges.max():.1f} %)"
             table.append(f"{f'{name}, {method}':26s}{off:26s}{volumes.mean():.3f}")
@@ -94,7 +94,7 @@ def run(args: argparse.Namespace) -> None:
 
 
 def errors(sample: Sample, frames: Tensor, levels: int) -> Tensor:
-    """Errors of ``2**levels`` frames an interval at the true times that fall on one of them.
+    """Errors at the true times that fall on one of the frames, of which an interval has ``2**levels``.
 
     The mean of ``|l - l_true| / l_true`` over all edges, and the ratio to the true volume. *Shape:* ``(T, 2)``.
     """
@@ -103,12 +103,12 @@ def errors(sample: Sample, frames: Tensor, levels: int) -> Tensor:
     from torch_modal.geometry.connectivity import Connectivity
     from torch_modal.geometry.inspect import signed_volume
 
-    faces, found = sample.faces.numpy(), []
+    faces, rows = sample.faces.numpy(), []
     i, j = torch.tensor(Connectivity(faces).edges).T
     for when, true in zip(sample.true_times, sample.truth, strict=True):
         if (when * 2**levels).is_integer():
             x = frames[int(when * 2**levels)]
             length, true_length = ((shape[i] - shape[j]).norm(dim=-1) for shape in (x, true))
             off = float(((length - true_length).abs() / true_length).mean())
-            found.append((off, signed_volume(x.numpy(), faces) / signed_volume(true.numpy(), faces)))
-    return torch.tensor(found)
+            rows.append((off, signed_volume(x.numpy(), faces) / signed_volume(true.numpy(), faces)))
+    return torch.tensor(rows)

@@ -1,4 +1,4 @@
-"""The command line, ``torch-modal``: its parser, and from errors, warnings and the log to lines."""
+"""The command line, ``torch-modal``: its parser, and the lines that errors, warnings and the log become."""
 
 import argparse
 import contextlib
@@ -42,13 +42,13 @@ COMMANDS: dict[str, tuple[Callable[[Any], None], Callable[[Any], int | None]]] =
     "view": (view.add_arguments, view.run),
     "demo": (demo.add_arguments, demo.run),
 }
-"""Of each command: a function that declares its arguments, and one that runs it (None or an exit status), whose
-docstring is its help: summary, description and examples with empty lines between them."""
+"""For each command, a function that declares its arguments, and a function that runs it and returns None or an exit
+status. The docstring of the second is the help: summary, description and examples with empty lines between them."""
 
 EXPECTED = (ValueError, OSError, MemoryError, ImportError)
 """Errors of input, files and machine, which become one line; all others are bugs and show their traceback."""
 EXPECTED_NAMES = ("TetrahedralizationError", "ModalAnalysisError")
-"""Further ones, whose modules are heavy."""
+"""Further such errors, whose modules take long to import."""
 
 
 Formatter = functools.partial(argparse.RawDescriptionHelpFormatter, max_help_position=30, width=100)
@@ -72,27 +72,27 @@ def build_parser() -> argparse.ArgumentParser:
         )
         add_arguments(sub)
         sub.add_argument("--debug", action="store_true", help="show the traceback of an error")
-        # Arguments that contradict each other leave with the usage and status 2, as those that argparse refuses.
+        # Arguments that contradict each other end with the usage and status 2, like all that argparse refuses.
         sub.set_defaults(command=run, fail=sub.error)
     return parser
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line with these arguments, or with those of the process; the exit code.
+    """Run the command line with these arguments, by default the process's; returns the exit code.
 
     It is 0, 1 after an error, 130 after Ctrl-C or SIGTERM; 3 of `precompute` when some sets have no result, and of
-    `check` when parts pass through each other. Wrong usage leaves with ``SystemExit(2)``.
+    `check` when parts pass through each other. Wrong usage raises ``SystemExit(2)``.
     """
     with contextlib.suppress(ValueError):  # in the main thread, SIGTERM of a batch system acts like Ctrl-C
         signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         args = build_parser().parse_args(argv)
-        with _messages_as_lines(args):
+        with _print_messages(args):
             code = args.command(args) or 0
         sys.stdout.flush()
         return code
     except KeyboardInterrupt:
-        _say("interrupted")
+        _print_error("interrupted")
         return 130
     except BrokenPipeError:
         # The reader (head, less) has closed the pipe. Python flushes once more at exit, into the null device.
@@ -108,24 +108,24 @@ def main(argv: Sequence[str] | None = None) -> int:
             reason = "out of memory; take fewer levels or a smaller mesh"
         else:
             reason = str(error) or type(error).__name__
-        _say(f"error: {reason}")
+        _print_error(f"error: {reason}")
         return 1
 
 
-def _say(message: str) -> None:
+def _print_error(message: str) -> None:
     """Print a message on the error output as one line."""
     print(f"{PROGRAM}: {' '.join(message.split())}", file=sys.stderr, flush=True)
 
 
 @contextlib.contextmanager
-def _messages_as_lines(args: argparse.Namespace) -> Iterator[None]:
-    """Show the package's log, all of it with --verbose, and each warning about input or result once, as lines."""
+def _print_messages(args: argparse.Namespace) -> Iterator[None]:
+    """Print the package's log (all of it with --verbose) and each warning about input or result once, as lines."""
     seen = set()
 
     def show(message: Warning | str, category: type[Warning], *_: Any) -> None:
         if issubclass(category, UserWarning) and str(message) not in seen:
             seen.add(str(message))
-            _say(f"warning: {message}")
+            _print_error(f"warning: {message}")
 
     logger, handler = logging.getLogger("torch_modal"), logging.StreamHandler()
     handler.setFormatter(logging.Formatter(f"{PROGRAM}: %(message)s"))

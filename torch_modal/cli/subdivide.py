@@ -16,7 +16,7 @@ from torch_modal.cli.arguments import (
     is_file,
     mode_options,
     number,
-    picked,
+    pick_options,
     register_options,
     reporter,
 )
@@ -24,17 +24,20 @@ from torch_modal.io.formats import ANIMATION_FORMATS, MESH_FORMATS, PICTURES
 
 
 def add_output(sub: argparse.ArgumentParser, picture: str) -> None:
-    """``--out``, ``--format`` and ``--picture`` of a sequence."""
+    """Add ``--out``, ``--format`` and ``--picture`` of a sequence."""
     add = sub.add_argument
     text = f"the animation alone: {', '.join(ANIMATION_FORMATS)}; a folder: numbered frames and animation.glb"
     add("--out", type=Path, required=True, metavar="FILE_OR_FOLDER", help=text)
-    text = "of the numbered frames (default: that of the first mesh, with all that its file carries)"
+    text = "format of the numbered frames (default: as the first mesh, with everything else in its file)"
     add("--format", choices=[suffix[1:] for suffix in MESH_FORMATS], help=text)
     add("--picture", type=file_name(PICTURES), metavar="FILE", help=f"also draw {picture}, as .png or .pdf")
 
 
 def check_files(args: argparse.Namespace, inputs: list[Path]) -> tuple[Path, str | None, list[Path]]:
-    """The animation; for a folder the format of the frames, and frames of an earlier run. Raises as `check_output`."""
+    """Path of the animation; for a folder also the format of its frames, and frames of an earlier run.
+
+    Raises as `check_output`.
+    """
     animation, fmt, earlier = args.out, None, []
     if not is_file(args, ANIMATION_FORMATS):
         animation, fmt = args.out / "animation.glb", args.format or inputs[0].suffix.lower()[1:].replace("gltf", "glb")
@@ -44,7 +47,7 @@ def check_files(args: argparse.Namespace, inputs: list[Path]) -> tuple[Path, str
 
 
 def write_sequence(args: argparse.Namespace, files: Any, frames: Any, faces: Any, asset: Any, **options: Any) -> None:
-    """Write what `check_files` found, and report it; ``options`` are those of `save_animation`."""
+    """Write frames and animation to the paths from `check_files`; ``options`` are passed to `save_animation`."""
     import torch_modal as tm
 
     report, (animation, fmt, earlier) = reporter(args), files
@@ -61,17 +64,17 @@ def write_sequence(args: argparse.Namespace, files: Any, frames: Any, faces: Any
 
 
 def add_arguments(sub: argparse.ArgumentParser) -> None:
-    """Arguments of ``subdivide``."""
+    """Add the arguments of ``subdivide``."""
     add, positive = sub.add_argument, number(float, 0, above=True)
     add("meshes", nargs="+", type=Path, metavar="MESH", help="key-frames, two or more, in their order")
-    add_output(sub, "the sequence beside linear interpolation")
+    add_output(sub, "the sequence next to linear interpolation")
     add_levels(sub, 0)
-    text = "number of frames of the result (default: those of the levels)"
+    text = "number of frames of the result (default: as many as the levels give)"
     add("--frames", type=number(int, 2), metavar="N", help=text)
     add("--cyclic", action="store_true", help="the last key-frame leads on to the first")
-    text = "when the key-frames are, ascending, in any unit; of a cycle, with the time when it begins again"
+    text = "times of the key-frames, ascending, in any unit; of a cycle, also the time when it begins again"
     add("--times", type=times, metavar="T,T,...", help=text)
-    text = "treat each pair of key-frames alone, without what its neighbours in time know"
+    text = "interpolate each pair of key-frames alone, without its neighbours in time"
     add("--no-smooth", dest="smooth", action="store_const", const=False, help=text)
     add("--contact", action="store_true", help="keep parts from passing through each other (extra contact)")
     text = (
@@ -110,15 +113,15 @@ def times(text: str) -> list[float]:
 
 
 def run(args: argparse.Namespace) -> None:
-    """Key-frames in, a dense sequence out.
+    """Fill a sequence of key-frames.
 
-    Fill a sequence of key-frames.
+    Compute a dense sequence of shapes from key-frames.
 
     Each level puts a new shape between all neighbours, so L levels turn every interval
     into 2**L. The key-frames themselves stay as they are, at their places.
 
     Examples:
-      one animated file, with a picture beside linear interpolation:
+      one animated file, with a picture next to linear interpolation:
         torch-modal subdivide open.obj fist.obj --out hand.glb --picture hand.png
       a cycle of six key-frames as 96 numbered OBJ files and animation.glb in a folder:
         torch-modal subdivide gait-?.ply --cyclic --levels 4 --out gait --format obj
@@ -161,7 +164,7 @@ def run(args: argparse.Namespace) -> None:
         args.levels,
         bases=partial(tm.extract_bases, **mode_options(args)),
         **spread,
-        **picked(args, "smooth", "preset", "contact", "mu", "regions", "proxy"),
+        **pick_options(args, "smooth", "preset", "contact", "mu", "regions", "proxy"),
         progress=False if args.quiet else None,
     )
     n_proxy = proxy_size(args.proxy, welded.keyframes.shape[1])
@@ -172,7 +175,7 @@ def run(args: argparse.Namespace) -> None:
     frames[keys] = keyframes
     seams = f", {welded.n_merged} of them copies along seams" if welded.n_merged else ""
     report(f"{n} key-frames of {keyframes.shape[1]} vertices{seams} -> {len(frames)} frames")
-    options = picked(args, "cyclic", "duration", "ping_pong", "ease", "bones", "targets")
+    options = pick_options(args, "cyclic", "duration", "ping_pong", "ease", "bones", "targets")
     write_sequence(args, files, frames, faces, asset, keyframe_indices=keys, times=when, **options)
     if args.picture:
         rows = {"torch_modal": frames, "linear": tm.linear_sequence(keyframes, places)}

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def add_arguments(sub: argparse.ArgumentParser) -> None:
-    """Arguments of ``view``."""
+    """Add the arguments of ``view``."""
     add = sub.add_argument
     add("meshes", nargs="+", type=Path, metavar="MESH", help="shapes in their order, a folder, or one GLB")
     text = "another sequence of as many shapes, of the same faces; may be given several times"
@@ -32,7 +32,7 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
     add("--page", type=file_name(PAGES), metavar="FILE", help=text)
     text = "with --page: store sequences as bones where these are within 0.1 %% of the diagonal; 0: never (default: 40)"
     add("--bones", type=number(int, 0), metavar="N", default=40, help=text)
-    text = "a page to pick landmarks of two meshes or more; with a FILE, those of it are there already"
+    text = "a page to pick landmarks of two meshes or more; it starts with the landmarks of FILE, if given"
     add("--landmarks", nargs="?", const=True, metavar="FILE", help=text)
     add_common(sub, "replace the file if it exists (default: refuse)", cache_dir=None)
 
@@ -50,23 +50,23 @@ def run(args: argparse.Namespace) -> None:
     that belong together are picked, for `register` and `subdivide --register`.
 
     Examples:
-      open a page of an animation, beside linear interpolation of its key-frames:
+      open a page of an animation, next to linear interpolation of its key-frames:
         torch-modal view hand.glb --linear
       write a page of three sequences side by side:
         torch-modal view ours/ --compare other/ --compare truth/frame-*.ply --page hands.html
       pick landmarks on two meshes, and save them as the file that --landmarks of `register` takes:
         torch-modal view cat.obj dog.obj --landmarks
     """
-    given = [args.meshes, *args.compare]
+    sequences = [args.meshes, *args.compare]
     if args.landmarks and (args.compare or args.linear or args.keyframes):
         args.fail("--compare, --linear and --keyframes belong to sequences; --landmarks shows single meshes")
     if args.landmarks and len(args.meshes) < 2:
         args.fail("--landmarks needs two meshes or more")
     if args.page:
         inputs = [] if args.landmarks in (None, True) else [Path(args.landmarks)]
-        check_output([args.page], [*chain(*given), *inputs], args.overwrite)
+        check_output([args.page], [*chain(*sequences), *inputs], args.overwrite)
 
-    page, what = _landmarks(args) if args.landmarks else _sequences(given, args)
+    page, what = _landmarks(args) if args.landmarks else _sequences(sequences, args)
     # Without --page it goes to a temporary folder, and stays: the browser reads it after this process.
     path = page.save(args.page or Path(tempfile.mkdtemp(prefix="torch_modal-"), "page.html"), args.overwrite)
     reporter(args)(f"{what}: {path}")
@@ -82,12 +82,12 @@ def _landmarks(args: argparse.Namespace) -> tuple[Page, str]:
 
     meshes = [(asset.positions, asset.faces) for asset in map(open_asset, args.meshes)]
     rows = None if args.landmarks is True else landmark_vertices(args.landmarks, [points for points, _ in meshes])
-    names = _numbered([path.name for path in args.meshes])
+    names = _number_names([path.name for path in args.meshes])
     page = tm.show_landmarks(dict(zip(names, meshes, strict=True)), rows, title="Landmarks")
     return page, f"{len(meshes)} meshes to pick landmarks on"
 
 
-def _sequences(given: list[list[Path]], args: argparse.Namespace) -> tuple[Page, str]:
+def _sequences(sequences: list[list[Path]], args: argparse.Namespace) -> tuple[Page, str]:
     """A page that plays sequences of the same faces, and what it shows."""
     import torch
 
@@ -95,15 +95,14 @@ def _sequences(given: list[list[Path]], args: argparse.Namespace) -> tuple[Page,
     from torch_modal.io.read import require_same_mesh
     from torch_modal.view.page_input import read_shapes
 
-    first, faces, options = read_shapes(given[0])
-    names, shapes, n = [_name(paths) for paths in given], [first], len(first)
-    for paths in given[1:]:
+    first, faces, options = read_shapes(sequences[0])
+    names, shapes, n = [_sequence_name(paths) for paths in sequences], [first], len(first)
+    for paths in sequences[1:]:
         frames, other_faces, _ = read_shapes(paths)
-        require_same_mesh(given[0][0], (first[0], faces), paths[0], (frames[0], other_faces))
+        require_same_mesh(sequences[0][0], (first[0], faces), paths[0], (frames[0], other_faces))
         if len(frames) != n:
             raise ValueError(
-                f"{paths[0]} has {len(frames)} shapes, {given[0][0]} has {n}; sequences are compared shape by shape, "
-                "so both need as many"
+                f"{paths[0]} has {len(frames)} shapes, {sequences[0][0]} has {n}; compared sequences need equally many"
             )
         shapes.append(frames)
     asked = {"keyframe_indices": args.keyframes, "fps": args.fps, "cyclic": args.cyclic or None, "up": args.up}
@@ -116,17 +115,17 @@ def _sequences(given: list[list[Path]], args: argparse.Namespace) -> tuple[Page,
         names.append("linear")
         shapes.append(tm.linear_sequence(torch.from_numpy(first[keys]), [*keys, n] if cyclic else keys).numpy())
     bones = args.bones if args.page else 0  # a page that opens at once keeps nobody waiting
-    page = tm.show(dict(zip(_numbered(names), shapes, strict=True)), faces, **options, title=names[0], bones=bones)
+    page = tm.show(dict(zip(_number_names(names), shapes, strict=True)), faces, **options, title=names[0], bones=bones)
     times = f"{len(shapes)} x " if len(shapes) > 1 else ""
     return page, f"{times}{n} shapes of {first.shape[1]} vertices"
 
 
-def _name(paths: list[Path]) -> str:
-    """The name of a sequence: of its only file or folder, or of its files' folder."""
+def _sequence_name(paths: list[Path]) -> str:
+    """Name of a sequence: its only file or folder, or the folder of its files."""
     path = paths[0].absolute() if len(paths) == 1 else paths[0].absolute().parent
     return path.stem if path.is_file() else path.name
 
 
-def _numbered(names: list[str]) -> list[str]:
-    """Names with a number each, if some are equal."""
+def _number_names(names: list[str]) -> list[str]:
+    """Append numbers to the names, if some are equal."""
     return names if len(set(names)) == len(names) else [f"{name} {i}" for i, name in enumerate(names, 1)]

@@ -1,4 +1,4 @@
-"""Amplitudes that bring a decoder's shapes closest to given frames: a small least-squares problem for each frame."""
+"""Amplitudes for which a decoder's shapes are closest to given frames: a small least-squares problem for each frame."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -11,13 +11,14 @@ from torch_modal.geometry.rotations import log
 from torch_modal.motion.decoder import ModalDecoder
 
 MAX_STEPS = 6
-MIN_GAIN = 0.01  # a frame is done when a step lowers the squared residual by less than this part
-SHORTER = 0.4  # part of a step that is tried where the whole step does not lower the residual
-RIDGE = 1e-4  # over the mean diagonal of the normal equations: amplitudes that hardly move the vertices stay near zero
-DIFFERENCE = 1e-3  # difference of amplitudes, for the Jacobian
+MIN_GAIN = 0.01  # a frame has converged when a step lowers the squared residual by less than this fraction
+SHORT_STEP = 0.4  # fraction of a step that is tried where the whole step does not lower the residual
+AMPLITUDE_RIDGE = 1e-4
+"""Times the mean diagonal of the normal equations: amplitudes that hardly move the vertices stay near zero."""
+AMPLITUDE_STEP = 1e-3  # difference of amplitudes, for the Jacobian
 MAX_TURN = 0.3
 """Change of edges, over their lengths, from which on the Jacobian is recomputed; about a rotation in radians."""
-QUANTILE = 0.95  # quantile of the edges' changes that is compared with that limit
+TURN_QUANTILE = 0.95  # quantile of the edges' changes that is compared with that limit
 
 
 class FittedFrames(NamedTuple):
@@ -34,9 +35,9 @@ class FittedFrames(NamedTuple):
 def fit(
     decoder: ModalDecoder, frames: Tensor, times: Tensor, on_frame: Callable[[], object] = lambda: None
 ) -> FittedFrames:
-    """Fit amplitudes and rigid motions of frames at some times, near key-frames of a decoder. *Shape:* ``(T, V, 3)``.
+    """Fit amplitudes and rigid motions of frames at given times. *Shape:* ``(T, V, 3)``.
 
-    Each frame starts from the amplitudes of the one before, as long as both are in the same interval of key-frames.
+    Each frame starts from the amplitudes of the frame before, if both are in the same interval of key-frames.
     """
     n, k = len(frames), decoder.n_modes
     found = FittedFrames(torch.zeros(n, k).double(), torch.zeros(n, 6).double(), torch.zeros(n).double())
@@ -58,31 +59,31 @@ def fit(
 
 
 class _Linearisation:
-    """Derivatives of the vertices by the amplitudes at one shape, without rigid motions, and their normal equations.
+    """Derivatives of the vertices with respect to the amplitudes, without rigid motions, and their normal equations.
 
-    All other shapes are aligned to that one, so that its derivatives serve them however the body turns.
+    They are taken at one shape. Other shapes are aligned to it, so that they are valid however the body turns.
     """
 
     def __init__(self, decoder: ModalDecoder, a: Tensor, t: Tensor) -> None:
         k = decoder.n_modes
         self._ends = decoder.faces[:, :2].T
         self.x = decoder(a, t)
-        shapes = decoder(a + DIFFERENCE * torch.eye(k).double(), t)
-        flat = ((shapes - self.x) / DIFFERENCE).flatten(1)
+        shapes = decoder(a + AMPLITUDE_STEP * torch.eye(k).double(), t)
+        flat = ((shapes - self.x) / AMPLITUDE_STEP).flatten(1)
         rigid = torch.linalg.qr(infinitesimal_motions(self.x - self.x.mean(0)).flatten(1).mT).Q
         #: *Shape:* ``(k, 3V)``.
         self.rows = flat - (flat @ rigid) @ rigid.mT
         normal = self.rows @ self.rows.mT
-        self.ridge = RIDGE * normal.diagonal().mean().clamp_min(torch.finfo(torch.float64).tiny)
+        self.ridge = AMPLITUDE_RIDGE * normal.diagonal().mean().clamp_min(torch.finfo(torch.float64).tiny)
         self.factor = torch.linalg.cholesky(normal + self.ridge * torch.eye(k).double())
 
     def holds(self, x: Tensor) -> bool:
-        """True if a shape is so near that the derivatives serve it. *Shape:* ``(V, 3)``."""
+        """True if a shape is so near that the derivatives are valid for it. *Shape:* ``(V, 3)``."""
         i, j = self._ends
-        own, other = (shape[j] - shape[i] for shape in (self.x, best_fit(x, self.x).apply(x)))
-        length = own.norm(dim=1).clamp_min(torch.finfo(torch.float64).tiny)
-        change = (other - own).norm(dim=1) / length
-        return float(change.kthvalue(max(1, int(QUANTILE * len(change)))).values) < MAX_TURN
+        edges, other_edges = (shape[j] - shape[i] for shape in (self.x, best_fit(x, self.x).apply(x)))
+        length = edges.norm(dim=1).clamp_min(torch.finfo(torch.float64).tiny)
+        change = (other_edges - edges).norm(dim=1) / length
+        return float(change.kthvalue(max(1, int(TURN_QUANTILE * len(change)))).values) < MAX_TURN
 
     def step(self, residual: Tensor, a: Tensor) -> Tensor:
         """Gauss-Newton step of the amplitudes. *Shape:* ``(V, 3), (k,) -> (k,)``."""
@@ -91,21 +92,21 @@ class _Linearisation:
 
 
 def _fit_frame(decoder: ModalDecoder, frame: Tensor, t: Tensor, start: Tensor, linear: _Linearisation) -> Tensor:
-    """Amplitudes of one frame, from given ones or from zero, whichever is nearer."""
+    """Amplitudes of one frame, starting from the given ones or from zero, whichever is nearer."""
 
-    def tried(a: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def evaluate(a: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         x = decoder(a, t)
         x = best_fit(x, linear.x).apply(x)
         residual = best_fit(frame, x).apply(frame) - x
         return a, residual, residual.square().sum()
 
-    best = min((tried(a) for a in (start, torch.zeros_like(start))), key=lambda one: float(one[2]))
+    best = min((evaluate(a) for a in (start, torch.zeros_like(start))), key=lambda one: float(one[2]))
     for _ in range(MAX_STEPS):
         a, residual, squared = best
         step = linear.step(residual, a)
-        new = tried(a + step)
+        new = evaluate(a + step)
         if new[2] > squared:
-            new = tried(a + SHORTER * step)
+            new = evaluate(a + SHORT_STEP * step)
         if new[2] > squared:
             break
         best = new

@@ -14,7 +14,7 @@ from torch_modal.motion.decoder import ModalDecoder
 from torch_modal.progress import Progress, ProgressReport
 from torch_modal.times import check_times
 
-ERROR = 0.002  # default for the largest mean distance of a frame's vertices, over the diagonal
+LARGEST_ERROR = 0.002  # default for the largest mean distance of a frame's vertices, over the diagonal
 N_SAMPLES = 5  # frames of an interval that are fitted to estimate its error
 
 
@@ -23,7 +23,7 @@ def select_keyframes(
     faces: Any,
     n_keyframes: int | None = None,
     *,
-    error: float = ERROR,
+    error: float = LARGEST_ERROR,
     n_modes: int = 60,
     times: Tensor | Sequence[float] | None = None,
     cyclic: bool = False,
@@ -34,8 +34,8 @@ def select_keyframes(
     """Select the frames of a motion that serve best as its key-frames.
 
     Key-frames are inserted one by one where the errors of the frames between are largest; a given number of them is
-    then moved while the mean error falls. Errors are those of :func:`torch_modal.encode`, estimated from a few frames
-    of each interval.
+    then moved while the mean error falls. Errors are the errors of :func:`torch_modal.encode`, estimated from a few
+    frames of each interval.
 
     Args:
         frames: A motion of one connectivity, in any units. *Shape:* ``(T, V, 3)``.
@@ -86,7 +86,7 @@ class Selection:
         """
         n = len(self.frames)
         if n_keyframes is not None and not 2 <= n_keyframes <= n:
-            raise ValueError(f"the number of key-frames is from 2 to the {n} frames; got {n_keyframes}")
+            raise ValueError(f"n_keyframes must be from 2 to the number of frames, {n}; got {n_keyframes}")
         keys = [0, n // 2] if self.cyclic else [0, n - 1]
         with ProgressReport(n_keyframes or n, "key-frames", progress) as bar:
             while len(keys) < (n_keyframes or n):
@@ -102,16 +102,16 @@ class Selection:
                 centre = sum(f * e for f, e in errors.items()) / total if total > 0 else (a + b) / 2
                 keys = sorted([*keys, min(max(round(centre), a + 1), b - 1)])
                 bar.update()
-        return keys if n_keyframes is None else self._moved(keys)
+        return keys if n_keyframes is None else self._move_keyframes(keys)
 
     def intervals(self, keys: Sequence[int]) -> list[tuple[dict[int, float], int, int]]:
         """Errors of a few frames of each interval between key-frames, by their numbers, and its first and last frame.
 
         The last interval of a cycle ends at the number of frames.
         """
-        found, n, period = [], len(keys), len(self.frames)
+        result, n, period = [], len(keys), len(self.frames)
         for i, (a, b) in enumerate(pairwise([*keys, period] if self.cyclic else keys)):
-            # The path of an interval depends on four key-frames; those of later periods of a cycle count on.
+            # The path of an interval depends on four key-frames; numbers go on in later periods of a cycle.
             if self.cyclic:
                 around = [keys[j % n] + period * (j // n) for j in range(i - 1, i + 3)]
             else:
@@ -119,27 +119,27 @@ class Selection:
             name = (*around, a)
             if name not in self._known:
                 samples = torch.linspace(a + 1, b - 1, min(N_SAMPLES, b - a - 1)).round().long()
-                self._known[name] = self._fitted(around, samples)
-            found.append((self._known[name], a, b))
-        return found
+                self._known[name] = self._fit_samples(around, samples)
+            result.append((self._known[name], a, b))
+        return result
 
     def mean(self, keys: Sequence[int]) -> float:
         """Estimated mean error of all frames."""
         each = [sum(e.values()) / max(len(e), 1) * (b - a - 1) for e, a, b in self.intervals(keys)]
         return sum(each) / len(self.frames)
 
-    def _fitted(self, around: list[int], samples: Tensor) -> dict[int, float]:
+    def _fit_samples(self, around: list[int], samples: Tensor) -> dict[int, float]:
         if not len(samples):
             return {}
         period = len(self.frames)
         duration = self.times[-1] - self.times[0]
         key_times = torch.stack([self.times[key % period] + duration * (key // period) for key in around])
         decoder = self._decoder.with_keyframes(self.frames[[key % period for key in around]], key_times)
-        found = fit(decoder, self.frames[samples], self.times[samples])
-        return dict(zip(samples.tolist(), found.errors.tolist(), strict=True))
+        fitted = fit(decoder, self.frames[samples], self.times[samples])
+        return dict(zip(samples.tolist(), fitted.errors.tolist(), strict=True))
 
-    def _moved(self, keys: list[int]) -> list[int]:
-        """Key-frames moved one at a time, by steps that halve, as long as the mean error falls."""
+    def _move_keyframes(self, keys: list[int]) -> list[int]:
+        """Move key-frames one at a time, by steps that halve, as long as the mean error falls."""
         n = len(self.frames)
         step = max(1, n // (4 * len(keys)))
         best = self.mean(keys)

@@ -1,4 +1,4 @@
-"""A motion as a few key-frames and a short vector for each frame: amplitudes of modes beside the smooth path."""
+"""A motion as a few key-frames and a short vector for each frame: amplitudes of modes added to the smooth path."""
 
 import os
 from collections.abc import Sequence
@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torch_modal.codec.fit import FittedFrames, fit
-from torch_modal.codec.selection import ERROR, Selection, checked_motion
+from torch_modal.codec.selection import LARGEST_ERROR, Selection, checked_motion
 from torch_modal.io.tensors import TensorFile, write_tensors
 from torch_modal.keyframes.arrays import check_tensor
 from torch_modal.keyframes.check import check_keyframes
@@ -23,14 +23,14 @@ from torch_modal.times import check_times, locate_times
 FORMAT = "torch_modal.sequence"
 VERSION = "3"
 STORED = ("keyframes", "faces", "keyframe_times", "times", "amplitudes", "motions", "modes", "errors")
-CHUNK = 16  # frames that are decoded at once
+FRAMES_AT_ONCE = 16  # frames that are decoded at once
 
 
 @dataclass(frozen=True, eq=False)
 class ModalSequence:
     """A motion: key-frames, and amplitudes, a rigid motion and a time for each frame.
 
-    Amplitudes are those of :class:`torch_modal.ModalDecoder`: 0 is the smooth path, 1 moves vertices by 1 % of the
+    Amplitudes are as in :class:`torch_modal.ModalDecoder`: 0 is the smooth path, 1 moves vertices by 1 % of the
     diagonal. They mean the same in all frames.
 
     Attributes:
@@ -87,7 +87,7 @@ class ModalSequence:
 
     @property
     def n_floats(self) -> int:
-        """Numbers that the motion consists of: key-frames, and amplitudes, rigid motion and time of each other frame.
+        """Number of floats of the motion: key-frames, and amplitudes, rigid motion and time of each other frame.
 
         Without modes, which :func:`torch_modal.extract_modes` computes again from the first key-frame.
         """
@@ -103,7 +103,7 @@ class ModalSequence:
         """The frames, or the shapes at other times, by linear interpolation of the amplitudes.
 
         Args:
-            t: Times, from the first to the last frame; if cyclic, any. Default: those of the frames. *Shape:*
+            t: Times, from the first to the last frame; if cyclic, any. Default: the times of the frames. *Shape:*
                 ``(N,)``, or a number.
             progress: See :data:`torch_modal.progress.Progress`.
 
@@ -121,7 +121,7 @@ class ModalSequence:
                 a, motions = self._at(times)
             out = torch.empty(len(times), *self.keyframes.shape[1:], dtype=torch.float64)
             with ProgressReport(len(times), "decoded frames", progress) as bar:
-                for rows in torch.arange(len(times)).split(CHUNK):
+                for rows in torch.arange(len(times)).split(FRAMES_AT_ONCE):
                     out[rows] = self.decoder(a[rows], times[rows], motions[rows])
                     bar.update(len(rows))
             for shape, time in zip(self.keyframes, self.keyframe_times.tolist(), strict=False):
@@ -129,7 +129,7 @@ class ModalSequence:
         return out
 
     def fit(self, frames: Any, times: Any) -> FittedFrames:
-        """Fit amplitudes of other frames beside the same path, such as those of another motion of the same mesh.
+        """Fit amplitudes of other frames along the same path, such as frames of another motion of the same mesh.
 
         Args:
             frames: In the units of the key-frames. *Shape:* ``(N, V, 3)``.
@@ -186,7 +186,7 @@ def encode(
     keyframes: Sequence[int] | int | None = None,
     n_modes: int = 60,
     *,
-    error: float = ERROR,
+    error: float = LARGEST_ERROR,
     times: Tensor | Sequence[float] | None = None,
     cyclic: bool = False,
     cache_dir: str | None = None,
@@ -195,8 +195,8 @@ def encode(
 ) -> ModalSequence:
     """Encode a motion as key-frames and amplitudes.
 
-    Each frame is fitted by least squares of its vertices, after the best rigid motion, from the amplitudes of the frame
-    before. Modes are those of the first frame.
+    Each frame is fitted by least squares of its vertices, after the best rigid motion, starting from the amplitudes of
+    the frame before. Modes are the vibration modes of the first frame.
 
     Args:
         frames: A motion of one connectivity, in any units. *Shape:* ``(T, V, 3)``.
@@ -218,13 +218,13 @@ def encode(
     """
     x, triangles, when = checked_motion(frames, faces, times, cyclic)
     if isinstance(n_modes, bool) or not isinstance(n_modes, int) or n_modes < 1:
-        raise ValueError(f"n_modes is {n_modes!r}; give a whole number of at least 1")
+        raise ValueError(f"n_modes must be a whole number of at least 1; got {n_modes!r}")
     if not 0 < error < 1:
-        raise ValueError(f"error is a part of the diagonal, such as 0.002; got {error!r}")
-    given = not isinstance(keyframes, (int, type(None)))
-    keys = _checked_keys(keyframes, len(x), cyclic) if given else []
+        raise ValueError(f"error must be a positive fraction of the diagonal, such as 0.002; got {error!r}")
+    listed = not isinstance(keyframes, (int, type(None)))
+    keys = _check_keys(keyframes, len(x), cyclic) if listed else []
     modes = extract_modes(x[0], triangles, n_modes, cache_dir=cache_dir, cache=cache).modes
-    if not given:
+    if not listed:
         keys = Selection(x, triangles, when, cyclic, modes).run(keyframes, error, progress)  # type: ignore[arg-type]
     n, k = len(x), len(modes)
     while True:
@@ -233,8 +233,8 @@ def encode(
         sequence = ModalSequence(x[keys], triangles, key_times, when[:n], amplitudes, motions, modes, errors)
         others = torch.nonzero(~sequence.is_keyframe)[:, 0]
         with ProgressReport(len(others), "encoded frames", progress) as bar:
-            found = fit(sequence.decoder, x[others], when[others], bar.update)
-        amplitudes[others], motions[others], errors[others] = found
+            fitted = fit(sequence.decoder, x[others], when[others], bar.update)
+        amplitudes[others], motions[others], errors[others] = fitted
         if keyframes is not None or float(errors.max()) <= error:
             return sequence
         # Errors were estimated from samples: add the worst frame of each interval that has one above the error.
@@ -242,14 +242,14 @@ def encode(
         keys = sorted({*keys, *(f for f in worst if float(errors[f]) > error)})
 
 
-def _checked_keys(keyframes: Any, n_frames: int, cyclic: bool) -> list[int]:
+def _check_keys(keyframes: Any, n_frames: int, cyclic: bool) -> list[int]:
     keys, last = [int(i) for i in keyframes], n_frames - 1
     required = "the first frame" if cyclic else "the first and the last frame"
     ends = {0} if cyclic else {0, last}
     ascending = all(a < b for a, b in pairwise(keys))
     if len(keys) < 2 or not ascending or not ends <= set(keys) or keys[-1] > last or keys[0] < 0:
         raise ValueError(
-            f"keyframes are two or more ascending frame numbers from 0 to {last}, with {required} among them; "
+            f"keyframes must be two or more ascending frame numbers from 0 to {last}, with {required} among them; "
             f"got {keys}"
         )
     return keys

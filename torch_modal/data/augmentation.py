@@ -31,8 +31,8 @@ class ShapeAugmentation(nn.Module):
     shape change labels (``blend_labels``).
 
     Parameters are drawn for each sample on the device of the generator, independent of the shapes' device and dtype.
-    :attr:`params` has those of the last call, ``batch_prob`` (which shapes were transformed) among them; a call with
-    ``params`` repeats them.
+    :attr:`params` has the parameters of the last call, and ``batch_prob``, which shapes were transformed; a call with
+    ``params`` repeats it.
 
     Args:
         p: Probability that a shape is transformed.
@@ -65,12 +65,12 @@ class ShapeAugmentation(nn.Module):
     ) -> None:
         super().__init__()
         if not 0 <= p <= 1:
-            raise ValueError(f"p is a probability, from 0 to 1; got {p}")
+            raise ValueError(f"p must be a probability, from 0 to 1; got {p}")
         self.data_keys = tuple(data_keys)
         if "shapes" not in self.data_keys or len(set(self.data_keys)) < len(self.data_keys):
-            raise ValueError(f"data_keys name each thing once, 'shapes' among them; got {self.data_keys}")
+            raise ValueError(f"data_keys must be unique and include 'shapes'; got {self.data_keys}")
         if set(self.data_keys) - set(DATA_KEYS):
-            raise ValueError(f"data_keys are of {DATA_KEYS}; got {self.data_keys}")
+            raise ValueError(f"data_keys must be among {DATA_KEYS}; got {self.data_keys}")
         self.p = p
         self.same_on_batch = same_on_batch
         self.keepdim = keepdim
@@ -116,7 +116,7 @@ class ShapeAugmentation(nn.Module):
             generator: By default the module's.
 
         Returns:
-            A dict; of :class:`AugmentationSequential` a list with one for each transform.
+            A dict; for :class:`AugmentationSequential`, a list with one for each transform.
 
         Raises:
             ValueError: There is no space, and the transform needs one.
@@ -124,7 +124,7 @@ class ShapeAugmentation(nn.Module):
         space, generator = self._space(space), self.generator if generator is None else generator
         drawn = 1 if self.same_on_batch and n else n
         with torch.inference_mode(False):  # a later call, with gradients, may repeat them
-            chosen = uniform(drawn, generator) < self.p
+            chosen = draw_uniform(drawn, generator) < self.p
             params = {"batch_prob": chosen, **self.generate_parameters(drawn, space, generator)}
         return {name: value.expand(n, *value.shape[1:]) for name, value in params.items()}
 
@@ -155,22 +155,22 @@ class ShapeAugmentation(nn.Module):
         if not len(chosen):
             return batch
         if self.uses_keyframes:
-            batch = batch.located(space, torch.promote_types(dtype, space.least_dtype))
+            batch = batch.locate(space, torch.promote_types(dtype, space.least_dtype))
         mine, partners = batch.rows(chosen), None
         if "partner" in params:
             partners = batch.partners(chosen, params["partner"].cpu()[chosen], space, pool)
             if partners is None:
                 return batch._replace(shapes=batch.shapes.to(dtype))
-        own = {}
+        chosen_params = {}
         for name, value in params.items():
             kind = mine.shapes.dtype if value.is_floating_point() else None
-            own[name] = value[chosen.to(value.device)].to(device, kind)
-        found = self.apply_transform(mine, own, space, partners)
+            chosen_params[name] = value[chosen.to(value.device)].to(device, kind)
+        result = self.apply_transform(mine, chosen_params, space, partners)
         if batch.is_keyframe is not None:
-            found = found._replace(is_keyframe=torch.zeros(len(chosen), dtype=torch.bool))
+            result = result._replace(is_keyframe=torch.zeros(len(chosen), dtype=torch.bool))
         parts = (
             before if before is None or after is None else before.index_copy(0, chosen.to(before.device), after)
-            for before, after in zip(batch, found, strict=True)
+            for before, after in zip(batch, result, strict=True)
         )
         batch = ShapeBatch._make(parts)
         return batch._replace(shapes=batch.shapes.to(dtype))
@@ -210,15 +210,15 @@ class ShapeAugmentation(nn.Module):
         self.params = self.forward_parameters(len(batch.shapes), space) if params is None else params
         out = self.transform(batch, self.params, space, pool)
         if "normals" in named:
-            own = (each.space for each in self.modules() if isinstance(each, ShapeAugmentation))
-            known = [each for each in (space, *own) if each is not None]
+            own_spaces = (each.space for each in self.modules() if isinstance(each, ShapeAugmentation))
+            known = [each for each in (space, *own_spaces) if each is not None]
             if not known:
                 raise ValueError("normals need faces: pass space=ShapeSpace(bases, faces) when it is made or called")
             normals = vertex_normals(out.shapes, known[0].faces)
-        found = [normals if name == "normals" else getattr(out, name) for name in named]
+        results = [normals if name == "normals" else getattr(out, name) for name in named]
         if single and self.keepdim:
-            found = [None if value is None else value[0] for value in found]
-        return found[0] if len(found) == 1 else tuple(found)
+            results = [None if value is None else value[0] for value in results]
+        return results[0] if len(results) == 1 else tuple(results)
 
     def _space(self, space: ShapeSpace | None) -> Any:
         space = self.space if space is None else space
@@ -235,14 +235,14 @@ class AugmentationSequential(ShapeAugmentation):
 
     Args:
         transforms: The transforms, in order.
-        data_keys: As for :class:`ShapeAugmentation`; only those of the sequence count.
+        data_keys: As for :class:`ShapeAugmentation`; the transforms' own data keys have no effect.
         keepdim: Likewise.
         generator: Source of random numbers of all transforms; by default each has its own.
         space: Key-frames and modes, for all transforms; by default each has its own.
         pool: Likewise.
 
     Raises:
-        ValueError: An unknown or doubled data key, no shapes, or what is no transform.
+        ValueError: A data key is unknown or doubled, there are no shapes, or an argument is no transform.
     """
 
     uses_keyframes = False
@@ -265,7 +265,7 @@ class AugmentationSequential(ShapeAugmentation):
     def forward_parameters(
         self, n: int, space: ShapeSpace | None = None, generator: torch.Generator | None = None
     ) -> list[Parameters]:
-        """Draw parameters for ``n`` shapes, of each transform."""
+        """Draw parameters of each transform for ``n`` shapes."""
         space, generator = self._space(space), self.generator if generator is None else generator
         return [one.forward_parameters(n, space, generator) for one in self.transforms]
 
@@ -275,34 +275,36 @@ class AugmentationSequential(ShapeAugmentation):
         """Transform a batch with given parameters; arguments as for :meth:`ShapeAugmentation.transform`.
 
         Raises:
-            ValueError: As there, or as many sets of parameters as transforms are not given.
+            ValueError: As there, or there are not as many sets of parameters as transforms.
         """
         if len(params) != len(self.transforms):
             raise ValueError(f"{len(self.transforms)} transforms need as many sets of parameters; got {len(params)}")
-        for one, own in zip(self.transforms, params, strict=True):
-            batch = one.transform(batch, own, self._space(space), self.pool if pool is None else pool)
+        for one, parameters in zip(self.transforms, params, strict=True):
+            batch = one.transform(batch, parameters, self._space(space), self.pool if pool is None else pool)
         return batch
 
 
-def check_range(name: str, given: tuple[float, float], lowest: float, highest: float) -> tuple[float, float]:
-    """A range of numbers; raises a ValueError unless it is one within the bounds."""
+def check_range(name: str, span: tuple[float, float], lowest: float, highest: float) -> tuple[float, float]:
+    """Check a range of numbers; raises a ValueError unless it lies within the bounds."""
     try:
-        low, high = map(float, given)
+        low, high = map(float, span)
     except (TypeError, ValueError):
         low = high = math.nan
     if not lowest <= low <= high <= highest:
-        raise ValueError(f"{name} is a range (low, high) within [{lowest}, {highest}]; got {str(given)[:100]}")
+        raise ValueError(f"{name} must be a range (low, high) within [{lowest}, {highest}]; got {str(span)[:100]}")
     return low, high
 
 
-def uniform(n: int, generator: torch.Generator | None, span: tuple[float, float] = (0.0, 1.0), *size: int) -> Tensor:
+def draw_uniform(
+    n: int, generator: torch.Generator | None, span: tuple[float, float] = (0.0, 1.0), *size: int
+) -> Tensor:
     """Uniform numbers in a range, float64. *Shape:* ``(n, ...)``."""
     device = "cpu" if generator is None else generator.device
     drawn = torch.rand(n, *size, dtype=torch.float64, generator=generator, device=device)
     return span[0] + (span[1] - span[0]) * drawn
 
 
-def normal(n: int, generator: torch.Generator | None, *size: int) -> Tensor:
+def draw_normal(n: int, generator: torch.Generator | None, *size: int) -> Tensor:
     """Standard normal numbers, float64. *Shape:* ``(n, ...)``."""
     device = "cpu" if generator is None else generator.device
     return torch.randn(n, *size, dtype=torch.float64, generator=generator, device=device)

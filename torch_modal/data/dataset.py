@@ -44,12 +44,11 @@ class ShapeDataset(Dataset[Sample]):
         labels: Returns the labels of a set: ``vertex_labels`` (V, ...) or (K, V, ...), and ``shape_labels`` (K, ...),
             each if there are any. A function of a module, if workers are spawned. By default the tensors in the file
             ``labels.safetensors`` of the set's folder.
-        seed: Of all random numbers.
-        dtype: Of the vertices.
-        faces: Whether samples have their faces. A loader stacks them with the rest; those of a :meth:`space` are there
-            once.
+        seed: Seed of all random numbers.
+        dtype: Dtype of the vertices.
+        faces: Whether samples have their faces. A loader stacks them for each sample; a :meth:`space` has them once.
         normals: Whether samples have normals.
-        options: Of the spaces (:class:`ShapeSpace`), such as ``preset`` or ``times``.
+        options: Options of the spaces (:class:`ShapeSpace`), such as ``preset`` or ``times``.
 
     Raises:
         FileNotFoundError: There is no such folder, or no set in it.
@@ -112,7 +111,7 @@ class ShapeDataset(Dataset[Sample]):
         return self.__getitems__([index])[0]
 
     def __getitems__(self, indices: Sequence[int]) -> list[Sample]:
-        """Several samples, those of the same set computed together; loaders call this for each batch."""
+        """Several samples; samples of the same set are computed together. Loaders call this for each batch."""
         samples: dict[int, Sample] = {}
         by_set: dict[int, list[int]] = {}
         for place, index in enumerate(indices):
@@ -143,7 +142,7 @@ class ShapeDataset(Dataset[Sample]):
             parts["normals"] = vertex_normals(batch.shapes, space.faces)
         # Copies: a view would carry the whole batch to another process.
         samples: list[Sample] = [
-            {name: part[row].clone() for name, part in parts.items() if part is not None}
+            {name: tensor[row].clone() for name, tensor in parts.items() if tensor is not None}
             | {"set": number, "keyframe": int(start[row])}
             | ({"faces": space.faces} if self.with_faces else {})
             for row in range(len(indices))
@@ -178,7 +177,7 @@ class ShapeDataset(Dataset[Sample]):
 
 
 class SetBatchSampler(Sampler[list[int]]):
-    """Batches of samples of one set each, so that they can be stacked where sets differ in their vertices.
+    """Batches whose samples are of one set, so that they can be stacked where sets have different numbers of vertices.
 
     Follows the epoch of the dataset.
 
@@ -207,8 +206,8 @@ class SetBatchSampler(Sampler[list[int]]):
         random = np.random.default_rng([self.dataset.seed, self.dataset.epoch])
         batches: list[list[int]] = []
         for number in range(len(self.dataset.sets)):
-            own = number * size + (random.permutation(size) if self.shuffle else np.arange(size))
-            batches += BatchSampler(own.tolist(), self.batch_size, self.drop_last)
+            indices = number * size + (random.permutation(size) if self.shuffle else np.arange(size))
+            batches += BatchSampler(indices.tolist(), self.batch_size, self.drop_last)
         order = random.permutation(len(batches)) if self.shuffle else np.arange(len(batches))
         for place in order:
             yield batches[place]

@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 
 from torch_modal.autograd import transformed
-from torch_modal.data.augmentation import Parameters, ShapeAugmentation, check_range, normal, uniform
-from torch_modal.data.in_betweens import by_kind
+from torch_modal.data.augmentation import Parameters, ShapeAugmentation, check_range, draw_normal, draw_uniform
+from torch_modal.data.in_betweens import compute_by_kind
 from torch_modal.data.shape_batch import ShapeBatch
 from torch_modal.data.space import ShapeSpace
 from torch_modal.data.strain import edge_strains
@@ -15,16 +15,16 @@ from torch_modal.geometry.poisson import Reconstruction
 from torch_modal.geometry.rigid import best_fit
 from torch_modal.geometry.triangle_frames import bend, bent_sides, frames, sides
 
-# A draw beyond the bound is scaled to this part of it; its largest strain is nearly linear in the scale.
-_INSIDE = 0.98
-_STEEPEST = 0.05
-_ROUNDS = 8
+# A draw beyond the bound is scaled to this fraction of it; its largest strain is nearly linear in the scale.
+_WITHIN_BOUND = 0.98
+_SMALLEST_FACTOR = 0.05
+_SCALING_ROUNDS = 8
 
 # The same draw with and without gradients differs by rounding; both must stay within the bound.
 _ROUNDING = 1e-4
 
-# Numbers of all edge vectors that are computed at a time.
-_CHUNK_NUMBERS = 2**22
+# Largest number of coordinates of edge vectors in memory at a time.
+_NUMBERS_AT_ONCE = 2**22
 
 
 class RandomModalDeformation(ShapeAugmentation):
@@ -38,8 +38,8 @@ class RandomModalDeformation(ShapeAugmentation):
 
     Args:
         strain: Range of the expected root mean square edge strain (which is sigma, in other units), drawn uniformly; a
-            number is a range of one. Of sheets, which bend without changes of length, it is the strain of the sides at
-            a thickness of a hundredth of their size: 0.02 bends by about 4 radians over the size.
+            number means exactly that. Sheets bend without changes of length: for them it is the strain of their two
+            sides, at a thickness of a hundredth of their size: 0.02 bends by about 4 radians over the size.
         max_strain: Bound on the relative change of length of every edge.
         p: Probability that a shape is transformed.
         options: As for :class:`ShapeAugmentation`.
@@ -62,7 +62,7 @@ class RandomModalDeformation(ShapeAugmentation):
 
     def generate_parameters(self, n: int, space: Any, generator: torch.Generator | None) -> Parameters:
         """``noise``, a standard normal number for each mode, and the ``strain``."""
-        return {"strain": uniform(n, generator, self.strain), "noise": normal(n, generator, space.n_modes)}
+        return {"strain": draw_uniform(n, generator, self.strain), "noise": draw_normal(n, generator, space.n_modes)}
 
     def apply_transform(
         self, batch: ShapeBatch, params: Parameters, space: Any, partners: ShapeBatch | None
@@ -70,22 +70,22 @@ class RandomModalDeformation(ShapeAugmentation):
         """Deform each shape along the modes of its nearest key-frame."""
         assert batch.nearest is not None
         amplitudes = params["strain"][:, None] * params["noise"]
-        chunk = max(1, _CHUNK_NUMBERS // (9 * len(space.faces)))
+        chunk = max(1, _NUMBERS_AT_ONCE // (9 * len(space.faces)))
 
-        def deformed(kind: list[int], rows: Tensor) -> Tensor:
-            parts = rows.to(amplitudes.device).split(chunk)
-            return torch.cat([self._deformed(batch.shapes[part], amplitudes[part], space, kind[0]) for part in parts])
+        def deform_rows(kind: list[int], rows: Tensor) -> Tensor:
+            chunks = rows.to(amplitudes.device).split(chunk)
+            return torch.cat([self._deform_nearest(batch.shapes[r], amplitudes[r], space, kind[0]) for r in chunks])
 
-        return batch._replace(shapes=by_kind(batch.nearest[:, None], deformed))
+        return batch._replace(shapes=compute_by_kind(batch.nearest[:, None], deform_rows))
 
-    def _deformed(self, x: Tensor, amplitudes: Tensor, space: ShapeSpace, index: int) -> Tensor:
-        """Shapes that are nearest to one key-frame. *Shape:* ``(B, V, 3), (B, n) -> (B, V, 3)``."""
+    def _deform_nearest(self, x: Tensor, amplitudes: Tensor, space: ShapeSpace, index: int) -> Tensor:
+        """Deform shapes whose nearest key-frame is the same. *Shape:* ``(B, V, 3), (B, n) -> (B, V, 3)``."""
         basis, reconstruction = space.bases[index], space.reconstruction(x.device)
-        keyframe, modes, scales = (part.to(x) for part in (basis.reference, basis.modes, space.mode_scales(index)))
+        keyframe, modes, scales = (tensor.to(x) for tensor in (basis.reference, basis.modes, space.mode_scales(index)))
         displacement = (amplitudes[:, : len(scales)] * scales) @ modes.flatten(1)
         displacement = displacement.unflatten(1, (-1, 3)).movedim(-1, 0).contiguous()
         with torch.no_grad():
-            scale, deformed = self._bounded(x.detach(), displacement.detach(), keyframe, space)
+            scale, deformed = self._scale_to_bound(x.detach(), displacement.detach(), keyframe, space)
         recording = torch.is_grad_enabled() and (x.requires_grad or amplitudes.requires_grad)
         if not recording and not transformed(x) and not transformed(amplitudes):
             return deformed
@@ -95,15 +95,17 @@ class RandomModalDeformation(ShapeAugmentation):
             within = (space.strain(deformed, x).abs() <= self.max_strain).all(1) & (scale > 0)
         return torch.where(within[:, None, None], deformed, x)
 
-    def _bounded(self, x: Tensor, displacement: Tensor, keyframe: Tensor, space: ShapeSpace) -> tuple[Tensor, Tensor]:
-        """The scale of each draw within the bound, ``(B,)``, and the shapes; unchanged shapes if none is found."""
+    def _scale_to_bound(
+        self, x: Tensor, displacement: Tensor, keyframe: Tensor, space: ShapeSpace
+    ) -> tuple[Tensor, Tensor]:
+        """Scale of each draw that keeps the bound, ``(B,)``, and the shapes; unchanged shapes if there is none."""
         reconstruction = space.reconstruction(x.device)
         bound = (1 - _ROUNDING) * self.max_strain
         expected = edge_strains(displacement, keyframe, reconstruction.edges).abs().amax(1)
-        scale = (_INSIDE * bound / expected.clamp_min(torch.finfo(x.dtype).tiny)).clamp_max(1)
+        scale = (_WITHIN_BOUND * bound / expected.clamp_min(torch.finfo(x.dtype).tiny)).clamp_max(1)
         shapes = x.clone()
         rows = torch.arange(len(x), device=x.device)
-        for _ in range(_ROUNDS):
+        for _ in range(_SCALING_ROUNDS):
             tried = deform(x[rows], (scale[:, None] * displacement)[:, rows], keyframe, reconstruction)
             largest = space.strain(tried, x[rows]).abs().amax(1).nan_to_num(torch.inf)
             within = largest <= bound
@@ -111,21 +113,21 @@ class RandomModalDeformation(ShapeAugmentation):
             rows, largest = rows[~within], largest[~within]
             if not len(rows):
                 return scale, shapes
-            factor = (_INSIDE * bound / largest).clamp_min(_STEEPEST)
+            factor = (_WITHIN_BOUND * bound / largest).clamp_min(_SMALLEST_FACTOR)
             scale = scale.index_copy(0, rows, scale[rows] * factor)
         return scale.index_fill(0, rows, 0), shapes
 
 
 def deform(x: Tensor, displacement: Tensor, keyframe: Tensor, reconstruction: Reconstruction) -> Tensor:
-    """Shapes bent as a linear displacement of a key-frame turns and strains its triangles.
+    """Bend shapes by the rotations and strains that a linear displacement of a key-frame gives its triangles.
 
-    A shape of another pose gets the same rotations, and strains along its own triangles; results are aligned with them.
+    A shape of another pose gets the same rotations, and strains along its own triangles; results are aligned with it.
 
     *Shape:* ``(B, V, 3), (3, B, V), (V, 3) -> (B, V, 3)``.
     """
     faces, weights = reconstruction.faces, reconstruction.areas.to(x)
-    own = frames(sides(keyframe.mT[:, None].contiguous(), faces))
-    turn, strain = bend(sides(displacement, faces), own)
+    keyframe_frames = frames(sides(keyframe.mT[:, None].contiguous(), faces))
+    turn, strain = bend(sides(displacement, faces), keyframe_frames)
     pose = best_fit(keyframe.expand_as(x), x, weights).rotation
     turn = (pose @ turn.movedim(0, 1)).movedim(0, 1)
     rest = x.movedim(-1, 0).contiguous()

@@ -1,4 +1,4 @@
-"""In-betweens of key-frames in pairs, of which tables are kept, and of shapes near them."""
+"""In-betweens of pairs of key-frames, which are kept in tables, and of shapes near them."""
 
 import contextlib
 import math
@@ -32,11 +32,11 @@ class InBetweens:
     """In-betweens of the key-frames of a space, and of shapes near them.
 
     Between two key-frames they are solved once, at even times, and cubics interpolate among these; if the two follow
-    each other in a motion, the shapes are those of its path. Other shapes are solved each, with the modes of the two
-    nearest key-frames. K key-frames have K (K - 1) / 2 pairs: layers and tables are made for those that are used, and
-    the most recent stay in memory.
+    each other in a motion, the shapes lie on its path. Other shapes are solved one by one, with the modes of the two
+    nearest key-frames. K key-frames have K (K - 1) / 2 pairs: layers and tables are made when a pair is used, and the
+    most recent stay in memory.
 
-    Arguments are what :class:`~torch_modal.data.space.ShapeSpace` makes of its own; the folder need not be writable.
+    Arguments are the checked ones of :class:`~torch_modal.data.space.ShapeSpace`; the folder need not be writable.
 
     Raises:
         ValueError: ``times`` is below 4.
@@ -89,7 +89,7 @@ class InBetweens:
             layer = self._layer(first, second, x_a)
             return _check_converged(layer.solve(starts[rows], ends[rows], t[rows]), first, second)
 
-        return by_kind(torch.stack([torch.minimum(i, j), torch.maximum(i, j), keyframes.long()], 1), solve)
+        return compute_by_kind(torch.stack([torch.minimum(i, j), torch.maximum(i, j), keyframes.long()], 1), solve)
 
     def of_keyframes(self, i: int, j: int, t: Tensor) -> Tensor:
         """Shapes between two key-frames, from their table if there are tables.
@@ -127,27 +127,27 @@ class InBetweens:
         return read_or_compute(self.folder, f"between-{i}-{j}", key, compute)
 
     def _layer(self, i: int, j: int, like: Tensor) -> InBetween:
-        def made() -> InBetween:
+        def make_layer() -> InBetween:
             ends = [self.bases[i], self.bases[j]]
             return InBetween(ends, self.faces, **self.settings._asdict()).to(like)
 
-        return self._solvers.get((i, j, like.dtype, like.device), made)
+        return self._solvers.get((i, j, like.dtype, like.device), make_layer)
 
     def _solve(self, i: int, j: int, t: Tensor) -> InBetweenResult:
-        """Solve between two key-frames: along the motion if they follow each other in it, else of the pair."""
+        """Solve between two key-frames: along the motion if they follow each other in it, otherwise the pair alone."""
         motion, span = self.motion, None if self.motion is None else self.motion.span(i, j)
         bases = [self.bases[i], self.bases[j]] if span is None else self.bases
         if span is None and not self.settings.objective.contact:
             first, last = (basis.reference.to(t.device, t.dtype) for basis in bases)
             return self._layer(i, j, t).solve(first, last, t)
 
-        def made() -> tuple[MotionPath, Tensor]:
+        def make_path() -> tuple[MotionPath, Tensor]:
             # A path separates contacts the same way at all times, so that tables are smooth.
             when = (motion.times, motion.cyclic) if motion is not None and span is not None else (None, False)
             path = MotionPath(bases, self.faces, *when, **self.settings._asdict())
             return path.to(t), torch.stack([basis.reference for basis in bases]).to(t)
 
-        path, shapes = self._solvers.get((span is None and (i, j), t.dtype, t.device), made)
+        path, shapes = self._solvers.get((span is None and (i, j), t.dtype, t.device), make_path)
         if span is not None:
             start, end = torch.tensor(span, dtype=torch.float64, device=t.device)
             t = torch.lerp(start, end, t.double())  # exact at both ends
@@ -163,8 +163,8 @@ class InBetweens:
             content = content_digest([*versions(), tensors, self.faces, when, *self.settings])
         except ContentError as error:
             warnings.warn(
-                f"tables of in-betweens are not stored in {self.folder}, as their key cannot hold the objective's own "
-                f"terms: {error}",
+                f"tables of in-betweens are not stored in {self.folder}, as the objective has terms without a "
+                f"digest: {error}",
                 CacheWarning,
                 stacklevel=5,
             )
@@ -173,23 +173,23 @@ class InBetweens:
 
 
 def versions() -> tuple[str, str, str]:
-    """Those on which the numbers of tables depend."""
+    """Versions that enter the key of a table."""
     return __version__, str(torch.__version__), code_digest()
 
 
-def by_kind(kinds: Tensor, compute: Callable[[list[int], Tensor], Tensor]) -> Tensor:
-    """Results of a batch in its order, whose rows of one kind are computed together, from the kind and their indices.
+def compute_by_kind(kinds: Tensor, compute: Callable[[list[int], Tensor], Tensor]) -> Tensor:
+    """Compute a batch by kinds: ``compute`` gets a kind and the indices of its rows; results are in the batch's order.
 
     Kinds are on the CPU. *Shape:* ``(B, n) -> (B, ...)``.
     """
     each, kind = kinds.unique(dim=0, return_inverse=True)
     rows = [torch.nonzero(kind == number).flatten() for number in range(len(each))]
-    found = torch.cat([compute(own, mine) for own, mine in zip(each.tolist(), rows, strict=True)])
-    return found[torch.argsort(torch.cat(rows)).to(found.device)]
+    results = torch.cat([compute(each_kind, mine) for each_kind, mine in zip(each.tolist(), rows, strict=True)])
+    return results[torch.argsort(torch.cat(rows)).to(results.device)]
 
 
 def interpolate(table: Tensor, t: Tensor) -> Tensor:
-    """Cubic Lagrange interpolation among the four nearest of even times in [0, 1].
+    """Cubic Lagrange interpolation between shapes at even times in [0, 1], from the four nearest.
 
     Reads these four only, so that a memory-mapped table is not loaded whole. Exact at the times of the table.
 
@@ -224,7 +224,7 @@ def read_or_compute(
 
 
 def _check_converged(result: InBetweenResult, i: int, j: int) -> Tensor:
-    """The in-betweens; raises for invalid shapes and warns of unconverged ones."""
+    """Raise for in-betweens that are not finite, and warn of unconverged ones; returns the in-betweens."""
     if not bool(result.shapes.isfinite().all()):
         raise ValueError(
             f"there is no in-between of some shapes near the key-frames {i} and {j}: one is not finite, has no size, "

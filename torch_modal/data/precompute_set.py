@@ -234,7 +234,7 @@ def _read_times(file: Path, n_keyframes: int) -> list[float]:
 
 
 def _end_with_parent() -> None:
-    """Wait for the end of the pipe from the parent, then end this process and what it started."""
+    """Wait for the end of the pipe from the parent, then end this process and its children."""
     while os.read(0, 1):  # not sys.stdin, whose lock would be missed at the interpreter's end
         pass
     _thread.interrupt_main()

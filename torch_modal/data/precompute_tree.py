@@ -62,7 +62,7 @@ def precompute_tree(
     out.mkdir(parents=True, exist_ok=True)
     options = options or Options()
     sets, left_out = find_keyframe_sets(root, skip=out)
-    lines = [f"left out {printable(name)}: {why}" for name, why in left_out.items()]
+    lines = [f"left out {escape_name(name)}: {why}" for name, why in left_out.items()]
     if not sets:
         why = "; ".join(lines[:3])
         raise ValueError(f"no folder below {root} directly holds two or more mesh files" + (f" ({why})" if why else ""))
@@ -102,7 +102,7 @@ def precompute_tree(
 
 @contextmanager
 def _executor(workers: int | None, scheduler: str | None) -> Iterator[tuple[Executor, Any]]:
-    """Threads that each wait for the process of one set, or the workers of a cluster; and the event that ends them."""
+    """An executor of threads that each wait for the process of one set, or of a Dask cluster; and its stop event."""
     if not scheduler:
         with ThreadPoolExecutor(workers or n_cpus(), thread_name_prefix="torch_modal-set") as executor:
             yield executor, threading.Event()
@@ -127,10 +127,10 @@ def _line(name: str, record: Record) -> str:
     """``done a/b, 2.1 s: its files changed``."""
     took = f", {record.seconds:.1f} s" if record.status == DONE else ""
     said = "; ".join(filter(None, (record.reason, *record.warnings)))
-    return f"{record.status} {printable(name)}{took}" + (f": {said}" if said else "")
+    return f"{record.status} {escape_name(name)}{took}" + (f": {said}" if said else "")
 
 
-def printable(name: str) -> str:
-    """A name as one line of a terminal can show it; names of folders may hold anything but a slash."""
+def escape_name(name: str) -> str:
+    """Escape a name so that a terminal shows it as one line; names of folders may hold anything but a slash."""
     text = name.encode("utf-8", "backslashreplace").decode()
     return text if text.isprintable() else repr(text)

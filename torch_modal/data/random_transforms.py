@@ -8,7 +8,7 @@ from kornia.geometry.conversions import quaternion_to_axis_angle
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from torch_modal.data.augmentation import Parameters, ShapeAugmentation, check_range, normal, uniform
+from torch_modal.data.augmentation import Parameters, ShapeAugmentation, check_range, draw_normal, draw_uniform
 from torch_modal.data.shape_batch import ShapeBatch
 from torch_modal.data.space import ShapeSpace
 from torch_modal.geometry.poisson import Reconstruction
@@ -25,7 +25,7 @@ class RandomInBetween(ShapeAugmentation):
     alone, without labels, has the key-frames of the space as partners.
 
     Where the key-frames are a motion (``keyframe_times`` of the :class:`ShapeSpace`), the partner from a pool is the
-    key-frame before or after in time, with equal probability, and the in-between is that of :class:`torch_modal.Path`.
+    key-frame before or after in time, with equal probability, and the in-between lies on the :class:`torch_modal.Path`.
     Shapes that are not key-frames have the same partners; their in-betweens depend on these two shapes only.
 
     Args:
@@ -53,7 +53,7 @@ class RandomInBetween(ShapeAugmentation):
 
         In a motion these are the key-frame before (below 0.5) and the one after.
         """
-        return {"partner": uniform(n, generator), "t": uniform(n, generator, self.t)}
+        return {"partner": draw_uniform(n, generator), "t": draw_uniform(n, generator, self.t)}
 
     def apply_transform(
         self, batch: ShapeBatch, params: Parameters, space: Any, partners: ShapeBatch | None
@@ -76,22 +76,22 @@ class RandomInBetween(ShapeAugmentation):
         tracked = x_a.requires_grad or x_b.requires_grad
         return space.in_betweens(x_a, x_b, t, i, j, is_a & is_b & (i != j) & (not tracked))
 
-    def _labels(self, name: str, own: Tensor | None, others: Tensor | None, t: Tensor) -> Tensor | None:
-        if own is None or others is None:
-            return own
-        t = t.detach().to(own.device).reshape(-1, *[1] * (own.dim() - 1))
+    def _labels(self, name: str, labels: Tensor | None, others: Tensor | None, t: Tensor) -> Tensor | None:
+        if labels is None or others is None:
+            return labels
+        t = t.detach().to(labels.device).reshape(-1, *[1] * (labels.dim() - 1))
         if not self.blend_labels:
-            return torch.where(t > 0.5, others, own)
-        if not own.is_floating_point():
-            raise ValueError(f"blended {name} must be floating-point, one-hot for classes; got {own.dtype}")
-        return torch.lerp(own, others, t.clamp(0, 1).to(own.dtype))
+            return torch.where(t > 0.5, others, labels)
+        if not labels.is_floating_point():
+            raise ValueError(f"blended {name} must be floating-point, one-hot for classes; got {labels.dtype}")
+        return torch.lerp(labels, others, t.clamp(0, 1).to(labels.dtype))
 
 
 class RandomExtrapolation(RandomInBetween):
     r"""Replaces a shape by an extrapolation of the motion between it and a partner.
 
-    The shape at :math:`1 + s` is the mirror image of the in-between at :math:`1 - s` in the partner, and the one at
-    :math:`-s` that of the in-between at :math:`s` in the shape itself: each triangle gets the inverse of its
+    The shape at :math:`1 + s` is the mirror image of the in-between at :math:`1 - s` in the partner, and the shape at
+    :math:`-s` the image of the in-between at :math:`s` in the shape itself: each triangle gets the inverse of its
     rotation and stretch, and a Poisson problem gives the vertices. So the partner is the shape half-way
     between the two, as the discrete geodesics of shells continue (Heeren et al. 2014), and position and velocity are
     continuous at the ends. (With a negative weight, the energies of the in-between would have no minimum.)
@@ -99,7 +99,7 @@ class RandomExtrapolation(RandomInBetween):
     Args:
         beyond: Range of s, how far outside [0, 1] the times are, drawn uniformly; at most 1. The end is drawn
             with equal probability.
-        blend_labels: As for :class:`RandomInBetween`, with times of 0 and 1: labels are those of the nearer end.
+        blend_labels: As for :class:`RandomInBetween`, with times of 0 and 1: a shape gets the labels of the nearer end.
         p: Probability that a shape is transformed.
         options: As for :class:`ShapeAugmentation`.
 
@@ -117,7 +117,7 @@ class RandomExtrapolation(RandomInBetween):
 
     def generate_parameters(self, n: int, space: Any, generator: torch.Generator | None) -> Parameters:
         """``partner`` as for :class:`RandomInBetween`, and times ``t`` beyond one end or the other."""
-        partner, draw = uniform(n, generator), uniform(n, generator, (0.0, 1.0), 2)
+        partner, draw = draw_uniform(n, generator), draw_uniform(n, generator, (0.0, 1.0), 2)
         beyond = self.beyond[0] + (self.beyond[1] - self.beyond[0]) * draw[:, 0]
         return {"partner": partner, "t": torch.where(draw[:, 1] < 0.5, -beyond, 1 + beyond)}
 
@@ -126,11 +126,11 @@ class RandomExtrapolation(RandomInBetween):
         after = t > 0.5
         before_end = super().shapes(batch, partners, torch.where(after, 2 - t, -t), space)
         ends = torch.where(after[:, None, None], partners.shapes, batch.shapes)
-        return mirror(ends, before_end, space.reconstruction(ends.device))
+        return extrapolate(ends, before_end, space.reconstruction(ends.device))
 
 
-def mirror(centre: Tensor, other: Tensor, reconstruction: Reconstruction) -> Tensor:
-    """The shape as far beyond ``centre`` as ``other`` lies before it, its rigid motion included.
+def extrapolate(centre: Tensor, other: Tensor, reconstruction: Reconstruction) -> Tensor:
+    """Extrapolate from ``other`` through ``centre`` by the same step, its rigid motion included.
 
     *Shape:* ``(B, V, 3), (B, V, 3) -> (B, V, 3)``.
     """
@@ -145,8 +145,8 @@ def mirror(centre: Tensor, other: Tensor, reconstruction: Reconstruction) -> Ten
 class RandomBlend(ShapeAugmentation):
     """Replaces shapes by random mixtures of all key-frames (:meth:`ShapeSpace.sample`), aligned with the given shapes.
 
-    Labels of the vertices stay, and so do those of shapes: give it shapes whose labels all key-frames share. Gradients
-    reach the given shapes through the alignment alone.
+    Labels of vertices and of shapes stay: use it for shapes whose labels all key-frames share. Gradients reach the
+    given shapes through the alignment alone.
 
     Args:
         concentration: As for :meth:`ShapeSpace.sample`.
@@ -174,7 +174,7 @@ class RandomBlend(ShapeAugmentation):
         super().__init__(p, **options)
         check_density(concentration, locality)
         if members is not None and members < 1:
-            raise ValueError(f"members is 1 or more, or None; got {members}")
+            raise ValueError(f"members must be 1 or more, or None; got {members}")
         self.concentration, self.locality, self.members = concentration, locality, members
 
     def generate_parameters(self, n: int, space: Any, generator: torch.Generator | None) -> Parameters:
@@ -183,7 +183,7 @@ class RandomBlend(ShapeAugmentation):
         With a table, the place of the ``member`` in it, in [0, 1).
         """
         if self.members is not None:
-            return {"member": uniform(n, generator)}
+            return {"member": draw_uniform(n, generator)}
         weights, factors = space.variation().draw(n, self.concentration, self.locality, generator)
         return {"weights": weights, "factors": factors}
 
@@ -193,13 +193,13 @@ class RandomBlend(ShapeAugmentation):
         """Draw a member for each shape; gradients reach the shapes through the rigid alignment with them alone."""
         drawn = {name: value.detach().double().cpu() for name, value in params.items()}
         if self.members is None:
-            found = space.variation().members(drawn["weights"], drawn["factors"])
+            members = space.variation().members(drawn["weights"], drawn["factors"])
         else:
             table = space.members(self.members, self.concentration, self.locality)
-            found = table[(drawn["member"] * len(table)).long().clamp_max(len(table) - 1)]
-        found = found.to(batch.shapes)
-        areas = space.reconstruction(found.device).areas.to(found)
-        shapes: Tensor = best_fit(found, batch.shapes, areas).apply(found)
+            members = table[(drawn["member"] * len(table)).long().clamp_max(len(table) - 1)]
+        members = members.to(batch.shapes)
+        areas = space.reconstruction(members.device).areas.to(members)
+        shapes: Tensor = best_fit(members, batch.shapes, areas).apply(members)
         return batch._replace(shapes=shapes, nearest=space.nearest(shapes))
 
 
@@ -207,7 +207,7 @@ class RandomRigidMotion(ShapeAugmentation):
     """Rotates shapes about the mean of their vertices, and translates them.
 
     Args:
-        degrees: Range of the angle, drawn uniformly; a number is the range from it to its negative. With None,
+        degrees: Range of the angle, drawn uniformly; a number means the range from its negative to it. With None,
             rotations are uniform over SO(3) (``axis`` has no effect).
         axis: Axis of rotation, such as ``(0, 1, 0)`` for shapes with y up; by default uniform directions.
         translation: Largest move along each axis, in diagonals of the shape's bounding box.
@@ -234,17 +234,17 @@ class RandomRigidMotion(ShapeAugmentation):
             degrees = (-degrees, degrees)
         self.degrees = None if degrees is None else check_range("degrees", degrees, -180, 180)
         if axis is not None and not math.hypot(*axis) > 0:
-            raise ValueError(f"an axis has a length, got {axis}")
+            raise ValueError(f"axis must have a length above zero; got {axis}")
         self.axis = axis
         if translation < 0:
-            raise ValueError(f"translation is the largest move, 0 or more; got {translation}")
+            raise ValueError(f"translation must be 0 or more; got {translation}")
         self.translation = translation
 
     def generate_parameters(self, n: int, space: Any, generator: torch.Generator | None) -> Parameters:
         """``rotation``, axis times angle in radians; and ``translation``, in diagonals."""
         low, high = (math.radians(degree) for degree in self.degrees or (0.0, 0.0))
-        direction, angle = normal(n, generator, 4), uniform(n, generator, (low, high))
-        move = self.translation * uniform(n, generator, (-1.0, 1.0), 3)
+        direction, angle = draw_normal(n, generator, 4), draw_uniform(n, generator, (low, high))
+        move = self.translation * draw_uniform(n, generator, (-1.0, 1.0), 3)
         if self.degrees is None:
             # A normal vector of four has a uniform direction: a uniform quaternion.
             return {"rotation": quaternion_to_axis_angle(normalize(direction, dim=1)), "translation": move}

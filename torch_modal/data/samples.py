@@ -1,4 +1,4 @@
-"""The sample key-frames that come with the package; ``examples/make_samples.py`` made them."""
+"""Sample key-frames that come with the package, made by ``examples/make_samples.py``."""
 
 from pathlib import Path
 from typing import Any, NamedTuple

@@ -1,4 +1,4 @@
-"""Shapes of one connectivity with what goes along with them: key-frames and labels."""
+"""Shapes of one connectivity with their nearest key-frames and labels."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -40,11 +40,11 @@ class ShapeBatch(NamedTuple):
         return cls(space.keyframes(like), every, every >= 0, vertex_labels, shape_labels)
 
     def rows(self, index: Tensor) -> "ShapeBatch":
-        """Some of the shapes."""
-        return ShapeBatch._make(None if part is None else part[index.to(part.device)] for part in self)
+        """Select shapes by their indices."""
+        return ShapeBatch._make(None if tensor is None else tensor[index.to(tensor.device)] for tensor in self)
 
-    def located(self, space: ShapeSpace, dtype: torch.dtype) -> "ShapeBatch":
-        """The batch in a dtype, with the nearest key-frame of each shape."""
+    def locate(self, space: ShapeSpace, dtype: torch.dtype) -> "ShapeBatch":
+        """Convert the batch to a dtype, and find the nearest key-frame of each shape."""
         shapes, none = self.shapes.to(dtype), torch.zeros(len(self.shapes), dtype=torch.bool)
         nearest = space.nearest(shapes) if self.nearest is None else self.nearest
         is_keyframe = none if self.is_keyframe is None else self.is_keyframe
@@ -53,14 +53,14 @@ class ShapeBatch(NamedTuple):
     def partners(
         self, chosen: Tensor, draw: Tensor, space: ShapeSpace, pool: "ShapeBatch | None"
     ) -> "ShapeBatch | None":
-        """A second shape for each of some shapes; None if there is no other.
+        """Choose a second shape for each of some shapes; None if there is no other.
 
         A shape that is alone, without labels, has partners among the key-frames.
 
         Args:
             chosen: The shapes. *Shape:* ``(n,)``.
-            draw: Place of the partner among the other shapes, in [0, 1); of key-frames in a motion, that before (below
-                0.5) or after. *Shape:* ``(n,)``.
+            draw: Place of the partner among the other shapes, in [0, 1); for key-frames of a motion, the one before
+                (below 0.5) or after. *Shape:* ``(n,)``.
             space: The space.
             pool: Its key-frames, if partners are drawn from these.
 
@@ -69,7 +69,7 @@ class ShapeBatch(NamedTuple):
         """
         if pool is None and len(self.shapes) == 1 and self.vertex_labels is None and self.shape_labels is None:
             pool = ShapeBatch.of_keyframes(space, self.shapes)
-        others, own = self, chosen
+        others, indices = self, chosen
         if pool is not None:
             if not isinstance(pool, ShapeBatch) or len(pool.shapes) != len(space):
                 got = f"{len(pool.shapes)} shapes" if isinstance(pool, ShapeBatch) else f"a {type(pool).__name__}"
@@ -77,13 +77,13 @@ class ShapeBatch(NamedTuple):
                     f"a pool holds the {len(space)} key-frames of the space, ShapeBatch.of_keyframes(space); got {got}"
                 )
             assert self.nearest is not None
-            others, own = pool.located(space, self.shapes.dtype), self.nearest[chosen]
+            others, indices = pool.locate(space, self.shapes.dtype), self.nearest[chosen]
         size = len(others.shapes)
         if size < 2:
             return None
         if pool is not None and space.motion is not None:
-            return others.rows(space.motion.neighbours[own, (draw >= 0.5).long()])
-        return others.rows((own + (draw * (size - 1)).long().clamp(0, size - 2) + 1) % size)
+            return others.rows(space.motion.neighbours[indices, (draw >= 0.5).long()])
+        return others.rows((indices + (draw * (size - 1)).long().clamp(0, size - 2) + 1) % size)
 
 
 def check_shapes(shapes: Any, space: ShapeSpace | None) -> None:
@@ -95,7 +95,7 @@ def check_shapes(shapes: Any, space: ShapeSpace | None) -> None:
 
 
 def check_labels(shape: Sequence[int], labels: Mapping[str, Tensor | None]) -> None:
-    """Raise a ValueError unless labels, if there are any, belong to as many shapes and vertices."""
+    """Raise a ValueError unless labels, if there are any, are for as many shapes and vertices."""
     for name, wanted in (("vertex_labels", tuple(shape)), ("shape_labels", tuple(shape[:1]))):
         value = labels.get(name)
         if value is not None and value.shape[: len(wanted)] != wanted:

@@ -26,10 +26,10 @@ from torch_modal.statistics.components import Components
 from torch_modal.statistics.fit import Fitted, fit
 from torch_modal.statistics.variation import Variation
 
-# Sizes whose squares, and squares of areas, are usual numbers of float32.
-_SIZES = 1e-3, 1e6
+# Range of sizes for which squares of lengths and of areas are normal numbers in float32.
+_FLOAT32_SIZES = 1e-3, 1e6
 
-# Key-frames whose modes a mean has, at most.
+# Largest number of key-frames whose modes span the mean.
 _BASES_OF_MEAN = 6
 
 
@@ -43,22 +43,22 @@ class ShapeSpace:
     Args:
         bases: The basis of each key-frame (:func:`torch_modal.extract_bases`).
         faces: Vertex indices. *Shape:* ``(F, 3)``.
-        preset: Of the in-betweens, as for :class:`torch_modal.InBetween`.
-        objective: What they minimise; replaces the preset's.
-        solver: How they are solved, and by which backend new members; replaces the preset's.
+        preset: Preset of the in-betweens, as for :class:`torch_modal.InBetween`.
+        objective: Their objective; replaces the preset's.
+        solver: Their solver, whose backend also computes new members; replaces the preset's.
         times: Number of even times at which the in-betweens of two key-frames are solved once; cubics interpolate
             among them. None solves each in-between. At least 4.
-        dtype: Of the tables.
-        folder: Stores tables between runs; by default none is stored.
-        keyframe_times: When the key-frames are, if they are a motion, as for :class:`torch_modal.Path`. Partners of
-            key-frames are then those before and after them in time, and in-betweens are shapes of that path.
+        dtype: Dtype of the tables.
+        folder: Folder that stores tables between runs; by default none is stored.
+        keyframe_times: Times of the key-frames, if they are a motion, as for :class:`torch_modal.Path`. Partners of
+            key-frames are then their neighbours in time, and in-betweens lie on that path.
         cyclic: Whether the last key-frame of the motion leads on to the first.
         contact: Whether contact keeps parts from passing through each other; replaces the objective's setting
             (docs/contact.md; extra ``contact``).
 
     Raises:
-        ValueError: The bases do not fit each other or the faces, ``times`` is below 4, or ``keyframe_times`` are not
-            those of a motion.
+        ValueError: The bases do not fit each other or the faces, ``times`` is below 4, or ``keyframe_times`` do not
+            ascend.
     """
 
     @lasting
@@ -78,7 +78,7 @@ class ShapeSpace:
         contact: bool | None = None,
     ) -> None:
         self.bases = [basis.to("cpu") for basis in checked_bases(bases)]
-        # Checks and repairs the faces, as everywhere.
+        # Checks and repairs the faces.
         self.faces = check_keyframes([self.bases[0].reference.double()], faces, warn=False).faces.cpu()
         self.settings = settings(preset, objective, solver, contact)
         if self.settings.objective.contact:
@@ -89,7 +89,7 @@ class ShapeSpace:
         self._keyframes = torch.stack([basis.reference.double() for basis in self.bases])
         length = size(self._keyframes[0].numpy(), self.faces.numpy())
         #: The least precise dtype that can square areas of these shapes.
-        self.least_dtype = torch.float32 if _SIZES[0] <= length <= _SIZES[1] else torch.float64
+        self.least_dtype = torch.float32 if _FLOAT32_SIZES[0] <= length <= _FLOAT32_SIZES[1] else torch.float64
         #: Reconstructions by device, scales of modes by key-frame, and the variation.
         self._made = Recent(5 + len(self.bases))
 
@@ -99,8 +99,8 @@ class ShapeSpace:
 
         Options as for the constructor.
         """
-        own = {"folder": stored.folder, "keyframe_times": stored.times, "cyclic": stored.cyclic}
-        return cls(stored.bases, stored.faces, **{**own, **options})
+        options_of_set = {"folder": stored.folder, "keyframe_times": stored.times, "cyclic": stored.cyclic}
+        return cls(stored.bases, stored.faces, **{**options_of_set, **options})
 
     def __len__(self) -> int:
         """Number of key-frames, K."""
@@ -143,7 +143,7 @@ class ShapeSpace:
         return after / before - 1
 
     def reconstruction(self, device: torch.device | str = "cpu") -> Reconstruction:
-        """The Poisson problem of the connectivity. The first key-frame's weights serve for all shapes."""
+        """The Poisson problem of the connectivity, with the weights of the first key-frame for all shapes."""
         device = torch.device(device)
         return self._made.get(device, lambda: Reconstruction(self._keyframes[0], self.faces).to(device))
 
@@ -157,14 +157,14 @@ class ShapeSpace:
         """The shape of least weighted energy towards all key-frames (:class:`torch_modal.Blend`).
 
         Args:
-            weights: Of the key-frames; even by default. *Shape:* ``(K,)``.
+            weights: Weights of the key-frames; equal by default. *Shape:* ``(K,)``.
 
         Returns:
             *Shape:* ``(V, 3)``, float64.
         """
         even = torch.full((len(self),), 1 / len(self), dtype=torch.float64)
         objective, solver = self.settings
-        # Modes of a few tell those of all; further ones cost more than they give.
+        # Modes of a few key-frames suffice; more cost time and hardly change the mean.
         few = self.bases[:: max(1, len(self) // _BASES_OF_MEAN)][:_BASES_OF_MEAN]
         blend = Blend(few, self.faces, objective=replace(objective, contact=False), solver=solver)
         return blend(self._keyframes, even if weights is None else weights.to(even))
@@ -173,10 +173,10 @@ class ShapeSpace:
         """Principal components of the key-frames, with coordinates of shapes and shapes of coordinates.
 
         Args:
-            n: How many; by default all, one less than there are key-frames.
+            n: Number of components; by default all, one less than there are key-frames.
 
         Raises:
-            ValueError: There are fewer.
+            ValueError: There are fewer components.
         """
         variation, most = self.variation(), len(self) - 1
         n = most if n is None else n
@@ -203,17 +203,17 @@ class ShapeSpace:
         """New members: random mixtures of the key-frames, with weights that vary from part to part of the surface.
 
         Each part of the surface lies between the key-frames, a leg perhaps nearer to one and the head to another, so
-        that lengths and angles stay those of the key-frames and their mixtures. A draw in which triangles fold over
-        that no key-frame has is made less local until none does; if that does not help, it is the key-frame of the
-        largest weight. For shapes outside of what the key-frames show, apply :class:`RandomModalDeformation`.
+        that lengths and angles stay as in the key-frames and their mixtures. A draw with folded triangles, more than
+        the key-frames have, is made less local until it has none; if that fails, it is the key-frame of the largest
+        weight. For shapes beyond the range of the key-frames, apply :class:`RandomModalDeformation`.
 
         Args:
             n: How many.
             generator: Source of random numbers; by default PyTorch's own.
             concentration: Of the Dirichlet density of the weights: 1 is even over all mixtures, less prefers single
                 key-frames, more their mean.
-            locality: Standard deviation of the logarithms of the weights over the surface; with 0, all of it has the
-                same.
+            locality: Standard deviation of the logarithms of the weights over the surface; 0 means the same weights
+                everywhere.
 
         Returns:
             In the pose of the first key-frame. *Shape:* ``(n, V, 3)``, in the dtype of the space.
@@ -226,7 +226,7 @@ class ShapeSpace:
         return (variation.members(*drawn) + variation.origin).to(self.dtype)
 
     def members(self, n: int, concentration: float, locality: float) -> Tensor:
-        """A table of members that are drawn once, with a seed of their own, and stored with the other tables.
+        """Table of members that are drawn once, with a fixed seed, and stored with the other tables.
 
         Arguments and shape as for :meth:`sample`, in the dtype of the tables.
         """
@@ -252,13 +252,13 @@ class ShapeSpace:
         weights: Tensor | None = None,
         noise: float | None = None,
     ) -> Fitted:
-        """The shape that meets observed points: weights of the key-frames that vary over the surface, then elasticity.
+        """Fit a shape to observed points: weights of the key-frames that vary over the surface, then elastic steps.
 
-        What the points leave open is as in the key-frames: lengths and angles of each part are those of the mixture
-        of key-frames that looks most like it. Of several sets of points, each is met on its own.
+        Where points leave the shape open, lengths and angles of each part are as in the mixture of key-frames that
+        looks most like it. Several sets of points are fitted independently.
 
-        Gradients reach the points. They are those of weights and rigid motion, by the implicit function theorem; the
-        elastic steps that follow, and the trust in points, are constants of the graph. There are no second derivatives.
+        Gradients reach the points through weights and rigid motion, by the implicit function theorem; the elastic
+        steps that follow, and the trust in points, are constants of the graph. There are no second derivatives.
 
         Args:
             points: In the caller's units, of at least three vertices; any rigid motion is followed. *Shape:*
@@ -274,9 +274,9 @@ class ShapeSpace:
                 noisier they are, the closer the shape stays to what is likely.
 
         Returns:
-            The shapes with their weights, and by how much they miss each point. Should the points be missed by more
-            than of a key-frame that is moved rigidly, it is that one. Points of weight zero have a trust of zero; the
-            shape's distance from them is a constant, and NaN where they are.
+            The shapes with their weights, and their distance from each point. If a rigidly moved key-frame is nearer to
+            the points, the result is that key-frame. Points of weight zero have a trust of zero; the shape's distance
+            from them is a constant, and NaN where they are.
 
         Raises:
             ValueError: There is only one key-frame, an argument does not fit, or the points are in other units.

@@ -1,4 +1,4 @@
-"""Key-frame sets with their bases on disk: a file in a folder of its own, written whole, read by memory mapping.
+"""Key-frame sets with their bases on disk: a file in a folder for each set, written whole, read by memory mapping.
 
 ``set.safetensors`` holds ``keyframes``, ``faces`` and the tensors of each :class:`~torch_modal.ModalBasis`, with the
 number of the key-frame and a dot before their names. Its metadata has the names of the source files, and the times if
@@ -25,11 +25,11 @@ SET_FILE = "set.safetensors"
 LABELS_FILE = "labels.safetensors"
 #: Tables of in-betweens, which follow from a set and are removed when it is replaced.
 TABLE_FILES = "between-*.safetensors"
-_PARTS = tuple(field.name for field in fields(ModalBasis))
+_BASIS_FIELDS = tuple(field.name for field in fields(ModalBasis))
 
 
 class Motion:
-    """The order and the times of the key-frames of a motion.
+    """Order and times of the key-frames of a motion.
 
     Args:
         times: Times of the key-frames, ascending; if cyclic, one more, when the first comes again. *Shape:* ``(K,)``,
@@ -41,7 +41,7 @@ class Motion:
         neighbours: The key-frames before and after each in time; twice the same at an end. *Shape:* ``(K, 2)``.
 
     Raises:
-        ValueError: Another number of times, or times that do not ascend.
+        ValueError: There is another number of times, or they do not ascend.
     """
 
     def __init__(self, times: Tensor | Sequence[float], n_keyframes: int, cyclic: bool = False) -> None:
@@ -66,7 +66,7 @@ class Motion:
         """The times of two successive key-frames, in either direction.
 
         Returns:
-            The times of ``i`` and of ``j``; in a cycle, those before the first and after the last go on. None if they
+            The times of ``i`` and of ``j``; in a cycle, times go on before the first and after the last. None if they
             are not successive, or have no neighbours.
         """
         n, back = self.n_keyframes, -1 % self.n_keyframes if self.cyclic else -1
@@ -104,13 +104,13 @@ class StoredSet:
     @lasting
     def __init__(self, folder: str | os.PathLike[str]) -> None:
         self.folder = Path(folder)
-        file = _opened(self.folder)
+        file = _open_file(self.folder)
         self.names: tuple[str, ...] = tuple(file.metadata["names"])
         self.times: tuple[float, ...] | None = file.metadata["times"] and tuple(file.metadata["times"])
         self.note: str = file.metadata["note"]
         self.keyframes, self.faces = file.tensor("keyframes"), file.tensor("faces")
-        parts = [{part: file.tensor(f"{i}.{part}") for part in _PARTS} for i in range(len(self.keyframes))]
-        self.bases = [ModalBasis(**own) for own in parts]
+        places = range(len(self.keyframes))
+        self.bases = [ModalBasis(**{name: file.tensor(f"{i}.{name}") for name in _BASIS_FIELDS}) for i in places]
 
     def __len__(self) -> int:
         """Number of key-frames, K."""
@@ -131,8 +131,8 @@ class StoredSet:
 
 
 def read_note(folder: Path) -> str:
-    """The note of a stored set; reads the header of its file only, and raises as :class:`StoredSet`."""
-    return str(_opened(folder).metadata["note"])
+    """Note of a stored set, from the header of its file alone; raises as :class:`StoredSet`."""
+    return str(_open_file(folder).metadata["note"])
 
 
 def write_set(
@@ -164,7 +164,7 @@ def write_set(
 
     Raises:
         OSError: The file cannot be written. Nothing is left behind.
-        ValueError: The parts do not fit each other.
+        ValueError: Shapes of the arguments do not fit each other.
     """
     shape = tuple(keyframes.shape)
     if len(shape) != 3 or shape[2] != 3 or not shape[0]:
@@ -179,7 +179,8 @@ def write_set(
         )
     motion = Motion.of(times, len(keyframes), cyclic)
     tensors = {"keyframes": keyframes.double(), "faces": faces.long()}
-    tensors |= {f"{i}.{part}": getattr(basis, part) for i, basis in enumerate(bases) for part in _PARTS}
+    for i, basis in enumerate(bases):
+        tensors |= {f"{i}.{name}": getattr(basis, name) for name in _BASIS_FIELDS}
     times = None if motion is None else motion.times.tolist()
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -198,21 +199,22 @@ def find_sets(root: str | os.PathLike[str]) -> list[Path]:
     root = Path(root)
     if not root.is_dir():
         raise FileNotFoundError(f"there is no folder {root}")
-    found = []
+    folders = []
     for place, below, files in os.walk(root):
         if SET_FILE in files:
-            found.append(Path(place))
+            folders.append(Path(place))
         below[:] = [name for name in below if not name.startswith(".")]
-    return sorted(found)
+    return sorted(folders)
 
 
-def _opened(folder: Path) -> TensorFile:
-    """The file of a set, whose header is checked; raises as :class:`StoredSet`."""
+def _open_file(folder: Path) -> TensorFile:
+    """Open the file of a set and check its header; raises as :class:`StoredSet`."""
     file = TensorFile(folder / SET_FILE, FORMAT, VERSION, ("keyframes", "faces"))
     keyframes, faces = file.shapes["keyframes"], file.shapes["faces"]
     if len(keyframes) != 3 or keyframes[2] != 3 or len(faces) != 2 or faces[1] != 3:
         raise ValueError(f"{file.path} needs keyframes (K, V, 3) and faces (F, 3); has {file.shapes}")
-    missing = [name for i in range(keyframes[0]) for part in _PARTS if (name := f"{i}.{part}") not in file.shapes]
+    needed = [f"{i}.{name}" for i in range(keyframes[0]) for name in _BASIS_FIELDS]
+    missing = [name for name in needed if name not in file.shapes]
     if missing:
         raise ValueError(f"{file.path} lacks the tensors {', '.join(missing[:4])}; make the file again")
     return file

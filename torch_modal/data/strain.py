@@ -1,4 +1,4 @@
-"""Strains that vibration modes cause, and the scales of modes that give them the strain of one."""
+"""Strains that vibration modes cause, and scales of modes that give a strain of one."""
 
 import torch
 from torch import Tensor
@@ -10,7 +10,7 @@ from torch_modal.geometry.vectors import cross, norm, pick
 from torch_modal.modes.basis import ModalBasis
 from torch_modal.modes.sheet import THICKNESS
 
-# Eigenvalues below this part of the largest are loose pieces that move without deforming: no elastic modes.
+# Eigenvalues below this fraction of the largest belong to loose pieces that move without deforming: no elastic modes.
 _NOT_ELASTIC = 1e-8
 
 
@@ -26,10 +26,10 @@ def mode_scales(basis: ModalBasis, faces: Tensor) -> Tensor:
     modes, edges = basis.modes.double() * scales[:, None, None], torch.tensor(mesh.edges)
     strains = edge_strains(modes.movedim(-1, 0).contiguous(), x, edges)
     lengths = (x[edges[:, 1]] - x[edges[:, 0]]).square().sum(-1)
-    expected = _expected(strains, torch.ones_like(lengths))
+    expected = _expected_strain(strains, torch.ones_like(lengths))
     bending, areas = _bending_strains(modes, x, mesh)
-    by_bending = _expected(bending, areas)
-    if by_bending > _expected(strains, lengths):  # a sheet, which bends without a change of length
+    by_bending = _expected_strain(bending, areas)
+    if by_bending > _expected_strain(strains, lengths):  # a sheet, which bends without a change of length
         expected = by_bending
     return scales / expected.clamp_min(torch.finfo(torch.float64).tiny)
 
@@ -42,7 +42,7 @@ def edge_strains(displacement: Tensor, x: Tensor, edges: Tensor) -> Tensor:
     return along / side.square().sum(0).clamp_min(torch.finfo(side.dtype).tiny)
 
 
-def _expected(strains: Tensor, weights: Tensor) -> Tensor:
+def _expected_strain(strains: Tensor, weights: Tensor) -> Tensor:
     """Expected root mean square for standard normal amplitudes. *Shape:* ``(k, n), (n,) -> ()``."""
     return (strains.square() @ weights / weights.sum()).sum().sqrt()
 

@@ -1,4 +1,4 @@
-"""Key-frame sets of a folder tree."""
+"""Key-frame sets and mesh files of a folder tree."""
 
 import os
 import re
@@ -56,6 +56,6 @@ def mesh_files(folder: Path) -> list[Path]:
 def natural(name: str) -> list[tuple[list[str | int], str]]:
     """A sort key: ``frame-2`` before ``frame-10``, a folder before its contents."""
     return [
-        ([int(part) if i % 2 else part.casefold() for i, part in enumerate(re.split(r"([0-9]+)", level))], level)
+        ([int(chunk) if i % 2 else chunk.casefold() for i, chunk in enumerate(re.split(r"([0-9]+)", level))], level)
         for level in name.split("/")
     ]

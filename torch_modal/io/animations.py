@@ -1,4 +1,4 @@
-"""A sequence as positions over time: point caches (MDD, PC2, NPZ), for a mesh that is already there, and USD."""
+"""A sequence as positions over time: point caches (MDD, PC2, NPZ) for a mesh that exists already, and USD."""
 
 import struct
 from pathlib import Path
@@ -11,7 +11,7 @@ from torch_modal.io.formats import ANIMATION_FORMATS, Animation, resample
 
 
 def write_mdd(animation: Animation, path: Path) -> None:
-    """LightWave's: big-endian counts, times in seconds, float32 positions, sampled at the rate of the timing."""
+    """Write LightWave's point cache: big-endian counts, times in seconds, float32 positions, at the timing's rate."""
     sampled = resample(animation.shapes, animation.timing.samples())
     times = np.arange(len(sampled)) / animation.timing.fps
     head = struct.pack(">2i", *sampled.shape[:2])
@@ -19,21 +19,21 @@ def write_mdd(animation: Animation, path: Path) -> None:
 
 
 def write_pc2(animation: Animation, path: Path) -> None:
-    """3ds Max's, version 1: one sample a frame from frame 0 on, float32 positions."""
+    """Write 3ds Max's point cache, version 1: one sample a frame from frame 0 on, float32 positions."""
     sampled = resample(animation.shapes, animation.timing.samples())
     head = struct.pack("<12siiffi", b"POINTCACHE2\0", 1, sampled.shape[1], 0.0, 1.0, len(sampled))
     path.write_bytes(head + sampled.astype("<f4").tobytes())
 
 
 def write_npz(animation: Animation, path: Path) -> None:
-    """Arrays ``frames`` (N, V, 3), ``faces`` (F, 3), ``times`` (N,) in seconds and ``keyframes``, all as they are."""
+    """Write arrays ``frames`` (N, V, 3), ``faces`` (F, 3), ``times`` (N,) in seconds, and ``keyframes``."""
     shapes, keyframes = animation.shapes, np.asarray(animation.keyframes, np.int64)
     times = animation.timing.knots()[0][: len(shapes)]
     np.savez_compressed(path, frames=shapes, faces=animation.faces, times=times, keyframes=keyframes)
 
 
 def write_usd(animation: Animation, path: Path) -> None:
-    """USD, by ``usd-core``: one mesh with positions at the times of the frames, linear between them.
+    """Write USD by ``usd-core``: one mesh with positions at the times of the frames, linear between them.
 
     A time code is one frame of the timing. Polygons, texture coordinates and colours come from the asset. The suffix
     ``.usda`` is text, the others are binary.

@@ -1,4 +1,4 @@
-"""Mesh files with all their content besides positions."""
+"""Mesh files with all their content: positions, faces, materials, texture coordinates, groups and more."""
 
 import io
 import warnings
@@ -14,11 +14,11 @@ from torch_modal.errors import MeshWarning
 
 FEATURES = ("polygons", "texcoords", "normals", "colors", "materials", "groups", "properties", "posing")
 """Content of mesh files besides positions and triangles."""
-CLAY = (0.66, 0.52, 0.42, 1.0)  # linear RGBA of surfaces without a colour
+CLAY = (0.66, 0.52, 0.42, 1.0)  # colour of surfaces without one, linear RGBA
 
 
 def as_png_or_jpeg(data: bytes) -> bytes | None:
-    """PNG and JPEG files as they are, other pictures as PNG, or None."""
+    """Return PNG and JPEG files as they are, other pictures as PNG, and None for data that is no picture."""
     if data.startswith((b"\x89PNG", b"\xff\xd8")):
         return data
     from PIL import Image
@@ -29,12 +29,12 @@ def as_png_or_jpeg(data: bytes) -> bytes | None:
         if picture.width * picture.height > 2**26:  # a small file may promise any size
             return None
         picture.save(stream, format="PNG")
-    except Exception:  # damaged pictures may raise any
+    except Exception:  # damaged pictures may raise any exception
         return None
     return stream.getvalue()
 
 
-def linear(colors: FloatArray) -> FloatArray:
+def linear_rgba(colors: FloatArray) -> FloatArray:
     """Linear RGBA of sRGB colours in [0, 1]. *Shape:* ``(n, 3)`` or ``(n, 4)`` to ``(n, 4)``."""
     clipped = np.clip(colors, 0.0, 1.0)
     rgb = clipped[:, :3]
@@ -61,7 +61,7 @@ class Part(NamedTuple):
     material: Material
     texcoords: FloatArray | None = None  # (P, 2) origin at the upper left, as in glTF
     colors: FloatArray | None = None  # (P, 4) linear RGBA
-    normals: FloatArray | None = None  # (P, 3) those of the file
+    normals: FloatArray | None = None  # (P, 3) as the file has them
 
 
 class Asset(ABC):
@@ -84,7 +84,7 @@ class Asset(ABC):
         self.carries = {}
 
     def _note(self, feature: str, name: str, there: object) -> None:
-        """Add to what the file carries, if it is there."""
+        """Add a feature to :attr:`carries`, if the file has it."""
         if there:
             self.carries[feature] = name
 
@@ -97,7 +97,7 @@ class Asset(ABC):
         return [Part(np.arange(len(self.positions)), self.faces, Material())]
 
     def polygons(self) -> tuple[IntArray, IntArray, FloatArray | None]:
-        """The faces for formats that hold polygons; triangles where the file's are not known.
+        """Polygons for formats that hold them; triangles, if the file's polygons are not known.
 
         Returns:
             Number of corners of each; vertices of the corners, one polygon after the other; their texture coordinates,
@@ -107,19 +107,19 @@ class Asset(ABC):
 
     @property
     def companions(self) -> dict[str, bytes]:
-        """Files that must lie beside a copy, by their names there: material libraries, textures."""
+        """Files that a copy needs in its folder, by their names there: material libraries, textures."""
         return {}
 
     def check(self, shapes: FloatArray) -> None:
-        """Raise unless shapes are of this mesh. *Shape:* ``(N, V, 3)``."""
+        """Raise a ValueError unless shapes have as many vertices as this mesh. *Shape:* ``(N, V, 3)``."""
         if shapes.shape[1] != len(self.positions):
             raise ValueError(
                 f"{self.path} has {len(self.positions)} vertices, the frames have {shapes.shape[1]}; an asset takes "
-                "frames of its own mesh."
+                "frames of its own mesh"
             )
 
     def warn_lost(self, name: str, holds: Collection[str]) -> None:
-        """Warn of what a file of this name loses, which holds some of :data:`FEATURES`."""
+        """Warn of the asset's features that a file of this name cannot hold; ``holds`` has those that it can."""
         lost = [name for feature, name in self.carries.items() if feature not in holds]
         if lost:
             listed = lost[0] if len(lost) == 1 else ", ".join(lost[:-1]) + " and " + lost[-1]

@@ -1,4 +1,4 @@
-"""Results of long computations on disk, named by a digest of all that they depend on."""
+"""Results of long computations on disk, named by a digest of everything that they depend on."""
 
 import contextlib
 import hashlib
@@ -28,7 +28,7 @@ CACHE_VARIABLE = "TORCH_MODAL_CACHE"
 LIMIT_VARIABLE = "TORCH_MODAL_CACHE_LIMIT"
 DEFAULT_LIMIT = 4 * 2**30
 KEPT_FRACTION = 0.9  # of the limit: what is left after entries were removed, so that not each new entry removes others
-ABANDONED = 3600.0  # seconds after which a partial file belongs to no running process
+ABANDONED = 3600.0  # age in seconds from which a partial file belongs to no running process
 FORMAT = "torch_modal.cache"
 SUFFIX = ".safetensors"
 _ENTRY_NAME = re.compile(r"[a-z]+-[0-9a-f]{64}\.safetensors|\.[a-z]+-[0-9a-f]{64}\.safetensors\..+\.tmp")
@@ -37,11 +37,11 @@ Arrays = dict[str, NDArray[Any]]
 
 
 class CacheWarning(UserWarning):
-    """The cache cannot be written: results are right, but will be computed again."""
+    """The cache cannot be written: results are right, but are computed again next time."""
 
 
 class ContentError(ValueError):
-    """An object has contents that are not plain data, so that it has no digest."""
+    """An object has no digest, as its contents are not plain data."""
 
 
 def default_cache_dir() -> Path:
@@ -91,7 +91,7 @@ class Cache:
         parameters: Mapping[str, Any],
         compute: Callable[[], Mapping[str, NDArray[Any]]],
     ) -> Arrays:
-        """The cached result of a kind, from arrays, and numbers or strings; computed and cached if there is none."""
+        """Look up a result by its kind, input arrays and parameters (numbers, strings); compute it if it is missing."""
         if self.folder is None:
             return dict(compute())
         path = self.folder / entry_name(kind, inputs, parameters)
@@ -139,7 +139,7 @@ class Cache:
 
 
 def entry_name(kind: str, inputs: Mapping[str, NDArray[Any]], parameters: Mapping[str, Any]) -> str:
-    """Name of the file of a result, from all that it depends on and the version of the cache."""
+    """File name of a result: its kind, and a digest of its inputs and the version of the cache."""
     key = content_digest([CACHE_VERSION, kind, sorted(inputs.items()), sorted(parameters.items())])
     return f"{kind}-{key}{SUFFIX}"
 
@@ -148,8 +148,8 @@ def entry_name(kind: str, inputs: Mapping[str, NDArray[Any]], parameters: Mappin
 def content_digest(value: Any) -> str:
     """SHA-256 of all contents of a value, the same in every process.
 
-    Numbers count with their types and shapes, objects of this package with their classes and all their attributes. The
-    rest raises a :class:`ContentError`: results would depend on code that has no digest.
+    It includes types and shapes of numbers, and classes and all attributes of objects of this package. Other objects
+    raise a :class:`ContentError`: results would depend on code that has no digest.
     """
     try:
         return _digest(value).hex()
@@ -159,23 +159,23 @@ def content_digest(value: Any) -> str:
 
 @cache
 def code_digest() -> str:
-    """SHA-256 of the package's own code, which changes before its version does."""
+    """SHA-256 of the package's code, which may change while its version does not."""
     root = Path(__file__).parents[1]
     files = sorted(root.rglob("*.py"))
-    parts = [part for file in files for part in (file.relative_to(root).as_posix().encode(), file.read_bytes())]
-    return _joined(__version__, parts).hex()
+    parts = [chunk for file in files for chunk in (file.relative_to(root).as_posix().encode(), file.read_bytes())]
+    return _hash_items(__version__, parts).hex()
 
 
 def _digest(value: Any) -> bytes:
     kind = type(value)
     if value is None or kind in (bool, int, float, str):
-        return _joined(kind.__name__, [repr(value).encode("utf-8", "surrogatepass")])
+        return _hash_items(kind.__name__, [repr(value).encode("utf-8", "surrogatepass")])
     if kind in (list, tuple):
-        return _joined(kind.__name__, map(_digest, value))
+        return _hash_items(kind.__name__, map(_digest, value))
     if kind in (dict, OrderedDict):
-        return _joined(kind.__name__, (_digest(part) for pair in value.items() for part in pair))
+        return _hash_items(kind.__name__, (_digest(item) for pair in value.items() for item in pair))
     if kind in (set, frozenset):
-        return _joined(kind.__name__, sorted(map(_digest, value)))
+        return _hash_items(kind.__name__, sorted(map(_digest, value)))
     if kind in (Tensor, torch.nn.Parameter):
         x = value.detach()
         if x.layout is not torch.strided or x.is_meta or torch.func.debug_unwrap(x, recurse=False) is not x:
@@ -183,20 +183,20 @@ def _digest(value: Any) -> bytes:
                 f"a tensor of {x.layout} on {x.device}, or inside a transform of torch.func, has no numbers"
             )
         numbers = bytes_of(x.cpu().resolve_conj().resolve_neg())
-        return _joined("tensor", [str(x.dtype).encode(), str(tuple(x.shape)).encode(), numbers])
+        return _hash_items("tensor", [str(x.dtype).encode(), str(tuple(x.shape)).encode(), numbers])
     if isinstance(value, (np.ndarray, np.generic)) and not value.dtype.hasobject:
-        return _joined("array", [str(value.dtype.descr).encode(), str(value.shape).encode(), value.tobytes()])
-    # A class counts that stands in this package under its own name.
-    found: Any = sys.modules.get(kind.__module__) if kind.__module__.startswith("torch_modal.") else None
+        return _hash_items("array", [str(value.dtype.descr).encode(), str(value.shape).encode(), value.tobytes()])
+    # Only classes that this package defines, under the name by which they are found there.
+    named: Any = sys.modules.get(kind.__module__) if kind.__module__.startswith("torch_modal.") else None
     for name in kind.__qualname__.split("."):
-        found = getattr(found, name, None)
-    if found is kind:
+        named = getattr(named, name, None)
+    if named is kind:
         content = tuple(value) if isinstance(value, tuple) else dict(vars(value))
-        return _joined(f"{kind.__module__}.{kind.__qualname__}", [_digest(content)])
+        return _hash_items(f"{kind.__module__}.{kind.__qualname__}", [_digest(content)])
     raise ContentError(f"a {kind.__qualname__} is neither plain data nor of a class of torch_modal")
 
 
-def _joined(kind: str, parts: Iterable[bytes]) -> bytes:
+def _hash_items(kind: str, parts: Iterable[bytes]) -> bytes:
     total = hashlib.sha256(kind.encode())
     for part in parts:
         total.update(struct.pack("<q", len(part)))

@@ -1,4 +1,4 @@
-"""Atomic writes, where a file is whole or absent, and reads of the files that a mesh file names."""
+"""Atomic writes, after which a file is whole or absent, and reads of the files that a mesh file names."""
 
 import contextlib
 import logging
@@ -16,8 +16,8 @@ LARGEST_COMPANION = 2**30  # bytes
 
 
 @contextlib.contextmanager
-def temporary_beside(path: Path, ending: str = ".tmp") -> Iterator[Path]:
-    """A temporary name in the same folder, which exists; the file of that name is moved to ``path`` at the end.
+def atomic_write(path: Path, ending: str = ".tmp") -> Iterator[Path]:
+    """Name of a temporary file in the folder of ``path``, which must exist; the file is moved to ``path`` at the end.
 
     Readers, and other processes that write the same file, see the old content or the new one, never a part. An OSError
     names ``path``, not the temporary file, which is not left behind. Some libraries choose a format by the ending.
@@ -37,10 +37,10 @@ def temporary_beside(path: Path, ending: str = ".tmp") -> Iterator[Path]:
 
 
 def read_companion(document: Path, name: str, most: int = LARGEST_COMPANION) -> tuple[str, bytes]:
-    """Path below the folder of a mesh file, and content, of a file that it names.
+    """Read a file that a mesh file names; returns its path below the folder of the mesh file, and its content.
 
     Raises:
-        ValueError: It is not there, not below that folder where links lead, not regular, or larger than ``most`` bytes.
+        ValueError: It does not exist, lies outside that folder, is not regular, or is larger than ``most`` bytes.
     """
     folder, shown = document.parent.resolve(), f"{name[:100]!r} is not "
     try:
@@ -56,7 +56,7 @@ def read_companion(document: Path, name: str, most: int = LARGEST_COMPANION) -> 
 
 
 def try_companion(document: Path, name: str, what: str, most: int = LARGEST_COMPANION) -> tuple[str, bytes] | None:
-    """Call :func:`read_companion`; None, with a warning that the document is without it, if it is not read."""
+    """Call :func:`read_companion`; if it fails, warn that the document is used without that file, and return None."""
     try:
         return read_companion(document, name, most)
     except ValueError as error:
@@ -75,7 +75,7 @@ def write_files(files: Iterable[tuple[Path, bytes]]) -> None:
     with contextlib.ExitStack() as written:
         for path, data in files:
             path.parent.mkdir(parents=True, exist_ok=True)
-            written.enter_context(temporary_beside(path)).write_bytes(data)
+            written.enter_context(atomic_write(path)).write_bytes(data)
             sizes[path] = len(data) / 1000
     for path, size in sizes.items():
         logger.debug("wrote %s, %.1f kB", path, size)

@@ -1,4 +1,4 @@
-"""Output formats by suffix, and what an animation passes to them."""
+"""Output formats by suffix, and the data of an animation that they receive."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ FPS = 24.0
 
 @dataclass(frozen=True)
 class OutputFormat:
-    """A function that writes, and what is known of it before it is imported.
+    """A function that writes a format, with what must be known before it is imported.
 
     In :data:`MESH_FORMATS`, for :func:`torch_modal.save_frames`, it takes vertices ``(V, 3)``, faces ``(F, 3)`` and the
     :class:`torch_modal.Asset` that they come from, or None, and returns the bytes of a file. In
@@ -75,12 +75,12 @@ PAGES = (".html", ".htm")
 
 
 class Timing:
-    """Times and repetitions of a sequence that plays, checked and completed.
+    """Times and repetitions of a sequence that plays, after checks and with defaults.
 
     Arguments as for :func:`torch_modal.save_animation`.
 
     Raises:
-        ValueError: A number is not positive, a cycle is to turn back or to slow down, or times do not fit.
+        ValueError: A number is not positive, a cycle has ``ping_pong`` or ``ease``, or times do not fit.
     """
 
     def __init__(
@@ -97,10 +97,10 @@ class Timing:
     ) -> None:
         for name, value in (("duration", duration), ("fps", fps)):
             if value is not None and not (np.isfinite(value) and value > 0):
-                raise ValueError(f"{name} must be a positive number, got {value}.")
+                raise ValueError(f"{name} must be a positive number, got {value}")
         if cyclic and (ping_pong or ease):
             name = "ping_pong" if ping_pong else "ease"
-            raise ValueError(f"{name} is for sequences that begin and end; a cyclic one does neither.")
+            raise ValueError(f"{name} is for sequences that begin and end; a cyclic one does neither")
         steps = max(n_frames if cyclic else n_frames - 1, 1)
         if duration is None and fps is not None:
             duration = steps / fps
@@ -118,9 +118,9 @@ class Timing:
         self.cyclic, self.ping_pong, self.ease = cyclic, ping_pong, ease
 
     def knots(self, frames: IntArray | None = None) -> tuple[FloatArray, IntArray]:
-        """Times in seconds at which frames are fully shown, for linear interpolation between them, and their indices.
+        """Times in seconds, and the index of the frame shown at each; players interpolate between them linearly.
 
-        The indices are into all frames, or into some that are kept, ascending. *Shape:* ``(n,) -> (T,), (T,)``.
+        Indices are into all frames, or into the given ones, which ascend. *Shape:* ``(n,) -> (T,), (T,)``.
         """
         parts = self.parts if frames is None else self.parts[frames]
         places = np.arange(len(parts))
@@ -143,21 +143,21 @@ class Timing:
         if len(self.parts) == 1:
             return np.zeros(1)
         steps = max(1, round(self.duration * self.fps))
-        part = np.arange(steps if self.cyclic else steps + 1) / steps
+        phase = np.arange(steps if self.cyclic else steps + 1) / steps
         if self.ease:
-            part = (1 - np.cos(np.pi * part)) / 2
+            phase = (1 - np.cos(np.pi * phase)) / 2
         if self.ping_pong:
-            part = np.concatenate([part, part[-2:0:-1]])
+            phase = np.concatenate([phase, phase[-2:0:-1]])
         known = np.append(self.parts, 1.0) if self.cyclic else self.parts
-        return np.interp(part, known, np.arange(len(known)))
+        return np.interp(phase, known, np.arange(len(known)))
 
 
 def resample(frames: FloatArray, places: FloatArray) -> FloatArray:
     """Linear interpolation at fractional frame numbers. *Shape:* ``(N, V, 3), (T,) -> (T, V, 3)``."""
     left = np.floor(places).astype(np.int64)
-    part = (places - left)[:, None, None]
-    following = frames[(left + 1) % len(frames)]
-    return np.where(part > 0, (1 - part) * frames[left % len(frames)] + part * following, frames[left % len(frames)])
+    fraction = (places - left)[:, None, None]
+    before, after = frames[left % len(frames)], frames[(left + 1) % len(frames)]
+    return np.where(fraction > 0, (1 - fraction) * before + fraction * after, before)
 
 
 class Animation(NamedTuple):
@@ -177,6 +177,6 @@ class Animation(NamedTuple):
     max_targets: int
     progress: Progress
     skin: Skin | None = None
-    """The motion as bones, in the place of morph targets."""
+    """The motion as bones, instead of morph targets."""
     targets: int | None = None
-    """Number of principal shapes, in the place of a morph target for each frame."""
+    """Number of principal shapes, instead of a morph target for each frame."""

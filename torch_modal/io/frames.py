@@ -25,8 +25,8 @@ def save_frames(
     Vertices and faces keep their order. OBJ and OFF are text and hold float64 exactly; PLY is binary and holds float32
     (about seven digits), which is what viewers expect: take OBJ where the files are computed with again.
 
-    With an asset, each file is that of the asset with other positions: polygons, texture coordinates, materials, groups
-    and all else stay, normals turn with the surface, and material libraries and textures are copied beside the files.
+    With an asset, each file is a copy of the asset's with other positions: polygons, texture coordinates, materials,
+    groups and everything else stay, normals turn with the surface, and material libraries and textures are copied too.
 
     Args:
         frames: Vertex positions, in the caller's coordinates. *Shape:* ``(N, V, 3)``.
@@ -45,7 +45,7 @@ def save_frames(
         ValueError: ``frames``, ``faces``, ``fmt`` or ``stem`` cannot be used; the message says why.
         FileExistsError: One of the files exists and ``overwrite`` is off; then none is written.
         NotADirectoryError: ``out`` is a file.
-        OSError: A file cannot be written. None is, and those that were there stay.
+        OSError: A file cannot be written. Then none is, and existing files stay.
 
     Warns:
         MeshWarning: The format cannot hold what the asset carries.
@@ -53,12 +53,12 @@ def save_frames(
     shapes, triangles = check_frames(frames, faces)
     suffix = (".ply" if asset is None else asset.suffix) if fmt is None else f".{fmt}"
     if suffix not in MESH_FORMATS:
-        raise ValueError(f"fmt must be one of {', '.join(known[1:] for known in MESH_FORMATS)}, got {fmt!r}.")
+        raise ValueError(f"fmt must be one of {', '.join(known[1:] for known in MESH_FORMATS)}, got {fmt!r}")
     if not stem or Path(stem).name != stem:
-        raise ValueError(f"stem must be the start of a file name, without folders, got {stem!r}.")
+        raise ValueError(f"stem must be the start of a file name, without folders, got {stem!r}")
     folder = Path(out)
     if folder.exists() and not folder.is_dir():
-        raise NotADirectoryError(f"{folder} is a file; out must be a folder.")
+        raise NotADirectoryError(f"{folder} is a file; out must be a folder")
     digits = max(3, len(str(len(shapes) - 1)))
     paths = [folder / f"{stem}-{number:0{digits}d}{suffix}" for number in range(len(shapes))]
     _write(shapes, triangles, paths, asset, overwrite)
@@ -68,14 +68,14 @@ def save_frames(
 def save_mesh(
     vertices: Array, faces: Array, out: str | Path, overwrite: bool = False, asset: Asset | None = None
 ) -> Path:
-    """Write one shape; the file's extension says the format. All else is as for :func:`torch_modal.save_frames`.
+    """Write one shape in the format of the file's extension. Everything else is as for :func:`torch_modal.save_frames`.
 
     Args:
         vertices: Vertex positions. *Shape:* ``(V, 3)``.
         faces: Vertex indices. *Shape:* ``(F, 3)``.
         out: The file: ``.ply``, ``.obj``, ``.off`` or ``.glb``.
         overwrite: Replace files that exist. Materials and textures of equal content need no overwriting.
-        asset: The mesh file whose materials, texture coordinates and all else the shape keeps.
+        asset: The mesh file whose materials, texture coordinates and other content the shape keeps.
     """
     path = Path(out)
     shapes, triangles = check_frames(to_numpy(vertices)[None], faces, "vertices[None]")
@@ -85,24 +85,24 @@ def save_mesh(
 
 
 def _write(shapes: FloatArray, faces: IntArray, paths: list[Path], asset: Asset | None, overwrite: bool) -> None:
-    """Each shape to its file, all in one folder and of one format; none if one of them cannot be written."""
+    """Write shapes to files of one folder and one format; none is written if one of them cannot be."""
     folder, suffix = paths[0].parent, paths[0].suffix.lower()
     for path in paths:
         refuse_existing(path, overwrite)
-    beside: list[tuple[Path, bytes]] = []
-    fmt, own = MESH_FORMATS[suffix], asset is not None and asset.suffix == suffix
+    extra_files: list[tuple[Path, bytes]] = []
+    fmt, same_format = MESH_FORMATS[suffix], asset is not None and asset.suffix == suffix
     if asset is not None:
         asset.check(shapes)
-        asset.warn_lost(paths[0].name, asset.keeps if own else fmt.holds)
-    if asset is not None and own:
+        asset.warn_lost(paths[0].name, asset.keeps if same_format else fmt.holds)
+    if asset is not None and same_format:
         companions = {folder / name: data for name, data in asset.companions.items()}
         if taken := companions.keys() & paths:
             raise ValueError(f"{taken.pop()} is the name of a texture or library of {asset.path.name}; take another")
         if realpath(folder) != realpath(asset.path.parent):  # where they are
-            beside = [(p, data) for p, data in companions.items() if not (p.is_file() and p.read_bytes() == data)]
-        for path, _ in beside:
+            extra_files = [(p, data) for p, data in companions.items() if not (p.is_file() and p.read_bytes() == data)]
+        for path, _ in extra_files:
             refuse_existing(path, overwrite)
         files = ((path, asset.with_positions(x)) for path, x in zip(paths, shapes, strict=True))
     else:
         files = ((path, fmt.write(x, faces, asset)) for path, x in zip(paths, shapes, strict=True))
-    write_files(chain(beside, files))
+    write_files(chain(extra_files, files))

@@ -16,31 +16,31 @@ from torch_modal.io.gltf import ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER, Document, Js
 from torch_modal.io.gltf_asset import GltfAsset
 from torch_modal.io.normals import carry_together
 
-# Normals double the file. Beyond this size (POSITION alone) they are left out.
+# Normals double the file. If POSITION alone is larger than this, normals do not move.
 LARGEST_FILE_WITH_NORMALS = 48 * 2**20
-TINY = 1e-30  # in the place of zero, where shapes do not move
+SMALLEST_EXTENT = 1e-30  # instead of zero, where shapes do not move
 
 
 def glb_bytes(vertices: FloatArray, faces: IntArray, asset: Asset | None) -> bytes:
-    """One shape without an animation."""
+    """A GLB file of one shape, without an animation."""
     return _document(vertices[None], faces, asset, "shape").to_glb()
 
 
 def write_glb(animation: Animation, path: Path) -> None:
-    """Frame 0, a morph target for each further frame, and an animation of their weights; a skin; or principal shapes.
+    """Write an animation as frame 0 and a morph target for each further frame, as a skin, or as principal shapes.
 
-    A GLB or GLTF file gives its nodes and everything else, too.
+    An asset that is a GLB or GLTF file also contributes its nodes and everything else.
     """
     shapes, asset, timing, keyframes = animation.shapes, animation.asset, animation.timing, animation.keyframes
     name, max_targets = animation.name, animation.max_targets
     if max_targets < 1:
-        raise ValueError(f"max_targets must be at least 1, got {max_targets}.")
+        raise ValueError(f"max_targets must be at least 1, got {max_targets}")
     skin, n_targets = animation.skin, animation.targets
-    kept = np.arange(len(shapes)) if skin or n_targets else thinned(len(shapes), max_targets + 1, keyframes)
+    kept = np.arange(len(shapes)) if skin or n_targets else thin_frames(len(shapes), max_targets + 1, keyframes)
     if len(kept) < len(shapes):
         warnings.warn(
             f"{name} holds {len(kept)} of the {len(shapes)} frames (max_targets={max_targets}); "
-            "players interpolate linearly between them.",
+            "players interpolate linearly between them",
             stacklevel=3,
         )
     if skin is not None:
@@ -51,11 +51,11 @@ def write_glb(animation: Animation, path: Path) -> None:
         drawn, weights = shapes[kept], np.eye(len(kept))[:, 1:]  # frame n is the target n - 1 alone
     move_normals = drawn.size * 4 <= LARGEST_FILE_WITH_NORMALS
     if not move_normals:
-        warnings.warn(f"{name} is large: its normals stay those of frame 0.", stacklevel=3)
+        warnings.warn(f"{name} is large: its normals do not move with the shape", stacklevel=3)
     if asset is not None:
         asset.warn_lost(name, asset.keeps if isinstance(asset, GltfAsset) else GLB_HOLDS)
     if isinstance(asset, GltfAsset):
-        document = asset.rebuilt(drawn, move_normals)
+        document = asset.rebuild(drawn, move_normals)
     else:
         document = _document(drawn, animation.faces, asset, Path(name).stem, move_normals)
     if len(kept) > 1:
@@ -82,8 +82,8 @@ def write_glb(animation: Animation, path: Path) -> None:
     path.write_bytes(document.to_glb())
 
 
-def thinned(n_frames: int, most: int, wanted: list[int]) -> IntArray:
-    """At most ``most`` frame numbers, evenly spread, with both ends and (if they fit) the wanted ones."""
+def thin_frames(n_frames: int, most: int, wanted: list[int]) -> IntArray:
+    """Choose at most ``most`` frame numbers, evenly spread, with both ends and, if they fit, the wanted ones."""
     if n_frames <= most:
         return np.arange(n_frames)
     fixed = sorted({0, n_frames - 1, *wanted})
@@ -97,7 +97,7 @@ def thinned(n_frames: int, most: int, wanted: list[int]) -> IntArray:
 
 
 def _principal(shapes: FloatArray, n: int) -> tuple[FloatArray, FloatArray]:
-    """A base, with each of the first n principal shapes added, and their weights in the frames, from 0 to 1.
+    """A base shape, the base plus each of the first n principal shapes, and their weights in the frames, from 0 to 1.
 
     Blender clamps weights to this range, so the base is the mean plus the least part of each shape. *Shape:*
     ``(N, V, 3) -> (1 + n, V, 3), (N, n)``; n is smaller where fewer give the frames exactly.
@@ -109,8 +109,8 @@ def _principal(shapes: FloatArray, n: int) -> tuple[FloatArray, FloatArray]:
     vectors = vectors[:, np.flatnonzero(values >= 1e-14 * values[-1])[::-1][:n]]
     if not few:
         vectors = moved @ vectors
-        vectors /= np.maximum(np.linalg.norm(vectors, axis=0), TINY)
-    low, extent = vectors.min(0), np.maximum(np.ptp(vectors, axis=0), TINY)
+        vectors /= np.maximum(np.linalg.norm(vectors, axis=0), SMALLEST_EXTENT)
+    low, extent = vectors.min(0), np.maximum(np.ptp(vectors, axis=0), SMALLEST_EXTENT)
     parts = (vectors.T @ moved).reshape(-1, *mean.shape)
     base = mean + np.tensordot(low, parts, 1)
     return np.concatenate([base[None], base + extent[:, None, None] * parts]), (vectors - low) / extent
@@ -119,15 +119,15 @@ def _principal(shapes: FloatArray, n: int) -> tuple[FloatArray, FloatArray]:
 def _add_skin(
     document: Document, skin: Skin, asset: Asset | None, inputs: int, shown: IntArray
 ) -> tuple[list[Json], list[Json]]:
-    """Bind the meshes to joints below a root that carries the rigid motion; samplers and channels of the joints.
+    """Bind the meshes to joints below a root, which carries the rigid motion; returns their samplers and channels.
 
     Skinned meshes ignore the transforms of their nodes, which therefore go into the inverse bind matrices.
     """
     weights, (bind, turns, shifts) = skin.weights.double().cpu().numpy(), skin.tracks()
     primitives = [primitive for mesh in document.get("meshes") for primitive in mesh["primitives"]]
     vertices = [np.arange(len(weights))] if asset is None else [part.vertices for part in asset.parts()]
-    for primitive, own in zip(primitives, vertices, strict=True):
-        primitive["attributes"] |= document.add_influences(weights[own])
+    for primitive, rows in zip(primitives, vertices, strict=True):
+        primitive["attributes"] |= document.add_influences(weights[rows])
     turns, shifts = turns[:, shown], shifts[shown]
     turns[:, 1:] *= torch.where((turns[:, 1:] * turns[:, :-1]).sum(0) < 0, -1, 1).cumprod(0)  # never the long way round
     rotations = (turns[[1, 2, 3, 0]] * 32_767).round().permute(2, 1, 0).numpy().astype("<i2", order="C")
@@ -144,8 +144,8 @@ def _add_skin(
         if "mesh" in node:
             inverse = (torch.linalg.inv(bind[1:]).numpy() @ world).transpose(0, 2, 1).reshape(-1, 16)
             matrices = document.add(inverse.astype("<f4"), "MAT4")
-            found = {"inverseBindMatrices": matrices, "joints": joints, "skeleton": first}
-            skinned = {"mesh": node.pop("mesh"), "skin": document.append("skins", found)}
+            skin_json = {"inverseBindMatrices": matrices, "joints": joints, "skeleton": first}
+            skinned = {"mesh": node.pop("mesh"), "skin": document.append("skins", skin_json)}
             if np.linalg.det(world[:3, :3]) < 0:
                 skinned["scale"] = [-1, 1, 1]  # its sign alone counts, for the winding
             if number in top and np.array_equal(world, np.eye(4)):
@@ -169,7 +169,7 @@ def _add_skin(
 def _document(
     shapes: FloatArray, faces: IntArray, asset: Asset | None, name: str, move_normals: bool = True
 ) -> Document:
-    """A document of one node, with the parts of a file or with all faces in clay, and the shapes as morph targets."""
+    """Document of one node, with shapes as morph targets: the parts of an asset, or all faces in clay without one."""
     parts = [Part(np.arange(shapes.shape[1]), faces, Material())] if asset is None else asset.parts()
     positions = shapes[0] if asset is None else asset.positions
     frames = shapes if move_normals else shapes[:1]

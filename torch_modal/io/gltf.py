@@ -1,4 +1,4 @@
-"""glTF 2.0 documents: the JSON and the binary part, read from files and written as GLB, with frames as morph targets.
+"""glTF 2.0 documents, JSON and binary part: read from files, and written as GLB with frames as morph targets.
 
 pygltflib would hold the JSON, but loses some of it (names of samplers, empty lists in extras) and takes 0.4 ms for each
 accessor. It decodes no accessors, and neither joins buffers nor takes images into them, so that it would save little.
@@ -41,14 +41,14 @@ class Document:
         self.root: Json = {"asset": {"version": "2.0", "generator": "torch_modal"}} if root is None else root
         self.path = path
         resource = cache(self.resource)  # any number of buffers may name the same file
-        #: Documents that are written have one, a bytearray.
+        #: A document that is written has one buffer, a bytearray.
         self.buffers: list[Any] = [
             resource(buffer["uri"]) if "uri" in buffer else binary for buffer in self.get("buffers")
         ] or [bytearray()]
 
     @classmethod
     def read(cls, path: Path) -> Document:
-        """Read a GLB or GLTF file; raises ValueError if it is none, or of another version."""
+        """Read a GLB or GLTF file; raises ValueError for other files and other versions of glTF."""
         text = data = path.read_bytes()
         binary, place = b"", 12
         if data[:4] == b"glTF":
@@ -71,7 +71,7 @@ class Document:
 
     # --------------------------------------------------------------------------------------------------------- reading
     def get(self, kind: str, index: int | None = None) -> Any:
-        """A list of the document, empty where there is none; or one of its members."""
+        """A list of the document, empty if it is missing; or the member at an index."""
         items = self.root.get(kind, [])
         if index is None:
             return items
@@ -95,7 +95,7 @@ class Document:
         return bytes(data)
 
     def image(self, index: int) -> bytes:
-        """The bytes of an image; those of a white one, with a warning, if they cannot be read."""
+        """The bytes of an image; if they cannot be read, a white image and a warning."""
         image = self.get("images", index)
         try:
             return self.view(image["bufferView"]) if "bufferView" in image else self.resource(image.get("uri", ""))
@@ -115,7 +115,7 @@ class Document:
         return array
 
     def _rows(self, place: Json, kind: int, count: int, width: int) -> NDArray[Any]:
-        """Numbers in a buffer view, zeros without one. *Shape:* ``(count, width)``."""
+        """Numbers in a buffer view; zeros, if there is no view. *Shape:* ``(count, width)``."""
         dtype = np.dtype(COMPONENTS[kind])
         if "bufferView" not in place:
             # Other accessors of as many elements have their bytes in the file.
@@ -140,13 +140,13 @@ class Document:
 
     # --------------------------------------------------------------------------------------------------------- writing
     def append(self, kind: str, item: Json) -> int:
-        """Add to a list of the document; its number there."""
+        """Append to a list of the document; returns the index."""
         items = self.root.setdefault(kind, [])
         items.append(item)
         return len(items) - 1
 
     def add_bytes(self, data: bytes, target: int | None = None) -> int:
-        """Add bytes as a buffer view; its number."""
+        """Add bytes as a buffer view; returns its index."""
         (binary,) = self.buffers
         binary += bytes(-len(binary) % 4)  # views start at multiples of four bytes
         view: Json = {"buffer": 0, "byteOffset": len(binary), "byteLength": len(data)}
@@ -156,14 +156,14 @@ class Document:
         return self.append("bufferViews", view)
 
     def add_image(self, data: bytes) -> Json:
-        """Add a picture; the JSON of an image."""
+        """Add a picture; returns the JSON of an image."""
         mime = "image/jpeg" if data.startswith(b"\xff\xd8") else "image/png"
         return {"bufferView": self.add_bytes(data), "mimeType": mime}
 
     def add(
         self, array: NDArray[Any], kind: str, target: int | None = None, bounds: bool = False, normalized: bool = False
     ) -> int:
-        """Add numbers ``(count,)`` or ``(count, width)`` as an accessor with a view of its own; its number.
+        """Add numbers ``(count,)`` or ``(count, width)`` as an accessor with a view of its own; returns its index.
 
         Positions and times need bounds. Normalized integers stand for fractions.
         """
@@ -183,9 +183,9 @@ class Document:
         return self.append("accessors", accessor)
 
     def add_frames(self, shapes: FloatArray, normals: FloatArray | None) -> Json:
-        """Add the points of a primitive: its attributes in frame 0, and a morph target for each further frame.
+        """Add the points of a primitive; returns attributes for frame 0, and a morph target for each further frame.
 
-        Normals may be those of frame 0 alone. *Shape:* ``(N, P, 3)``, and ``(N, P, 3)`` or ``(1, P, 3)``.
+        Normals may be given for frame 0 alone. *Shape:* ``(N, P, 3)``, and ``(N, P, 3)`` or ``(1, P, 3)``.
         """
         added: list[Json] = [{"POSITION": self.add(x, "VEC3", ARRAY_BUFFER, bounds=True)} for x in _differences(shapes)]
         if normals is not None:
@@ -194,7 +194,7 @@ class Document:
         return {"attributes": added[0], **({"targets": added[1:]} if added[1:] else {})}
 
     def add_influences(self, weights: FloatArray) -> Json:
-        """Add the largest four weights of bones at points, as attributes. *Shape:* ``(P, J)``."""
+        """Add the four largest weights of bones at points; returns attributes. *Shape:* ``(P, J)``."""
         wide = np.pad(weights, ((0, 0), (0, max(0, 4 - weights.shape[1]))))
         joints = np.argsort(-wide, axis=1, kind="stable")[:, :4]
         parts = np.rint(np.take_along_axis(wide, joints, axis=1) * STEPS).astype("<u2")
@@ -214,18 +214,18 @@ class Document:
 
 
 def world_transforms(document: Document) -> dict[int, FloatArray]:
-    """The nodes of the scene, parents first, and where each is. *Shape of each:* ``(4, 4)``."""
+    """World transform of each node of the scene, parents first. *Shape of each:* ``(4, 4)``."""
     nodes = document.get("nodes")
     if document.get("scenes"):
         roots = document.get("scenes", document.root.get("scene", 0)).get("nodes", [])
     else:
         children = {child for node in nodes for child in node.get("children", [])}
         roots = [number for number in range(len(nodes)) if number not in children]
-    found: dict[int, FloatArray] = {}
+    worlds: dict[int, FloatArray] = {}
     waiting = [(number, np.eye(4)) for number in reversed(roots)]
     while waiting:
         number, parent = waiting.pop()
-        if number in found:  # a node has one parent; in a damaged file it may be its own
+        if number in worlds:  # a node has one parent; in a damaged file it may be its own
             continue
         node = document.get("nodes", number)
         if "matrix" in node:
@@ -235,19 +235,19 @@ def world_transforms(document: Document) -> dict[int, FloatArray]:
             local = quaternion_matrix((w, x, y, z))
             local[:3, :3] *= np.array(node.get("scale", (1.0, 1.0, 1.0)), dtype=np.float64)
             local[:3, 3] = node.get("translation", (0.0, 0.0, 0.0))
-        found[number] = parent @ local
-        waiting += [(child, found[number]) for child in reversed(node.get("children", []))]
-    return found
+        worlds[number] = parent @ local
+        waiting += [(child, worlds[number]) for child in reversed(node.get("children", []))]
+    return worlds
 
 
 def _differences(frames: FloatArray) -> NDArray[np.float32]:
-    """Frame 0 in single precision, and the others less that, so that its rounding is in none of them."""
+    """Frame 0 in single precision, then each other frame minus it, so that its rounding cancels."""
     first = frames[0].astype(np.float32)
     return np.concatenate([first[None], (frames[1:] - first).astype(np.float32)])
 
 
 def _unit(vectors: FloatArray) -> FloatArray:
-    """Unit vectors, as glTF demands; ``(0, 0, 1)`` for those without length. Unit vectors stay bit for bit."""
+    """Unit vectors, as glTF demands; ``(0, 0, 1)`` for zero vectors. Unit vectors stay bit for bit."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     usable = length > 1e-12
     scaled = np.where(np.abs(length - 1) < 1e-6, vectors, vectors / np.where(usable, length, 1.0))

@@ -1,4 +1,4 @@
-"""GLB and GLTF files: their own nodes, materials and textures around other positions."""
+"""GLB and GLTF files, which are written with other positions and their own nodes, materials and textures."""
 
 import copy
 from pathlib import Path
@@ -21,7 +21,7 @@ _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 
 
 class _Primitive(NamedTuple):
-    """Triangles of one node, as indices of its own vertices, which are a slice of the asset's. *Shape:* ``(F, 3)``."""
+    """Triangles of one node, as indices into its vertices, which are a slice of the asset's. *Shape:* ``(F, 3)``."""
 
     node: int
     json: Json
@@ -30,7 +30,7 @@ class _Primitive(NamedTuple):
 
 
 class GltfAsset(Asset):
-    """A GLB or GLTF file. All nodes with triangles count, at the places of their transforms.
+    """A GLB or GLTF file. Its surface has the triangles of all nodes, moved by the transforms of these.
 
     It is written as GLB, with the same nodes, cameras, lights, materials, textures and further attributes. Tangents are
     left out: viewers compute them from normals and texture coordinates.
@@ -99,7 +99,7 @@ class GltfAsset(Asset):
         self._note("posing", " and ".join(name for name, there in posing.items() if there), any(posing.values()))
 
     def morphs(self) -> FloatArray:
-        """The file's shape, and that of each morph target at weight 1. *Shape:* ``(N, V, 3)``."""
+        """The file's shape, and the shape with each morph target at weight 1. *Shape:* ``(N, V, 3)``."""
         counts = {len(primitive.json.get("targets", [])) for primitive in self._primitives}
         if len(counts) > 1:
             raise ValueError(f"meshes of {sorted(counts)} morph targets")
@@ -113,8 +113,8 @@ class GltfAsset(Asset):
                 shapes[number, primitive.points] = moved
         return shapes
 
-    def played(self) -> FloatArray:
-        """The shapes at the key times of an animation that this package wrote. *Shape:* ``(T, V, 3)``."""
+    def play(self) -> FloatArray:
+        """Shapes at the key times of an animation that this package wrote. *Shape:* ``(T, V, 3)``."""
         document, (animation,) = self.document, self.document.get("animations")
         tracks = [document.floats(sampler["output"]) for sampler in animation["samplers"]]
         if not document.get("skins"):
@@ -141,10 +141,10 @@ class GltfAsset(Asset):
     # ------------------------------------------------------------------------------------------------ the file again
     def with_positions(self, positions: FloatArray) -> bytes:
         """The file with other positions."""
-        return self.rebuilt(positions[None]).to_glb()
+        return self.rebuild(positions[None]).to_glb()
 
-    def rebuilt(self, frames: FloatArray, move_normals: bool = True) -> Document:
-        """A copy without unused content, with other positions and those of morph targets. *Shape:* ``(N, V, 3)``."""
+    def rebuild(self, frames: FloatArray, move_normals: bool = True) -> Document:
+        """Copy the used content, with frames as positions and morph targets. *Shape:* ``(N, V, 3)``."""
         old = self.document
         root = {key: copy.deepcopy(value) for key, value in old.root.items() if key not in _REBUILT}
         root["asset"] = {**root.get("asset", {}), "generator": "torch_modal"}
@@ -161,41 +161,41 @@ class GltfAsset(Asset):
         for node_json in document.get("nodes"):
             for key in ("mesh", "skin", "weights"):
                 node_json.pop(key, None)
-        taken: dict[int, int] = {}
+        copies: dict[int, int] = {}
 
         def take(accessor: int, target: int) -> int:
-            """Copy an accessor as it is; its number in the copy."""
-            if accessor not in taken:
-                given, numbers = old.get("accessors", accessor), old.accessor(accessor)
-                normalized = given.get("normalized", False)
-                taken[accessor] = document.add(numbers, given["type"], target, "min" in given, normalized)
-                if "name" in given:
-                    document.get("accessors", taken[accessor])["name"] = given["name"]
-            return taken[accessor]
+            """Copy an accessor as it is; returns its number in the copy."""
+            if accessor not in copies:
+                source, numbers = old.get("accessors", accessor), old.accessor(accessor)
+                normalized = source.get("normalized", False)
+                copies[accessor] = document.add(numbers, source["type"], target, "min" in source, normalized)
+                if "name" in source:
+                    document.get("accessors", copies[accessor])["name"] = source["name"]
+            return copies[accessor]
 
         for node in self._world:
-            own = [primitive for primitive in self._primitives if primitive.node == node]
-            if not own:
+            primitives = [primitive for primitive in self._primitives if primitive.node == node]
+            if not primitives:
                 continue
             # Each node gets a mesh of its own: the same mesh may be shown, and deformed, at several places.
             mesh = copy.deepcopy({**old.get("meshes", old.get("nodes", node)["mesh"]), "primitives": []})
             mesh.pop("weights", None)
             inverse = self._inverse(node)
-            given, shapes = [], []
-            for primitive in own:
+            originals, shapes = [], []
+            for primitive in primitives:
                 normal = primitive.json["attributes"].get("NORMAL")
                 normals = None if normal is None else old.floats(normal)
-                given.append((normals, old.floats(primitive.json["attributes"]["POSITION"]), primitive.triangles))
+                originals.append((normals, old.floats(primitive.json["attributes"]["POSITION"]), primitive.triangles))
                 shapes.append(frames[:, primitive.points] @ inverse[:3, :3].T + inverse[:3, 3])
-            turned = carry_together(given, shapes if move_normals else [x[:1] for x in shapes])
-            placed: dict[tuple[int, int | None], Json] = {}
-            for primitive, shape, normals in zip(own, shapes, turned, strict=True):
+            rotated = carry_together(originals, shapes if move_normals else [x[:1] for x in shapes])
+            by_points: dict[tuple[int, int | None], Json] = {}
+            for primitive, shape, normals in zip(primitives, shapes, rotated, strict=True):
                 attributes = primitive.json["attributes"]
                 points = attributes["POSITION"], attributes.get("NORMAL")
-                if points not in placed:
-                    placed[points] = document.add_frames(shape, normals)
+                if points not in by_points:
+                    by_points[points] = document.add_frames(shape, normals)
                 kept = {key: primitive.json[key] for key in ("material", "mode", "extras") if key in primitive.json}
-                copied = copy.deepcopy(kept | placed[points])
+                copied = copy.deepcopy(kept | by_points[points])
                 for name, accessor in attributes.items():
                     if name not in ("POSITION", "NORMAL", "TANGENT") and not name.startswith(("JOINTS_", "WEIGHTS_")):
                         copied["attributes"][name] = take(accessor, ARRAY_BUFFER)
@@ -217,7 +217,7 @@ class GltfAsset(Asset):
     # --------------------------------------------------------------------------------------------- for other formats
     def parts(self) -> list[Part]:
         """One part for each primitive."""
-        found = []
+        parts = []
         for primitive in self._primitives:
             read = {name: self.document.floats(index) for name, index in primitive.json["attributes"].items()}
             colors, normals = read.get("COLOR_0"), read.get("NORMAL")
@@ -228,8 +228,8 @@ class GltfAsset(Asset):
                 normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
             vertices = np.arange(primitive.points.start, primitive.points.stop)
             material = self._material(primitive.json.get("material"))
-            found.append(Part(vertices, primitive.triangles, material, read.get("TEXCOORD_0"), colors, normals))
-        return found
+            parts.append(Part(vertices, primitive.triangles, material, read.get("TEXCOORD_0"), colors, normals))
+        return parts
 
     def _material(self, number: int | None) -> Material:
         if number is None:

@@ -14,28 +14,28 @@ from torch_modal.io.asset import Material, as_png_or_jpeg
 from torch_modal.io.files import try_companion
 
 _OPTIONS = re.compile(r"(?:-(?:[ost](?:\s+-?[\d.]+){1,3}|mm\s+\S+\s+\S+|\w+\s+\S+)\s+)*")
-"""Options of a texture line with their values: those of coordinates have up to three numbers."""
+"""Options of a texture line with their values: options of coordinates have up to three numbers."""
 LARGEST_LIBRARY = 2**24  # bytes
 
 
 def read_libraries(path: Path, lines: dict[int, str]) -> tuple[dict[str, Material], dict[str, bytes], dict[int, str]]:
-    """Read the material libraries that an OBJ file names, by the numbers of its lines; warn of those left out.
+    """Read the material libraries that lines of an OBJ file name, by line number; warn of libraries that are not read.
 
     Returns the materials; the libraries and their textures, by their paths below the folder of the file or of a copy;
-    and the names in those lines that differ in a copy.
+    and the lines whose names differ in a copy, with these names.
     """
     materials: dict[str, Material] = {}
     files: dict[str, bytes] = {}
     changed: dict[int, str] = {}
     read = cache(partial(try_companion, path))  # materials share textures
     for line, written in lines.items():
-        # One name may hold blanks; blanks also separate several names.
+        # One name may contain blanks; blanks also separate several names.
         names = [written] if os.path.isfile(path.parent / written) else written.split()
         for number, name in enumerate(names):
-            if found := read(name, "a material library", LARGEST_LIBRARY):
-                files[found[0]] = _read_library(path, *found, read, materials, files)
-                if posixpath.normpath(name) != found[0]:
-                    names[number] = found[0]
+            if companion := read(name, "a material library", LARGEST_LIBRARY):
+                files[companion[0]] = _read_library(path, *companion, read, materials, files)
+                if posixpath.normpath(name) != companion[0]:
+                    names[number] = companion[0]
                     changed[line] = " ".join(names)
     return materials, files, changed
 
@@ -43,7 +43,7 @@ def read_libraries(path: Path, lines: dict[int, str]) -> tuple[dict[str, Materia
 def _read_library(
     path: Path, library: str, data: bytes, read: Any, materials: dict[str, Material], files: dict[str, bytes]
 ) -> bytes:
-    """Add the materials and textures of a library; returns its content for a copy."""
+    """Add the materials and files of a library to the results; returns its content for a copy."""
     folder = posixpath.dirname(library)
     lines = re.split(r"(\r\n|\n|\r)", data.decode("utf-8", errors="surrogateescape"))  # and their ends
     material = ""
@@ -54,13 +54,13 @@ def _read_library(
             material = line.strip()[len(key) :].strip()
             materials[material] = Material(material, (0.8, 0.8, 0.8, 1.0))
         elif words and (key.startswith("map_") or key in ("bump", "norm", "disp", "decal", "refl")):
-            # The file stands after the options, and may hold blanks.
+            # The file name follows the options, and may contain blanks.
             written = _OPTIONS.sub("", line.strip().split(None, 1)[1], count=1)
             texture = written.replace("\\", "/")
             base = folder if os.path.isfile(path.parent / folder / texture) else ""
-            if not (found := read(posixpath.join(base, texture), f"a texture of {library}")):
+            if not (companion := read(posixpath.join(base, texture), f"a texture of {library}")):
                 continue
-            place, files[found[0]] = found
+            place, files[companion[0]] = companion
             if posixpath.normpath(texture) != (kept := posixpath.relpath(place, folder or ".")):
                 lines[number] = line.rstrip().removesuffix(written) + kept
             if key == "map_kd" and material in materials:

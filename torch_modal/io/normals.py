@@ -11,8 +11,8 @@ from torch_modal.geometry.vectors import vertex_normals
 class CarriedNormals:
     """Rotates a file's normals with the surface, so that hard edges stay hard and smooth ones smooth.
 
-    Points with one place and one normal are one: seams of texture coordinates do not show in the shading. All are as
-    the file has them. *Shape:* ``(P, 3), (P, 3), (F, 3)``.
+    Points of equal position and normal count as one: seams of texture coordinates do not show in the shading. Arguments
+    are as the file has them. *Shape:* ``(P, 3), (P, 3), (F, 3)``.
     """
 
     def __init__(self, normals: FloatArray, positions: FloatArray, triangles: IntArray) -> None:
@@ -28,7 +28,7 @@ class CarriedNormals:
         self.before = self._frames(positions)
 
     def _frames(self, positions: FloatArray) -> FloatArray:
-        """Right-handed frames at each point: the normal, the edge made perpendicular to it. *Shape:* ``(P, 3, 3)``."""
+        """Right-handed frame at each point: the normal, an edge made perpendicular to it. *Shape:* ``(P, 3, 3)``."""
         x = positions[self.first]
         normals, sides = vertex_normals(x, self.triangles), x[self.neighbour] - x
         along = sides - np.einsum("ij,ij->i", sides, normals)[:, None] * normals
@@ -40,27 +40,28 @@ class CarriedNormals:
         return np.stack([normals, second, np.cross(normals, second)], axis=2)[self.group]
 
     def at(self, positions: FloatArray) -> FloatArray:
-        """The normals of the surface with other positions; bit for bit those of the file where it has not moved."""
+        """Normals of the surface with other positions; where it has not moved, the file's, bit for bit."""
         after = self._frames(positions)
-        turned = np.einsum("nij,nkj,nk->ni", after, self.before, self.normals)
-        return np.where((self.before == after).all(axis=(1, 2))[:, None], self.normals, turned)
+        rotated = np.einsum("nij,nkj,nk->ni", after, self.before, self.normals)
+        return np.where((self.before == after).all(axis=(1, 2))[:, None], self.normals, rotated)
 
 
 def carry_together(
     parts: Sequence[tuple[FloatArray | None, FloatArray, IntArray]], frames: Sequence[FloatArray]
 ) -> list[FloatArray | None]:
-    """Normals of several parts of a surface in each frame, None for those without; where parts meet, they stay equal.
+    """Rotate the normals of several parts of a surface with each frame; where parts meet, their normals stay equal.
 
-    Parts are arguments of :class:`CarriedNormals`. *Shape of each in the frames, and of the results:* ``(N, P, 3)``.
+    Parts are arguments of :class:`CarriedNormals`; a part without normals gives None. *Shape of each in the frames, and
+    of the results:* ``(N, P, 3)``.
     """
-    found: list[FloatArray | None] = [None] * len(parts)
-    own = [k for k, (normals, _, _) in enumerate(parts) if normals is not None]
-    if own:
-        normals, positions, triangles = zip(*(parts[k] for k in own), strict=True)
+    carried_normals: list[FloatArray | None] = [None] * len(parts)
+    with_normals = [k for k, (normals, _, _) in enumerate(parts) if normals is not None]
+    if with_normals:
+        normals, positions, triangles = zip(*(parts[k] for k in with_normals), strict=True)
         ends = np.cumsum([len(part) for part in positions])
         shifted = [part + end - len(place) for part, end, place in zip(triangles, ends, positions, strict=True)]
         carried = CarriedNormals(np.concatenate(normals), np.concatenate(positions), np.concatenate(shifted))
-        turned = np.stack([carried.at(x) for x in np.concatenate([frames[k] for k in own], axis=1)])
-        for k, part in zip(own, np.split(turned, ends[:-1], axis=1), strict=True):
-            found[k] = part
-    return found
+        rotated = np.stack([carried.at(x) for x in np.concatenate([frames[k] for k in with_normals], axis=1)])
+        for k, part in zip(with_normals, np.split(rotated, ends[:-1], axis=1), strict=True):
+            carried_normals[k] = part
+    return carried_normals

@@ -1,4 +1,4 @@
-"""Wavefront OBJ: the lines of the file, with other numbers in the place of positions and normals."""
+"""Wavefront OBJ: the lines of the file, in which positions and normals are replaced."""
 
 import re
 from functools import cached_property
@@ -9,7 +9,7 @@ import numpy as np
 
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.errors import MeshError
-from torch_modal.io.asset import Asset, Material, Part, linear
+from torch_modal.io.asset import Asset, Material, Part, linear_rgba
 from torch_modal.io.mtl import read_libraries
 from torch_modal.io.normals import CarriedNormals
 
@@ -92,15 +92,18 @@ class ObjAsset(Asset):
         lines = list(self.lines)
         for number, (x, y, z) in zip(self._line_of["v"], positions.tolist(), strict=True):
             lines[number] = " ".join([f"v {x!r} {y!r} {z!r}", *lines[number].split(None, 4)[4:]])
-        for number, names in self._read[2].items():
+        for number, names in self._library_content[2].items():
             lines[number] = f"mtllib {names}"
         if "normals" in self.carries:
             self._write_normals(lines, positions)
         return ("\n".join(lines) + "\n").encode("utf-8", errors="surrogateescape")
 
     @cached_property
-    def _carried(self) -> tuple[IntArray, IntArray, IntArray, CarriedNormals]:
-        """Pairs of a vertex and a normal; each corner's, -1 for none; their normals. *Shape:* ``(n,), (n,), (C,)``."""
+    def _carried_normals(self) -> tuple[IntArray, IntArray, IntArray, CarriedNormals]:
+        """Vertex and normal of each pair that corners use; the pair of each corner, -1 for none; the pairs' normals.
+
+        *Shape:* ``(n,), (n,), (C,)``.
+        """
         with_normal = self._corners[:, 2] >= 0
         pairs, inverse = np.unique(self._corners[with_normal][:, [2, 0]], axis=0, return_inverse=True)
         which = np.full(len(self._corners), -1)
@@ -112,13 +115,13 @@ class ObjAsset(Asset):
         return vertices, normals, which, carried
 
     def _write_normals(self, lines: list[str], positions: FloatArray) -> None:
-        vertices, normals, which, carried = self._carried
+        vertices, normals, which, carried = self._carried_normals
         text = [f"vn {x!r} {y!r} {z!r}" for x, y, z in carried.at(positions[vertices]).tolist()]
         if len(np.unique(normals)) == len(normals):
             for index, line in zip(normals.tolist(), text, strict=True):
                 lines[self._line_of["vn"][index]] = line
             return
-        # A normal of several vertices: one for each instead, all at the place of the first.
+        # Vertices shared this normal: it becomes one for each of them, all on the line of the first.
         for number in self._line_of["vn"]:
             lines[number] = "#"
         lines[self._line_of["vn"][0]] = "\n".join(text)
@@ -130,13 +133,13 @@ class ObjAsset(Asset):
             lines[number] = " ".join([kind, *words])
 
     @cached_property
-    def _read(self) -> tuple[dict[str, Material], dict[str, bytes], dict[int, str]]:
+    def _library_content(self) -> tuple[dict[str, Material], dict[str, bytes], dict[int, str]]:
         return read_libraries(self.path, self._libraries)
 
     @property
     def companions(self) -> dict[str, bytes]:
         """Material libraries and their textures."""
-        return self._read[1]
+        return self._library_content[1]
 
     # --------------------------------------------------------------------------------------------- for other formats
     def polygons(self) -> tuple[IntArray, IntArray, FloatArray | None]:
@@ -146,45 +149,45 @@ class ObjAsset(Asset):
         return self._sizes, self._corners[:, 0], self._texcoords[texcoords] if known else None
 
     def parts(self) -> list[Part]:
-        """One part for each material that faces use."""
-        colors = None if self._colors is None else linear(self._colors)
-        found = []
+        """A part for each material that faces use."""
+        colors = None if self._colors is None else linear_rgba(self._colors)
+        parts = []
         for number in np.unique(self._material_of):
             corners = self._corners[self._triangles[self._material_of == number]].reshape(-1, 3)
             points, triangles = np.unique(corners, axis=0, return_inverse=True)
             vertices, texcoords, normals = points.T
             name = self._materials[number] if number >= 0 else ""
-            material = self._read[0].get(name)
+            material = self._library_content[0].get(name)
             if material is None:
                 material = Material(name) if name else Material()
                 if colors is not None:
                     material = material._replace(color=(1.0, 1.0, 1.0, 1.0))
             uv = self._texcoords[texcoords] * [1, -1] + [0, 1] if (texcoords >= 0).all() else None
             rgba = None if colors is None else colors[vertices]
-            given = self._normals[normals] if (normals >= 0).all() else None
-            found.append(Part(vertices, triangles.reshape(-1, 3), material, uv, rgba, given))
-        return found
+            vectors = self._normals[normals] if (normals >= 0).all() else None
+            parts.append(Part(vertices, triangles.reshape(-1, 3), material, uv, rgba, vectors))
+        return parts
 
 
 def _corner(word: str, counts: tuple[int, ...], place: str) -> tuple[int, ...]:
     """Indices from 0 of a corner such as ``1/2/3`` or ``-1//-1``; -1 where there is none."""
-    given = [int(part) if part else None for part in (*word.split("/"), "", "")[:3]]
-    if 0 in given or given[0] is None:
+    indices = [int(number) if number else None for number in (*word.split("/"), "", "")[:3]]
+    if 0 in indices or indices[0] is None:
         raise MeshError(f"{place} has the index 0 (OBJ counts from 1) or a corner without a vertex")
     v, *others = [
         -1 if index is None else index - 1 if index > 0 else count + index
-        for index, count in zip(given, counts, strict=True)
+        for index, count in zip(indices, counts, strict=True)
     ]
     return v, *(max(index, -1) for index in others)
 
 
 def _columns(rows: list[list[float]], start: int, stop: int) -> FloatArray:
-    """Some numbers of each line; 0 where a line has fewer. *Shape:* ``(n, stop - start)``."""
+    """Numbers ``start`` to ``stop`` of each line; 0 where a line has fewer. *Shape:* ``(n, stop - start)``."""
     padded = [[*row[start:stop], 0.0, 0.0][: stop - start] for row in rows]
     return np.array(padded, dtype=np.float64).reshape(-1, stop - start)
 
 
 def obj_bytes(vertices: FloatArray, faces: IntArray, asset: Any = None) -> bytes:
-    """Text; repr() gives the fewest digits that read back as the same float64."""
+    """An OBJ file of vertices and faces; repr() gives the fewest digits that read back as the same float64."""
     points = "".join(f"v {x!r} {y!r} {z!r}\n" for x, y, z in vertices.tolist())
     return (points + "".join(f"f {a} {b} {c}\n" for a, b, c in (faces + 1).tolist())).encode("ascii")

@@ -1,7 +1,8 @@
-"""PLY and OFF. A PLY is written as its own bytes, with other numbers in the place of positions and normals.
+"""PLY and OFF. A PLY file is written as its own bytes, in which positions and normals are replaced.
 
 trimesh reads positions and triangles. It writes neither further elements and properties of PLY nor comments, so that
-files are patched here. plyfile could do so, but its license is the GPL.
+files are patched here. plyfile could do so, but its license is the GPL. trimesh writes OFF
+with ten digits.
 """
 
 import re
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.errors import MeshError
-from torch_modal.io.asset import Asset, Material, Part, as_png_or_jpeg, linear
+from torch_modal.io.asset import Asset, Material, Part, as_png_or_jpeg, linear_rgba
 from torch_modal.io.files import try_companion
 from torch_modal.io.normals import CarriedNormals
 
@@ -30,7 +31,7 @@ _NORMALS, _COLORS = ("nx", "ny", "nz"), ("red", "green", "blue")
 class PlyFile:
     """A PLY file in memory: its header, and the numbers of its vertices.
 
-    A ValueError says that it has no header, no vertices, or fewer bytes than the header promises.
+    Raises a ValueError if it has no header, no vertices, or fewer bytes than the header promises.
     """
 
     def __init__(self, path: Path) -> None:
@@ -40,7 +41,7 @@ class PlyFile:
             raise ValueError("no end_header")
         self._start = match.end()
         self._order, self.textures = "", []
-        #: Number and properties of each element. A property is its type; a list has that of its length first.
+        #: Number and properties of each element. A property is ``[type]``, a list ``[type of its length, type]``.
         self.elements: dict[str, tuple[int, dict[str, list[str]]]] = {}
         properties: dict[str, list[str]] = {}
         for line in re.split(r"\r\n|\n|\r", self.data[: self._start].decode("utf-8", errors="replace")):
@@ -64,7 +65,7 @@ class PlyFile:
 
     @cached_property
     def _content(self) -> tuple[bytes, NDArray[Any], bytes]:
-        """The vertices with all their properties, of text its words, and the bytes before and after them."""
+        """The vertices with all their properties (words, if the file is text), and the bytes before and after them."""
         if any(len(types) > 1 for types in self.properties.values()):
             raise ValueError("vertices with properties that are lists")
         before = [*takewhile(lambda element: element[1] is not self.properties, self.elements.values())]
@@ -110,7 +111,7 @@ class PlyFile:
 
 
 class PlyAsset(Asset):
-    """A PLY file, kept as bytes. Written again it differs in positions and normals alone, in the file's types."""
+    """A PLY file, kept as bytes. Written again it differs in positions and normals only, in the file's types."""
 
     suffix = ".ply"
 
@@ -133,14 +134,14 @@ class PlyAsset(Asset):
         self._note("properties", "properties " + ", ".join(further), further)
 
     @cached_property
-    def _carried(self) -> CarriedNormals:
+    def _carried_normals(self) -> CarriedNormals:
         return CarriedNormals(self._file.columns(*_NORMALS), self.positions, self.faces)
 
     def with_positions(self, positions: FloatArray) -> bytes:
         """The file with other positions."""
         new = dict(zip("xyz", positions.T, strict=True))
         if "normals" in self.carries:
-            new |= dict(zip(_NORMALS, self._carried.at(positions).T, strict=True))
+            new |= dict(zip(_NORMALS, self._carried_normals.at(positions).T, strict=True))
         return self._file.with_columns(new)
 
     @cached_property
@@ -159,7 +160,7 @@ class PlyAsset(Asset):
             kind = np.dtype(self._file.properties["red"][0])
             scale = float(np.iinfo(kind).max) if kind.kind in "iu" else 1.0
             alpha = ["alpha"] if "alpha" in self._file.properties else []
-            colors = linear(self._file.columns(*_COLORS, *alpha) / scale)
+            colors = linear_rgba(self._file.columns(*_COLORS, *alpha) / scale)
         if self._uv_names is not None:
             texcoords = self._file.columns(*self._uv_names) * [1, -1] + [0, 1]
         if "normals" in self.carries:
@@ -169,7 +170,7 @@ class PlyAsset(Asset):
 
 
 class OffAsset(Asset):
-    """An OFF file, of which the triangles are kept: neither colours nor polygons."""
+    """An OFF file. Written again it has triangles alone, neither colours nor polygons."""
 
     suffix = ".off"
     keeps = frozenset()
@@ -190,7 +191,7 @@ class OffAsset(Asset):
 
 
 def read_triangles(path: Path, n_vertices: int, n_faces: int) -> tuple[FloatArray, IntArray]:
-    """Vertices ``(V, 3)`` as they stand in the file, faces ``(F, 3)``; numbers are those of its header."""
+    """Read vertices ``(V, 3)`` in the order of the file, and faces ``(F, 3)``; the header gives their numbers."""
     import trimesh
 
     # Without process=False vertices are merged; with fix_texture a PLY is split at seams. It needs no textures here.
@@ -208,7 +209,7 @@ def read_triangles(path: Path, n_vertices: int, n_faces: int) -> tuple[FloatArra
 
 
 def ply_bytes(vertices: FloatArray, faces: IntArray, asset: Any = None) -> bytes:
-    """Binary, float32."""
+    """A binary PLY file of vertices and faces, float32."""
     header = (
         "ply\nformat binary_little_endian 1.0\n"
         f"element vertex {len(vertices)}\nproperty float x\nproperty float y\nproperty float z\n"
@@ -220,7 +221,7 @@ def ply_bytes(vertices: FloatArray, faces: IntArray, asset: Any = None) -> bytes
 
 
 def off_bytes(vertices: FloatArray, faces: IntArray, asset: Any = None) -> bytes:
-    """Text, float64."""
+    """An OFF file of vertices and faces, text, float64."""
     points = "".join(f"{x!r} {y!r} {z!r}\n" for x, y, z in vertices.tolist())
     triangles = "".join(f"3 {a} {b} {c}\n" for a, b, c in faces.tolist())
     return f"OFF\n{len(vertices)} {len(faces)} 0\n{points}{triangles}".encode("ascii")

@@ -14,17 +14,17 @@ _NORMALS = ["nx", "ny", "nz"]
 
 MOST_DEGREE = 3  # of spherical harmonics
 
-# Directions from which the harmonics of a degree follow: more than it has, and none of another's opposite.
+# Directions whose values determine the harmonics of a degree: more than it has, and no two opposite.
 _DIRECTIONS = np.random.default_rng(0).standard_normal((12, 3))
 _DIRECTIONS /= np.linalg.norm(_DIRECTIONS, axis=1, keepdims=True)
 
-_CHUNK = 65_536  # rotations that are applied at a time
+_ROTATIONS_AT_ONCE = 65_536  # rotations that are applied at a time
 
 
 class PointFile:
-    """A PLY file whose vertices, at ``positions`` ``(P, 3)``, move, with or without faces; all else stays as it is.
+    """A PLY file, with or without faces, whose vertices at ``positions`` ``(P, 3)`` can be moved; the rest stays.
 
-    They may be splats, with a rotation and logarithms of scales.
+    Vertices may be splats, with a rotation and logarithms of scales.
     """
 
     def __init__(self, path: Path) -> None:
@@ -49,34 +49,34 @@ class PointFile:
                 "24 or 45"
             )
 
-    def moved(self, positions: FloatArray, rotations: FloatArray, gradients: FloatArray) -> bytes:
-        """The file with points that moved, and what turns with them: normals; of splats axes, scales and harmonics.
+    def move(self, positions: FloatArray, rotations: FloatArray, gradients: FloatArray) -> bytes:
+        """The file with points at other positions; normals, and axes and harmonics of splats, are rotated.
 
-        Axes of splats turn, and scales change as lengths along the axes do under the deformation gradients. *Shape:*
+        Scales of splats change as lengths along their axes do under the deformation gradients. *Shape:*
         ``(P, 3), (P, 3, 3), (P, 3, 3)``.
         """
         new = dict(zip("xyz", positions.T, strict=True))
         if self.normals.size:
-            turned = np.einsum("pij,pj->pi", rotations, self.normals)
-            new |= dict(zip(_NORMALS, turned.T, strict=True))
+            rotated = np.einsum("pij,pj->pi", rotations, self.normals)
+            new |= dict(zip(_NORMALS, rotated.T, strict=True))
         if self.is_splats:
             # SciPy's quaternions have the scalar last, and a length.
             quaternions = np.roll(self._file.columns(*_QUATERNION), -1, axis=1)
             quaternions[~quaternions.any(1), 3] = 1
-            given = Rotation.from_quat(quaternions)
-            turned = (Rotation.from_matrix(rotations) * given).as_quat()
-            new |= dict(zip(_QUATERNION, np.roll(turned, 1, axis=1).T, strict=True))
-            stretch = np.linalg.norm(gradients @ given.as_matrix(), axis=1)
+            before = Rotation.from_quat(quaternions)
+            rotated = (Rotation.from_matrix(rotations) * before).as_quat()
+            new |= dict(zip(_QUATERNION, np.roll(rotated, 1, axis=1).T, strict=True))
+            stretch = np.linalg.norm(gradients @ before.as_matrix(), axis=1)
             scales = self._file.columns(*_SCALES) + np.log(np.maximum(stretch, np.finfo(np.float32).tiny))
             new |= dict(zip(_SCALES, scales.T, strict=True))
             if self._harmonics:
-                own = self._file.columns(*self._harmonics).reshape(len(positions), 3, -1)
-                rotated = rotated_harmonics(own, rotations).reshape(len(positions), -1)
+                coefficients = self._file.columns(*self._harmonics).reshape(len(positions), 3, -1)
+                rotated = rotate_harmonics(coefficients, rotations).reshape(len(positions), -1)
                 new |= dict(zip(self._harmonics, rotated.T, strict=True))
         return self._file.with_columns(new)
 
 
-def harmonics(directions: FloatArray, degree: int) -> FloatArray:
+def evaluate_harmonics(directions: FloatArray, degree: int) -> FloatArray:
     """The real harmonics of a degree, in the order and with the signs of 3D Gaussian splatting (Kerbl et al. 2023).
 
     *Shape:* ``(..., 3) -> (..., 2 degree + 1)``, of unit vectors; degrees 1, 2 and 3.
@@ -99,21 +99,21 @@ def harmonics(directions: FloatArray, degree: int) -> FloatArray:
     return np.sqrt(7 / (64 * np.pi)) * np.stack(rows, -1)
 
 
-def rotated_harmonics(coefficients: FloatArray, rotations: FloatArray) -> FloatArray:
-    """Coefficients of functions on the sphere that turn: ``f'(d) = f(R^T d)``.
+def rotate_harmonics(coefficients: FloatArray, rotations: FloatArray) -> FloatArray:
+    """Coefficients of rotated functions on the sphere: ``f'(d) = f(R^T d)``.
 
-    Those of degrees 1 up to 3, one after the other, ``(P, C, 3)``, ``(P, C, 8)`` or ``(P, C, 15)``.
+    Degrees 1 up to 3 follow one another. *Shape:* ``(P, C, 3)``, ``(P, C, 8)`` or ``(P, C, 15)``.
     """
-    found = np.empty_like(coefficients)
-    for start in range(0, len(coefficients), _CHUNK):
-        part = slice(start, start + _CHUNK)
-        back = _DIRECTIONS @ rotations[part]  # rows R^T d
+    rotated = np.empty_like(coefficients)
+    for start in range(0, len(coefficients), _ROTATIONS_AT_ONCE):
+        rows = slice(start, start + _ROTATIONS_AT_ONCE)
+        back = _DIRECTIONS @ rotations[rows]  # rows R^T d
         first = 0
         for degree in range(1, MOST_DEGREE + 1):
-            own = slice(first, first + 2 * degree + 1)
-            if own.stop > coefficients.shape[-1]:
+            columns = slice(first, first + 2 * degree + 1)
+            if columns.stop > coefficients.shape[-1]:
                 break
-            seen = np.einsum("pdj,pcj->pcd", harmonics(back, degree), coefficients[part, :, own])
-            found[part, :, own] = seen @ np.linalg.pinv(harmonics(_DIRECTIONS, degree)).T
-            first = own.stop
-    return found
+            seen = np.einsum("pdj,pcj->pcd", evaluate_harmonics(back, degree), coefficients[rows, :, columns])
+            rotated[rows, :, columns] = seen @ np.linalg.pinv(evaluate_harmonics(_DIRECTIONS, degree)).T
+            first = columns.stop
+    return rotated

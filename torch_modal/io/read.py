@@ -30,8 +30,8 @@ def open_asset(path: str | os.PathLike[str]) -> Asset:
         path: An OBJ, PLY, OFF, GLB or GLTF file.
 
     Returns:
-        The asset: ``positions`` and ``faces`` are those of :func:`torch_modal.load_keyframes`;
-        :func:`torch_modal.save_mesh` makes the same file with other positions.
+        The asset: ``positions`` and ``faces`` are as from :func:`torch_modal.load_keyframes`;
+        :func:`torch_modal.save_mesh` writes the same file with other positions.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -75,7 +75,7 @@ def open_asset(path: str | os.PathLike[str]) -> Asset:
 def require_same_mesh(
     first: str | os.PathLike[str], mesh: Mesh, other: str | os.PathLike[str], other_mesh: Mesh
 ) -> None:
-    """Raise unless the vertices and faces of a file match those of the first."""
+    """Raise a MeshError unless two files have equally many vertices and the same faces."""
     hint = "all key-frames need the same vertices and faces, in the same vertex order"
     (_, faces), (_, other_faces) = mesh, other_mesh
     for what, mine, its in zip(("vertices", "faces"), mesh, other_mesh, strict=True):
@@ -84,7 +84,7 @@ def require_same_mesh(
     if np.array_equal(faces, other_faces):
         return
     here, there = (set(map(tuple, np.sort(rows, axis=1).tolist())) for rows in (faces, other_faces))
-    # Of equally many faces, some may be strange, or missing, or both.
+    # There are equally many faces, so that some are new, or some are missing, or both.
     for file, rows, known, whole in ((other, other_faces, here, first), (first, faces, there, other)):
         strange = [number for number, row in enumerate(np.sort(rows, axis=1).tolist()) if tuple(row) not in known]
         if strange:

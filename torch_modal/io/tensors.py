@@ -1,7 +1,7 @@
 """Safetensors files of the package: a format with a version, and digests that find damage before numbers are used.
 
-The metadata have one entry, ``torch_modal``, which is JSON: the format, its version, and what else a caller adds.
-(safetensors does not keep the order of several entries, and equal files shall have equal bytes.) The tensor ``digests``
+The metadata have one entry, ``torch_modal``, which is JSON: the format, its version, and what a caller adds.
+(safetensors does not keep the order of several entries, and equal content gives equal bytes.) The tensor ``digests``
 has a row of SHA-256 for the header and for each other tensor, in the order of their names. The first row covers the
 others, so that opening a large file does not read its numbers; each tensor is compared with its row when it is read.
 """
@@ -19,7 +19,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from torch_modal.autograd import lasting
-from torch_modal.io.files import temporary_beside
+from torch_modal.io.files import atomic_write
 
 DIGESTS = "digests"
 ENTRY = "torch_modal"
@@ -31,21 +31,21 @@ def write_tensors(
     """Write a whole file or nothing, into a folder that exists. JSON must be able to hold the metadata."""
     header = json.dumps({"format": format, "version": version, **(metadata or {})}, sort_keys=True)
     # Copies, as safetensors refuses tensors that share memory.
-    parts = {
+    copies = {
         name: tensor.detach().cpu().clone(memory_format=torch.contiguous_format) for name, tensor in tensors.items()
     }
-    rows = [_digest(name, parts[name]) for name in sorted(parts)]
-    table = bytearray(b"".join([_header_digest(header, sorted(parts), rows), *rows]))
-    parts[DIGESTS] = torch.frombuffer(table, dtype=torch.uint8).reshape(-1, 32)
+    rows = [_digest(name, copies[name]) for name in sorted(copies)]
+    table = bytearray(b"".join([_header_digest(header, sorted(copies), rows), *rows]))
+    copies[DIGESTS] = torch.frombuffer(table, dtype=torch.uint8).reshape(-1, 32)
     # Not safetensors' save_file: its files can be read by their owner alone, whatever the umask says.
-    with temporary_beside(path) as temporary:
-        temporary.write_bytes(save(parts, {ENTRY: header}))
+    with atomic_write(path) as temporary:
+        temporary.write_bytes(save(copies, {ENTRY: header}))
 
 
 class TensorFile:
     """A file that is open for reading and mapped into memory: tensors are read when they are used, and outlive it.
 
-    A ValueError says that it is damaged, or lacks the format, the version or the tensors that are named.
+    Raises a ValueError if it is damaged, or lacks the format, the version or the tensors that are named.
     """
 
     def __init__(self, path: Path, format: str, version: str, needs: Sequence[str] = ()) -> None:
@@ -82,14 +82,14 @@ class TensorFile:
     @lasting
     def tensor(self, name: str) -> Tensor:
         """One of the tensors; raises ValueError if it is not what was written."""
-        found: Tensor = self._file.get_tensor(name)
-        if self._digests[name] != _digest(name, found):
+        tensor: Tensor = self._file.get_tensor(name)
+        if self._digests[name] != _digest(name, tensor):
             raise ValueError(f"{self.path} is damaged: its tensor {name!r} is not what was written")
-        return found
+        return tensor
 
     @lasting
     def tensors(self) -> dict[str, Tensor]:
-        """Copies of all tensors, which do not depend on the file any more."""
+        """Copies of all tensors, which do not depend on the file."""
         return {name: self.tensor(name).clone() for name in self.shapes}
 
 

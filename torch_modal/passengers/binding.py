@@ -7,24 +7,24 @@ from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.geometry.closest import ClosestFaces, closest_on_triangles
 
 CANDIDATES = 8
-"""Number of candidate triangles of each point, beside the nearest: those with the nearest centroids."""
-WIDTH = 1.0
-"""Triangles farther than the nearest by this part of its distance have no influence."""
+"""Number of candidate triangles of each point in addition to the nearest: the triangles with the nearest centroids."""
+FADE_WIDTH = 1.0
+"""Triangles farther than the nearest by this fraction of its distance have no influence."""
 ON_SURFACE = 1e-9
-"""Part of the diagonal within which points are on the surface, and follow the nearest triangle alone."""
-CHUNK = 65_536
+"""Fraction of the diagonal within which points are on the surface, and follow the nearest triangle alone."""
+POINTS_AT_ONCE = 65_536
 """Number of points that are bound at a time."""
 
 
-def binding(
+def bind_points(
     points: FloatArray, vertices: FloatArray, faces: IntArray, anchors: IntArray | None = None
 ) -> sparse.csr_matrix:
     """Non-negative weights of the vertices that each point follows, with sum one.
 
-    They are barycentric coordinates of the closest points on the nearest triangles, which fade out with the distance
-    beyond the nearest one, so that weights are continuous around the surface. Triangles that are near in space but not
-    along the surface, such as those of the next finger, have none. Anchors are vertices of the carrier known to be near
-    a point, -1 where none is. *Shape:* ``(P, 3), (V, 3), (F, 3), (P,) -> (P, V)``.
+    They are barycentric coordinates of the closest points on the nearest triangles. The influence of a triangle fades
+    out with its distance, so that weights are continuous around the surface. Triangles that are near in space but not
+    along the surface, such as on the next finger, have no influence. Anchors are vertices of the carrier known to be
+    near a point, or -1. *Shape:* ``(P, 3), (V, 3), (F, 3), (P,) -> (P, V)``.
     """
     surface = ClosestFaces(vertices, faces)
     extent = float(np.linalg.norm(np.ptp(vertices[np.unique(faces)], axis=0)))
@@ -40,25 +40,25 @@ def binding(
         counts = np.append(np.diff(of_vertex.indptr), 0)
         at_vertex = np.full((len(vertices) + 1, max(counts.max(initial=1), CANDIDATES)), -1)
         at_vertex[np.arange(at_vertex.shape[1]) < counts[:, None]] = of_vertex.indices
-    found = []
-    for first in range(0, len(points), CHUNK):
-        own = points[first : first + CHUNK]
-        candidates = surface.centroids.query(own, k=np.arange(1, min(CANDIDATES, len(faces)) + 1))[1]
+    rows_of_weights = []
+    for first in range(0, len(points), POINTS_AT_ONCE):
+        chunk = points[first : first + POINTS_AT_ONCE]
+        candidates = surface.centroids.query(chunk, k=np.arange(1, min(CANDIDATES, len(faces)) + 1))[1]
         # The centroid of a long triangle may be far from its closest point.
-        anchor = np.full(len(own), -1) if anchors is None else anchors[first : first + CHUNK]
+        anchor = np.full(len(chunk), -1) if anchors is None else anchors[first : first + POINTS_AT_ONCE]
         free = np.flatnonzero(anchor < 0)
-        nearest = surface(own[free])
+        nearest = surface(chunk[free])
         missed = ~(candidates[free] == nearest[:, None]).any(1)
         candidates[free[missed], -1] = nearest[missed]
         if anchors is not None:
             around = at_vertex[anchor]
             widened = np.pad(candidates, ((0, 0), (0, around.shape[1] - candidates.shape[1])), constant_values=-1)
             candidates = np.where(around[:, :1] >= 0, around, widened)
-        barycentric, distance = closest_on_triangles(own[:, None], surface.corners[candidates])
+        barycentric, distance = closest_on_triangles(chunk[:, None], surface.corners[candidates])
         distance[candidates < 0] = np.inf
         best = distance.argmin(1)[:, None]
         least = np.take_along_axis(distance, best, 1)
-        share = np.maximum(1 - (distance - least) / (WIDTH * least + ON_SURFACE * extent), 0) ** 2
+        share = np.maximum(1 - (distance - least) / (FADE_WIDTH * least + ON_SURFACE * extent), 0) ** 2
         row, column = np.nonzero(share)
         closest = np.take_along_axis(candidates, best, 1)
         keys = closest[row, 0] * len(faces) + candidates[row, column]
@@ -67,7 +67,7 @@ def binding(
         weights = barycentric * (share / share.sum(1, keepdims=True))[..., None]
         row, column = np.nonzero(share)
         index = faces[candidates[row, column]].reshape(-1)
-        part = (weights[row, column].reshape(-1), (np.repeat(row, 3), index))
-        found.append(sparse.csr_matrix(part, shape=(len(own), len(vertices))))
-        found[-1].eliminate_zeros()
-    return sparse.vstack(found, format="csr") if found else sparse.csr_matrix((0, len(vertices)))
+        entries = (weights[row, column].reshape(-1), (np.repeat(row, 3), index))
+        rows_of_weights.append(sparse.csr_matrix(entries, shape=(len(chunk), len(vertices))))
+        rows_of_weights[-1].eliminate_zeros()
+    return sparse.vstack(rows_of_weights, format="csr") if rows_of_weights else sparse.csr_matrix((0, len(vertices)))

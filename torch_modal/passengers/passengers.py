@@ -14,7 +14,7 @@ from torch_modal.geometry.rigid import best_rotation
 from torch_modal.geometry.triangle_frames import sides
 from torch_modal.geometry.vectors import cross, inverse, norm
 from torch_modal.keyframes.arrays import as_faces, check_tensor
-from torch_modal.passengers.binding import binding
+from torch_modal.passengers.binding import bind_points
 
 
 class Passengers(nn.Module):
@@ -38,11 +38,11 @@ class Passengers(nn.Module):
         reference: The carrier when the points are bound. *Shape:* ``(V, 3)``.
         faces: Vertex indices. *Shape:* ``(F, 3)``.
         points: In the coordinates of the reference. *Shape:* ``(P, 3)``.
-        anchors: Where it is known, a vertex of the carrier that each point belongs to, otherwise -1: it follows the
+        anchors: A vertex of the carrier that each point belongs to, or -1 where it is not known: the point follows the
             triangles there, even if others are nearer. *Shape:* ``(P,)``.
 
     Raises:
-        ValueError: Shapes that do not fit, or numbers that are not finite.
+        ValueError: Shapes of the arguments do not fit, or numbers are not finite.
     """
 
     reference: Tensor
@@ -72,16 +72,16 @@ class Passengers(nn.Module):
             anchors.shape != points.shape[:1] or bool(((anchors < -1) | (anchors >= len(reference))).any())
         ):
             raise ValueError(f"anchors hold a vertex of {len(reference)} for each of {len(points)} points, or -1")
-        own, bound = (x.detach().double().cpu() for x in (reference, points))
-        if not bool(cross(*sides(own.mT, corners)).any()):
+        rest, bound = (x.detach().double().cpu() for x in (reference, points))
+        if not bool(cross(*sides(rest.mT, corners)).any()):
             raise ValueError("no face of the reference has an area: there is no surface to follow")
         known = None if anchors is None else anchors.detach().cpu().numpy()
-        self._bind(own, bound, corners, binding(bound.numpy(), own.numpy(), corners.numpy(), known))
+        self._bind(rest, bound, corners, bind_points(bound.numpy(), rest.numpy(), corners.numpy(), known))
         self.to(reference)
 
     def _bind(self, reference: Tensor, points: Tensor, faces: Tensor, weights: sparse.csr_matrix) -> None:
-        for name, given in (("faces", faces), ("reference", reference), ("points", points)):
-            self.register_buffer(name, given, persistent=False)
+        for name, buffer in (("faces", faces), ("reference", reference), ("points", points)):
+            self.register_buffer(name, buffer, persistent=False)
         frame = _frames(reference.mT, faces).movedim(-1, 0)  # (F, 3, 3)
         area = 0.5 * norm(cross(*sides(reference.mT, faces)))
         flat = area <= 1e-12 * area.mean()
@@ -90,23 +90,23 @@ class Passengers(nn.Module):
         self.register_buffer("areas", torch.where(flat, 0, area), persistent=False)
         # Weights by rows, and their transpose: torch would make it anew at each backward pass.
         for prefix, matrix in (("", weights), ("transposed_", weights.T.tocsr())):
-            for name, part in (("starts", matrix.indptr), ("columns", matrix.indices), ("values", matrix.data)):
-                self.register_buffer(prefix + name, torch.from_numpy(part), persistent=False)
+            for name, array in (("starts", matrix.indptr), ("columns", matrix.indices), ("values", matrix.data)):
+                self.register_buffer(prefix + name, torch.from_numpy(array), persistent=False)
 
     @property
     def weights(self) -> sparse.csr_matrix:
         """Weights of the carrier's vertices for each point. *Shape:* ``(P, V)``."""
-        parts = (part.cpu().numpy() for part in (self.values, self.columns, self.starts))
-        return sparse.csr_matrix(tuple(parts), shape=(len(self), len(self.reference)))
+        arrays = (tensor.cpu().numpy() for tensor in (self.values, self.columns, self.starts))
+        return sparse.csr_matrix(tuple(arrays), shape=(len(self), len(self.reference)))
 
     @lasting
-    def rebound(self, reference: Tensor, points: Tensor) -> "Passengers":
+    def rebind(self, reference: Tensor, points: Tensor) -> "Passengers":
         """Passengers with these weights for another pose of carrier and points. *Shape:* ``(V, 3), (P, 3)``."""
-        found = Passengers.__new__(Passengers)
-        nn.Module.__init__(found)
+        passengers = Passengers.__new__(Passengers)
+        nn.Module.__init__(passengers)
         reference, points = (x.detach().double().cpu() for x in (reference, points))
-        found._bind(reference, points, self.faces.cpu(), self.weights.astype(np.float64))
-        return found.to(self.points)
+        passengers._bind(reference, points, self.faces.cpu(), self.weights.astype(np.float64))
+        return passengers.to(self.points)
 
     def __len__(self) -> int:
         return len(self.points)
@@ -123,17 +123,17 @@ class Passengers(nn.Module):
         # About the carrier's middle, for the sake of float32.
         middle = self.reference.mean(0)
         offsets = flat - middle - torch.einsum("bvij,vj->bvi", turns, self.reference - middle)
-        found = self._mixed(torch.cat([turns.flatten(2), offsets], -1))
-        own = self.points - middle
-        moved = (found[..., :9].unflatten(-1, (3, 3)) * own[:, None]).sum(-1) + found[..., 9:]
+        affine = self._mix(torch.cat([turns.flatten(2), offsets], -1))
+        offset = self.points - middle
+        moved = (affine[..., :9].unflatten(-1, (3, 3)) * offset[:, None]).sum(-1) + affine[..., 9:]
         return (moved + middle).view(*shapes.shape[:-2], len(self), 3)
 
     @full_precision
     def rotations(self, shapes: Tensor) -> Tensor:
         """Rotation of the surface around each point. *Shape:* ``(..., V, 3) -> (..., P, 3, 3)``."""
         flat = self._flat(shapes)
-        found = self._mixed(best_rotation(self._deformation(flat)).flatten(2)).unflatten(-1, (3, 3))
-        return best_rotation(found).view(*shapes.shape[:-2], len(self), 3, 3)
+        mixed = self._mix(best_rotation(self._deformation(flat)).flatten(2)).unflatten(-1, (3, 3))
+        return best_rotation(mixed).view(*shapes.shape[:-2], len(self), 3, 3)
 
     @full_precision
     def gradients(self, shapes: Tensor) -> Tensor:
@@ -142,8 +142,8 @@ class Passengers(nn.Module):
         A covariance ``C`` at a point becomes ``G C G^T``.
         """
         flat = self._flat(shapes)
-        found = self._mixed(self._deformation(flat).flatten(2)).unflatten(-1, (3, 3))
-        return found.view(*shapes.shape[:-2], len(self), 3, 3)
+        mixed = self._mix(self._deformation(flat).flatten(2)).unflatten(-1, (3, 3))
+        return mixed.view(*shapes.shape[:-2], len(self), 3, 3)
 
     def _flat(self, shapes: Tensor) -> Tensor:
         check_tensor("shapes", shapes, "...", *self.reference.shape, device=self.reference.device)
@@ -166,9 +166,9 @@ class Passengers(nn.Module):
             total = total.index_add(0, corner, self.areas[:, None])
         return (summed * inverse(total, total <= 0)).unflatten(-1, (3, 3))
 
-    def _mixed(self, values: Tensor) -> Tensor:
+    def _mix(self, values: Tensor) -> Tensor:
         """Weighted sums over the vertices that points follow. *Shape:* ``(B, V, n) -> (B, P, n)``."""
-        if traced(values):  # sparse products are not
+        if traced(values):  # sparse products cannot be traced
             counts = self.starts.diff().long()
             row = torch.arange(len(self), device=values.device).repeat_interleave(counts, output_size=len(self.values))
             each = values[:, self.columns.long()] * self.values[:, None]

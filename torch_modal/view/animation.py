@@ -1,4 +1,4 @@
-"""A sequence as one file that plays; its suffix chooses the format. Those that are drawn, MP4 and GIF, stand here."""
+"""A sequence as one file that plays, in the format of its suffix. The formats that are drawn, MP4 and GIF, are here."""
 
 import logging
 from collections.abc import Sequence
@@ -12,13 +12,13 @@ from torch_modal.arrays import Array
 from torch_modal.extras import require_installed
 from torch_modal.geometry.skin import Skin
 from torch_modal.io.asset import Asset
-from torch_modal.io.files import temporary_beside
+from torch_modal.io.files import atomic_write
 from torch_modal.io.formats import ANIMATION_FORMATS, Animation, Timing, resample
 from torch_modal.io.write import check_frames, check_indices, check_suffix, refuse_existing
 from torch_modal.motion.skin import bake
 from torch_modal.progress import Progress, ProgressReport
 from torch_modal.view.drawing import ByteArray, Scene, draw
-from torch_modal.view.picture import BETWEEN_COLOR, centred, view_rotation
+from torch_modal.view.picture import BETWEEN_COLOR, fit_into_cells, view_rotation
 
 logger = logging.getLogger("torch_modal")
 
@@ -27,10 +27,10 @@ PICTURES_AT_ONCE = 24  # drawn by one process of the renderer
 
 
 def require_packages(path: Path) -> None:
-    """Raise a MissingPackageError, before any work, for a file whose format needs a package that is not installed."""
+    """Raise a MissingPackageError, before any work, if the format of a file needs a package that is not installed."""
     if path.suffix.lower() in ANIMATION_FORMATS:
-        found = ANIMATION_FORMATS[path.suffix.lower()]
-        require_installed(found.modules, found.extra, path.name)
+        fmt = ANIMATION_FORMATS[path.suffix.lower()]
+        require_installed(fmt.modules, fmt.extra, path.name)
 
 
 def save_animation(
@@ -79,10 +79,10 @@ def save_animation(
             square; a longer sequence loses frames evenly, with a warning, and players fill in linearly.
         duration: Of the sequence once, in seconds. Default: from ``fps`` where that is given; otherwise 1 s for a
             cycle, 2 s for two key-frames, and 1 s for each interval of more.
-        ping_pong: There and back again; the whole takes twice the duration.
+        ping_pong: Play forwards and then backwards, which takes twice the duration.
         ease: Slow at both ends, by half a period of a cosine.
-        times: When the frames are, in any unit (:func:`torch_modal.frame_times`); of a cycle, with the time when it
-            begins again. Default: evenly. The duration stays what it is.
+        times: Times of the frames, in any unit (:func:`torch_modal.frame_times`); of a cycle, also the time when it
+            begins again. Default: evenly spaced. The duration does not change.
         asset: The mesh file that the frames come from (:func:`torch_modal.open_asset`). GLB gets its materials,
             textures, texture coordinates, colours and normals, USD its polygons, texture coordinates and colours.
         bones: Most bones of a skin, or a skin of these frames. GLB alone.
@@ -104,12 +104,12 @@ def save_animation(
     path = Path(out)
     if (bones, targets) != (None, None) and (path.suffix.lower() != ".glb" or None not in (bones, targets)):
         raise ValueError(
-            f"out={path.name!r}: bones or targets are two forms of a .glb file; other formats hold neither."
+            f"out={path.name!r}: bones or targets are two forms of a .glb file; other formats hold neither"
         )
     suffix = check_suffix(path, ANIMATION_FORMATS)
     if targets is not None and not (isinstance(targets, int) and 1 <= targets < len(shapes)):
         raise ValueError(
-            f"targets must be a whole number, at least 1, and below the {len(shapes)} frames; got {targets!r}."
+            f"targets must be a whole number, at least 1, and below the {len(shapes)} frames; got {targets!r}"
         )
     if asset is not None:
         asset.check(shapes)
@@ -127,18 +127,18 @@ def save_animation(
     if skin is not None:
         n = len(skin.transforms)
         if skin.rest.shape != shapes.shape[1:] or not 0 <= n - len(shapes) <= cyclic:
-            raise ValueError(f"bones is a skin of {n} other frames than these {len(shapes)}; bake these.")
+            raise ValueError(f"bones is a skin of {n} other frames than these {len(shapes)}; bake these")
         skin = replace(skin, transforms=skin.transforms[: len(shapes)])
     path.parent.mkdir(parents=True, exist_ok=True)
     animation = Animation(shapes, triangles, timing, path.name, keyframes, asset, max_targets, progress, skin, targets)
-    with temporary_beside(path, suffix) as temporary:
+    with atomic_write(path, suffix) as temporary:
         ANIMATION_FORMATS[suffix].write(animation, temporary)
     logger.debug("wrote %s, %.1f kB", path, path.stat().st_size / 1000)
     return path
 
 
 def write_mp4(animation: Animation, path: Path) -> None:
-    """H.264."""
+    """Draw and write an MP4 file, H.264."""
     import imageio.v2 as imageio
 
     options: dict[str, Any] = {"codec": "libx264", "macro_block_size": 1, "ffmpeg_log_level": "error"}
@@ -150,7 +150,7 @@ def write_mp4(animation: Animation, path: Path) -> None:
 
 
 def write_gif(animation: Animation, path: Path) -> None:
-    """A GIF that repeats for ever."""
+    """Draw and write a GIF that repeats for ever."""
     from PIL import Image
 
     # GIF counts in hundredths of a second, and players slow down below two of them.
@@ -160,20 +160,20 @@ def write_gif(animation: Animation, path: Path) -> None:
 
 
 def _pictures(animation: Animation) -> list[ByteArray]:
-    """The sequence drawn from one place, at the rate of its timing."""
+    """Draw the sequence from one viewpoint, at the rate of its timing."""
     shapes, faces = animation.shapes, animation.faces
     places = animation.timing.samples()
     # A frame that is shown twice, as on the way back, is drawn once.
     unique, which = np.unique(places, return_inverse=True)
     points = resample(shapes, unique) @ view_rotation(shapes[0], None, None).T
-    points, half = centred(points[None])
+    points, half = fit_into_cells(points[None])
     # H.264 stores colour for blocks of two by two.
     size = np.maximum((PIXELS * half / half.max() / 2).round() * 2, 2).astype(np.int64)
     paint = np.broadcast_to((np.array(BETWEEN_COLOR) * 255).round().astype(np.uint8), points[0].shape)
     images: list[ByteArray] = []
     with ProgressReport(len(unique), "pictures", animation.progress, unit="picture") as report:
         for start in range(0, len(unique), PICTURES_AT_ONCE):
-            part = slice(start, start + PICTURES_AT_ONCE)
-            images += list(draw(Scene(points[0, part], paint[part].copy(), faces, half, size), "auto"))
+            chunk = slice(start, start + PICTURES_AT_ONCE)
+            images += list(draw(Scene(points[0, chunk], paint[chunk].copy(), faces, half, size), "auto"))
             report.update(len(images) - start)
     return [images[number] for number in which.reshape(-1)]

@@ -40,7 +40,7 @@ class Scene(NamedTuple):
 
 
 def _draw_pyvista(scene: Scene) -> ByteArray:
-    """Images ``(S, height, width, 3)``. Runs in the child only."""
+    """Images by pyvista, ``(S, height, width, 3)``; runs in the child process only."""
     import pyvista as pv
 
     scale = 1.0 / float(scene.half_size[1])  # to half height 1: radii below are absolute
@@ -70,7 +70,7 @@ def _draw_pyvista(scene: Scene) -> ByteArray:
 
 
 def _draw_matplotlib(scene: Scene) -> ByteArray:
-    """Images ``(S, height, width, 3)``: faces from back to front, each in one shade."""
+    """Images by matplotlib, ``(S, height, width, 3)``: faces from back to front, each in one shade."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.collections import PolyCollection
     from matplotlib.figure import Figure
@@ -85,8 +85,8 @@ def _draw_matplotlib(scene: Scene) -> ByteArray:
         while len(corners) < SMOOTH_FACES:  # each as four, cut at the middles of its sides
             a, b, c = corners.swapaxes(0, 1)
             ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
-            parts = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
-            corners = np.concatenate([np.stack(part, axis=1) for part in parts])
+            quarters = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
+            corners = np.concatenate([np.stack(quarter, axis=1) for quarter in quarters])
         middle = corners.mean(axis=1)
         normals = middle[:, 3:6] / np.maximum(np.linalg.norm(middle[:, 3:6], axis=1, keepdims=True), 1e-12)
         normals *= np.where(normals[:, 2:] < 0, -1.0, 1.0)  # open meshes show their inside too
@@ -124,14 +124,14 @@ def draw_points(points: FloatArray, color: tuple[float, ...], half_size: FloatAr
 
 
 def _draw_scene() -> None:
-    """Draw the scene of the current folder, where the images go too."""
+    """Draw the scene in the current folder, and write the images there; runs in the child process."""
     with np.load("scene.npz") as stored:
         scene = Scene(**{name: stored[name] for name in Scene._fields})
     np.save("images.npy", _draw_pyvista(scene))
 
 
 def _draw_in_child(scene: Scene) -> ByteArray:
-    """Images from pyvista in a process of its own; RuntimeError with the reason if that fails."""
+    """Images from pyvista in a child process; raises RuntimeError with the reason if it fails."""
     with tempfile.TemporaryDirectory(prefix="torch_modal-") as folder:
         np.savez(Path(folder, "scene.npz"), **scene._asdict())
         # The folder is the working directory so that a core file goes with it.
@@ -155,7 +155,7 @@ def draw(scene: Scene, renderer: str) -> ByteArray:
     if importlib.util.find_spec("pyvista") is None:
         if renderer == "pyvista":
             raise RuntimeError(
-                "pyvista is not installed: pip install torch_modal[pictures]; matplotlib draws without it."
+                "pyvista is not installed: pip install torch_modal[pictures]; matplotlib draws without it"
             )
         logger.debug("matplotlib draws; pyvista draws better: pip install torch_modal[pictures]")
         return _draw_matplotlib(scene)
@@ -163,6 +163,6 @@ def draw(scene: Scene, renderer: str) -> ByteArray:
         return _draw_in_child(scene)
     except RuntimeError as error:
         if renderer == "pyvista":
-            raise RuntimeError(f"pyvista could not render: {error}. renderer='matplotlib' needs no GL.") from None
-        warnings.warn(f"pyvista could not render ({error}); matplotlib draws the picture.", stacklevel=3)
+            raise RuntimeError(f"pyvista could not render: {error}. renderer='matplotlib' needs no GL") from None
+        warnings.warn(f"pyvista could not render ({error}); matplotlib draws the picture", stacklevel=3)
         return _draw_matplotlib(scene)

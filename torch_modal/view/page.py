@@ -1,7 +1,7 @@
-"""A page that plays sequences of shapes, or on which landmarks are picked: one HTML file without any other.
+"""A page that plays sequences of shapes, or on which landmarks are picked: one HTML file that needs no other.
 
 It joins the files in page_assets with the shapes of page_data.py. Its content security policy allows its own scripts by
-their hashes and forbids all else, so that text in file names or titles cannot run.
+their hashes and forbids everything else, so that text in file names or titles cannot run.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class Page:
 
     def __init__(self, html: str, height: int = 600) -> None:
         if height < 1:
-            raise ValueError(f"height is a number of pixels, at least 1; got {height}.")
+            raise ValueError(f"height is a number of pixels, at least 1; got {height}")
         self.html = html
         self.height = height
 
@@ -56,7 +56,7 @@ class Page:
         )
 
     def save(self, out: str | Path, overwrite: bool = False) -> Path:
-        """Write the page as one HTML file, ``*.html``; the file.
+        """Write the page as one HTML file, ``*.html``; returns its path.
 
         Raises:
             ValueError: ``out`` does not end in .html.
@@ -94,8 +94,8 @@ def show(
         faces: Vertex indices. *Shape:* ``(F, 3)``.
         keyframe_indices: Frames that are key-frames: drawn in the other colour and marked on the time line; an empty
             list means none. By default the first and the last.
-        times: The time of each frame, rising; shown beside its number, and the time line keeps their distances. Evenly
-            spaced by default. *Shape:* ``(N,)``.
+        times: The time of each frame, ascending; shown next to its number, and the time line keeps their distances.
+            Evenly spaced by default. *Shape:* ``(N,)``.
         fps: Frames a second, on average if ``times`` are given.
         cyclic: Add the step from the last frame back to the first, unless the two are equal already.
         view: Azimuth and elevation of the first view in degrees, as for :func:`torch_modal.render_sequence`.
@@ -112,10 +112,10 @@ def show(
         ValueError: An argument cannot be used; the message says why.
     """
     check_view(view, up)
-    given = sequences if isinstance(sequences, Mapping) else {"shapes": sequences}
+    by_name = sequences if isinstance(sequences, Mapping) else {"shapes": sequences}
     if not (np.isfinite(fps) and fps > 0):
-        raise ValueError(f"fps must be a positive number, got {fps}.")
-    checked, triangles = check_sequences({str(name): frames for name, frames in given.items()}, faces, "sequences")
+        raise ValueError(f"fps must be a positive number, got {fps}")
+    checked, triangles = check_sequences({str(name): frames for name, frames in by_name.items()}, faces, "sequences")
     shapes = list(checked.values())
     n = len(shapes[0])
     keyframes = check_indices([0, n - 1] if keyframe_indices is None else keyframe_indices, n, "keyframe_indices")
@@ -151,7 +151,7 @@ def show_landmarks(
         ValueError: An argument cannot be used; the message says why.
     """
     if len(meshes) < 2:
-        raise ValueError(f"landmarks belong to two meshes or more, got {len(meshes)}.")
+        raise ValueError(f"landmarks belong to two meshes or more, got {len(meshes)}")
     checked = {
         str(name): check_frames(to_numpy(vertices)[None], faces, f"meshes[{name!r}][0][None]")
         for name, (vertices, faces) in meshes.items()
@@ -160,17 +160,17 @@ def show_landmarks(
     if rows.ndim != 2 or rows.shape[1] != len(checked) or rows.dtype.kind not in "iu":
         raise ValueError(
             f"landmarks must be vertex indices, a column for each of the {len(checked)} meshes, got shape {rows.shape} "
-            f"and dtype {rows.dtype}."
+            f"and dtype {rows.dtype}"
         )
     counts = np.array([shape.shape[1] for shape, _ in checked.values()])
     if ((rows < 0) | (rows >= counts)).any():
-        raise ValueError(f"landmarks must index the {counts.tolist()} vertices of the meshes from 0.")
+        raise ValueError(f"landmarks must index the {counts.tolist()} vertices of the meshes from 0")
     groups = [pack_group({name: shape}, faces) for name, (shape, faces) in checked.items()]
     return _page(groups, title, height, landmarks=rows.tolist())
 
 
 def _page(groups: list[dict[str, Any]], title: str, height: int, **data: Any) -> Page:
-    """The page of groups of shapes, with the data that page.js reads. Titles and names are escaped."""
+    """Page of groups of shapes, with the data that page.js reads. Titles and names are escaped."""
     still = {"n_frames": 1, "times": [0.0], "has_times": False, "fps": 24.0, "keyframes": [], "landmarks": None}
     data = {"groups": groups, **still, **data}
     assets = files("torch_modal.view") / "page_assets"

@@ -10,8 +10,8 @@ Two frames predict the next one of a smooth motion well. Frame n is stored as
 with r_1 = q_1 - q_0, small numbers around zero. They are folded to positive numbers (0, -1, 1, -2, ... -> 0, 1, 2,
 3, ...), split into planes of low and of high bytes (almost all zeros), and deflated.
 
-Where bones follow a sequence within :data:`FOLLOWED` and take less room, it is stored as its first frame, weights and
-transforms instead, from which the page computes the frames.
+Where bones follow a sequence within :data:`LARGEST_BONE_ERROR` and take less room, it is stored as its first frame,
+weights and transforms instead, from which the page computes the frames.
 """
 
 import base64
@@ -27,8 +27,8 @@ from torch_modal.geometry.skin import STEPS
 from torch_modal.motion.skin import bake
 from torch_modal.view.picture import up_axis, view_rotation
 
-FOLLOWED = 1e-3  # largest error of bones, over the diagonal
-LEVELS = 65_535  # steps of the grid along the longest side
+LARGEST_BONE_ERROR = 1e-3  # largest error of bones, over the diagonal
+GRID_STEPS = 65_535  # steps of the grid along the longest side
 
 
 def pack_group(
@@ -38,16 +38,16 @@ def pack_group(
     up: Literal["y", "z"] | None = None,
     bones: int = 0,
 ) -> dict[str, Any]:
-    """Data of shapes that share faces, a grid and a camera; lengths in steps of the grid, which begins at ``origin``.
+    """Pack shapes that share faces, a grid and a camera; lengths are in steps of the grid, which begins at ``origin``.
 
     Arguments as for :func:`torch_modal.show`.
     """
     first = next(iter(sequences.values()))[0]
     corners = np.stack([f(x.reshape(-1, 3), axis=0) for f in (np.min, np.max) for x in sequences.values()])
     origin = corners.min(0)
-    step = float(np.ptp(corners, axis=0).max()) / LEVELS or 1.0
+    step = float(np.ptp(corners, axis=0).max()) / GRID_STEPS or 1.0
     numbers = {
-        name: np.clip(np.rint((x - origin) / step), 0, LEVELS).astype(np.uint16) for name, x in sequences.items()
+        name: np.clip(np.rint((x - origin) / step), 0, GRID_STEPS).astype(np.uint16) for name, x in sequences.items()
     }
     # The box around everything along right, up and front; the camera orbits its middle. A frame at a time saves memory.
     rotation = view_rotation(first, view, up)
@@ -76,11 +76,11 @@ def pack_group(
 def pack_sequence(
     shapes: FloatArray, numbers: NDArray[np.uint16], faces: IntArray, origin: FloatArray, step: float, bones: int
 ) -> dict[str, Any]:
-    """Shapes ``(N, V, 3)``, also in steps of the grid, as frames or as a skin of at most so many bones."""
+    """Pack shapes ``(N, V, 3)``, also given in steps of the grid, as frames or as a skin of at most ``bones`` bones."""
     plain: dict[str, Any] = {"frames": pack_frames(numbers)}
     usable = bones and len(shapes) > 1 and shapes.shape[1] >= max(bones, 4) and np.ptp(shapes[0], axis=0).any()
     skin = bake(shapes, faces, bones) if usable else None
-    if skin is None or skin.error > FOLLOWED:
+    if skin is None or skin.error > LARGEST_BONE_ERROR:
         return plain
     weights, transforms = (skin.weights.numpy() * STEPS).round(), skin.transforms.numpy()[:, :, :3]
     # From steps of the grid to steps of the grid.
@@ -94,7 +94,7 @@ def pack_sequence(
 
 
 def pack_frames(numbers: NDArray[np.uint16]) -> str:
-    """Shapes ``(N, V, 3)`` in whole steps as text."""
+    """Pack shapes ``(N, V, 3)`` in whole steps of the grid as text."""
     residual = numbers.copy()
     residual[1:] -= numbers[:-1]  # wraps, here and in the page
     residual[2:] -= numbers[1:-1] - numbers[:-2]
@@ -102,14 +102,14 @@ def pack_frames(numbers: NDArray[np.uint16]) -> str:
 
 
 def pack_faces(faces: IntArray) -> str:
-    """Faces ``(F, 3)`` as text: the difference of each corner from the one before."""
+    """Pack faces ``(F, 3)`` as text: the difference of each corner from the one before."""
     steps = faces.reshape(-1).astype(np.int32)
     steps[1:] -= steps[:-1].copy()
     return _pack(steps)
 
 
 def _pack(numbers: NDArray[np.signedinteger]) -> str:
-    """Numbers folded to positive ones of the same width, as planes of bytes, the lowest first, deflated, in base64."""
+    """Fold integers to positive ones, and deflate their planes of bytes, the lowest first, as base64 text."""
     width = numbers.dtype.itemsize
     folded = ((numbers << 1) ^ (numbers >> (8 * width - 1))).view(f"u{width}")
     planes = np.ascontiguousarray(folded, f"<u{width}").view(np.uint8).reshape(-1, width).T

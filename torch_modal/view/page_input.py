@@ -26,8 +26,8 @@ def read_shapes(paths: Sequence[str | os.PathLike[str]]) -> tuple[FloatArray, In
     """
     files = [Path(path) for path in paths]
     if len(files) == 1 and files[0].is_dir():
-        folder, found = files[0], [path for path in files[0].iterdir() if path.is_file()]
-        meshes = [path for path in found if path.suffix.lower() in FRAME_SUFFIXES]
+        folder = files[0]
+        meshes = [path for path in folder.iterdir() if path.is_file() and path.suffix.lower() in FRAME_SUFFIXES]
         files = sorted(meshes, key=lambda path: natural(path.name))
         kinds = sorted({path.suffix.lower() for path in files})
         if len(kinds) != 1:
@@ -44,13 +44,13 @@ def read_shapes(paths: Sequence[str | os.PathLike[str]]) -> tuple[FloatArray, In
 
 
 def _animation(path: Path, asset: GltfAsset) -> tuple[FloatArray, dict[str, Any]] | None:
-    """The frames of a GLB, by targets or bones, and the options of `show`; None without an animation of shapes."""
+    """Frames of a GLB, from morph targets or bones, and options of `show`; None without an animation of shapes."""
     document = asset.document
     try:
-        own = document.root["asset"].get("generator") == GENERATOR
-        if len(asset.morphs()) == 1 and not (own and document.get("skins")):
+        ours = document.root["asset"].get("generator") == GENERATOR
+        if len(asset.morphs()) == 1 and not (ours and document.get("skins")):
             return None
-        if not own or len(document.get("animations")) != 1:
+        if not ours or len(document.get("animations")) != 1:
             raise MeshError(
                 f"{path}: morph targets that save_animation did not write, so their times are not known; export one "
                 "mesh a frame instead"
@@ -61,7 +61,7 @@ def _animation(path: Path, asset: GltfAsset) -> tuple[FloatArray, dict[str, Any]
         kept = [int(number) for number in extras["frames"]]
         keyframes = [kept.index(number) for number in extras["keyframes"] if number in kept]
         back = bool(extras.get("ping_pong"))
-        frames, n = asset.played(), len(kept)
+        frames, n = asset.play(), len(kept)
         closed = len(seconds) == n + 1 and not back
         if len(frames) != len(seconds) or len(seconds) != (2 * n - 1 if back else n + closed):
             raise ValueError(f"{len(frames)} shapes, {n} frames, {len(seconds)} times")
@@ -72,7 +72,7 @@ def _animation(path: Path, asset: GltfAsset) -> tuple[FloatArray, dict[str, Any]
         reason = " ".join(str(error).split()) or type(error).__name__
         raise MeshError(f"{path}: cannot be read as an animation of this package ({reason[:200]})") from error
     options: dict[str, Any] = {"keyframe_indices": keyframes or None, "cyclic": closed, "fps": rate}
-    # Frames left out of a long sequence leave wider steps in time; so does ease.
+    # Steps in time differ where frames of a long sequence were left out, or with ease.
     times = seconds[:n]
     even = np.allclose(np.diff(times), times[-1] / (n - 1), rtol=1e-4)
     if not even or kept != list(range(n)):

@@ -1,7 +1,7 @@
 """A picture that compares rows of shapes: one row a method, one column a time.
 
 All shapes are turned into view coordinates (x right, y up, z to the viewer), a renderer (drawing.py) draws each into an
-image of its own, and the sheet is set from those.
+image of its own, and the sheet is set from these images.
 """
 
 from __future__ import annotations
@@ -28,23 +28,23 @@ MARGIN = 1.06  # of a cell against the largest shape in it
 
 
 def check_view(view: tuple[float, float] | None, up: str | None) -> None:
-    """Raise if these are no valid view."""
+    """Raise a ValueError unless ``view`` and ``up`` are valid."""
     if view is not None and not (len(view) == 2 and np.isfinite(view).all()):
-        raise ValueError(f"view must be two numbers of degrees, azimuth and elevation, got {view}.")
+        raise ValueError(f"view must be two numbers of degrees, azimuth and elevation, got {view}")
     if up not in (None, "y", "z"):
-        raise ValueError(f"up must be 'y' or 'z', got {up!r}.")
+        raise ValueError(f"up must be 'y' or 'z', got {up!r}")
 
 
 def check_sequences(sequences: Mapping[str, Array], faces: Array, name: str) -> tuple[dict[str, FloatArray], IntArray]:
-    """Sequences of shapes that are shown together, and their faces, as NumPy arrays; ``name`` is for messages."""
+    """Check sequences of shapes that are shown together, and their faces; ``name`` is for messages."""
     if not sequences:
-        raise ValueError(f"{name} is empty; it needs at least one sequence of shapes.")
+        raise ValueError(f"{name} is empty; it needs at least one sequence of shapes")
     checked: dict[str, FloatArray] = {}
     for key, frames in sequences.items():
         checked[key], triangles = check_frames(frames, faces, f"{name}[{key!r}]")
     if len({frames.shape for frames in checked.values()}) > 1:
         sizes = ", ".join(f"{key!r} {frames.shape}" for key, frames in checked.items())
-        raise ValueError(f"all {name} must have the same shape (N, V, 3), got {sizes}.")
+        raise ValueError(f"all {name} must have the same shape (N, V, 3), got {sizes}")
     return checked, triangles
 
 
@@ -76,17 +76,17 @@ def view_rotation(shape: FloatArray, view: tuple[float, float] | None, up: Liter
     return np.stack([right, np.cross(front, right), front])
 
 
-def centred(points: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Move shapes ``(R, C, V, 3)`` into their cells; also the half width and height that hold them all.
+def fit_into_cells(points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Move shapes ``(R, C, V, 3)`` into their cells; returns them, and the half width and height that hold them all.
 
     One centre serves all cells, so that static parts stay in place and rows can be compared. Where shapes are
     separated by more than their own size, each column gets a centre, or if necessary each shape.
     """
-    own = np.ptp(points, axis=2).max(axis=(0, 1))
+    extent = np.ptp(points, axis=2).max(axis=(0, 1))
     for together in ((0, 1, 2), (0, 2), (2,)):
         low, high = points.min(axis=together, keepdims=True), points.max(axis=together, keepdims=True)
         size = (high - low).max(axis=(0, 1, 2))
-        if (size[:2] <= 1.4 * own[:2]).all():
+        if (size[:2] <= 1.4 * extent[:2]).all():
             break
     half = 0.5 * size[:2] * MARGIN
     # Neither needles nor points: labels need some width.
@@ -101,7 +101,7 @@ def _sheet(
     color_bar: tuple[Any, str] | None,  # ScalarMappable and label
     fmt: str,
 ) -> bytes:
-    """The images on white paper with their labels. Measures are in pixels of the result."""
+    """Put the images on white paper with their labels. Measures are in pixels of the result."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from matplotlib.font_manager import FontProperties
@@ -112,8 +112,8 @@ def _sheet(
     text = min(11.0, 0.13 * width * 72 / dpi)  # points; the longest column label has about twelve letters
     line = text * dpi / 72
     font = FontProperties(size=text + 1)
-    parts = [part for row in rows for part in row.split("\n") if part.strip()]  # TextPath fails on blanks
-    widest = max((TextPath((0, 0), part, prop=font).get_extents().width for part in parts), default=0.0)
+    lines = [words for row in rows for words in row.split("\n") if words.strip()]  # TextPath fails on blanks
+    widest = max((TextPath((0, 0), words, prop=font).get_extents().width for words in lines), default=0.0)
     left = widest * dpi / 72 + 2 * line
     right = 7 * line if color_bar else line
     top, bottom = 2.6 * line, line
@@ -122,7 +122,7 @@ def _sheet(
     FigureCanvasAgg(figure)
 
     def cell(x: float, y: float, w: float, h: float) -> tuple[float, float, float, float]:
-        """From pixels, y down, to the fractions of the figure."""
+        """Convert pixels, y down, to fractions of the figure."""
         return x / total[0], 1 - (y + h) / total[1], w / total[0], h / total[1]
 
     for r, row in enumerate(rows):
@@ -174,7 +174,7 @@ def render_sequence(
         out: File to write, ``*.png`` or ``*.pdf``.
         columns: How many frames to show, evenly chosen with the first and the last, or their numbers. By
             default all up to seven, and of more a number from four to seven that gives equal steps.
-        titles: What stands above the columns. Default: when they are, from 0 to 1.
+        titles: Text above the columns. Default: their times, from 0 to 1.
         keyframe_indices: Frames that are key-frames, drawn in the other colour; an empty list is none. The first
             and the last by default.
         view: Azimuth and elevation of the camera in degrees; ``(0, 0)`` looks from the front (+Z where Y is up, -Y
@@ -182,7 +182,7 @@ def render_sequence(
         up: ``"y"`` or ``"z"``; by default Y, unless the first shape is flat in Y.
         colors: A number for each vertex, for any of the rows, shown as colour with a bar. The bar ends at the 99.5th
             percentile of what is shown, with an arrow if there is more. *Shape of each:* ``(N, V)``.
-        color_label: What those numbers are, with their unit.
+        color_label: Name of the numbers in ``colors``, with their unit.
         points: Rows of clouds, drawn above the shapes as dots: a cloud for each frame. *Shape of each:* ``(n, 3)``.
         renderer: ``"auto"`` is pyvista where it is installed (extra ``pictures``), otherwise matplotlib; also, with a
             warning, where pyvista cannot render.
@@ -199,7 +199,7 @@ def render_sequence(
     path = Path(out)
     fmt = check_suffix(path, PICTURES)[1:]
     if renderer not in ("auto", "pyvista", "matplotlib"):
-        raise ValueError(f"renderer must be auto, pyvista or matplotlib, got {renderer!r}.")
+        raise ValueError(f"renderer must be auto, pyvista or matplotlib, got {renderer!r}")
     check_view(view, up)
     refuse_existing(path, overwrite)
 
@@ -212,25 +212,25 @@ def render_sequence(
     if isinstance(columns, (int, np.integer)):
         count = min(columns, n_frames)
         if count < 1:
-            raise ValueError(f"columns must be at least 1, got {columns}.")
+            raise ValueError(f"columns must be at least 1, got {columns}")
         chosen = np.unique(np.linspace(0, n_frames - 1, count).round().astype(int)).tolist()
     else:
         chosen = check_indices(columns, n_frames, "columns")
         if not chosen:
-            raise ValueError("columns are the frames to show, one or more; got none.")
+            raise ValueError("columns are the frames to show, one or more; got none")
     titles = [f"t = {n / max(n_frames - 1, 1):.3g}" for n in chosen] if titles is None else titles
     if len(titles) != len(chosen):
-        raise ValueError(f"titles stand above {len(chosen)} columns, got {len(titles)}.")
+        raise ValueError(f"titles stand above {len(chosen)} columns, got {len(titles)}")
     clouds = {label: [to_numpy(cloud) for cloud in row] for label, row in (points or {}).items()}
     for label, row in clouds.items():
         if len(row) != n_frames or any(cloud.shape != (len(cloud), 3) for cloud in row):
-            raise ValueError(f"points[{label!r}] must be {n_frames} clouds (n, 3), got {[c.shape for c in row]}.")
-    given = [0, n_frames - 1] if keyframe_indices is None else keyframe_indices
-    keyframes = check_indices(given, n_frames, "keyframe_indices")
+            raise ValueError(f"points[{label!r}] must be {n_frames} clouds (n, 3), got {[c.shape for c in row]}")
+    ends = [0, n_frames - 1]
+    keyframes = check_indices(ends if keyframe_indices is None else keyframe_indices, n_frames, "keyframe_indices")
 
     shown = np.stack([frames[chosen] for frames in shapes])  # (R, C, V, 3)
     rotation = view_rotation(shapes[0][0], view, up)
-    placed, half = centred(shown @ rotation.T)
+    placed, half = fit_into_cells(shown @ rotation.T)
     paint = np.empty(shown.shape)
     paint[:] = np.array([KEYFRAME_COLOR if n in keyframes else BETWEEN_COLOR for n in chosen])[:, None]
     color_bar = None
@@ -254,7 +254,7 @@ def render_sequence(
 def _paint(
     paint: FloatArray, colors: Mapping[str, Array], rows: list[str], size: tuple[int, ...], chosen: list[int]
 ) -> Any:
-    """Paint the rows with colours, RGB in [0, 1]; the colour scale, which they share. *Shape:* ``(R, C, V, 3)``."""
+    """Paint the rows with colours, RGB in [0, 1]; returns their colour scale. *Shape:* ``(R, C, V, 3)``."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import LinearSegmentedColormap, Normalize
 
@@ -262,10 +262,10 @@ def _paint(
     for row, numbers in colors.items():
         array = to_numpy(numbers)
         if row not in rows:
-            raise ValueError(f"colors has a row {row!r} that frames_by_row does not have ({', '.join(rows)}).")
+            raise ValueError(f"colors has a row {row!r} that frames_by_row does not have ({', '.join(rows)})")
         if array.shape != size or not np.isfinite(array).all():
             raise ValueError(
-                f"colors[{row!r}] must hold finite numbers, one a vertex, shape {size}, got shape {array.shape}."
+                f"colors[{row!r}] must hold finite numbers, one a vertex, shape {size}, got shape {array.shape}"
             )
         values[rows.index(row)] = array[chosen].astype(np.float64)
     everything = np.concatenate([v.reshape(-1) for v in values.values()])
