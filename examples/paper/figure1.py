@@ -11,6 +11,7 @@ from pathlib import Path
 import _paths  # noqa: F401
 import numpy as np
 import torch
+from _meshes import gallop
 from errors import edge_error, percents, vertex_error
 from figure5 import around_vertices
 from results import Table, wanted
@@ -27,10 +28,10 @@ LEVELS = 2
 """Of the recursion: three shapes between two key-frames."""
 
 
-def main(table: Table, out: Path | None, only: Sequence[str]) -> None:
+def main(table: Table, out: Path | None, only: Sequence[str], meshes: Path | None = None) -> None:
     """Draw a part of the cycle, and encode its true frames."""
     sample = load_sample("creature")
-    keys, faces, truth = sample.keyframes, sample.faces, sample.truth
+    keys, faces, truth = gallop(meshes) if meshes else (sample.keyframes, sample.faces, sample.truth)
     frames = torch.stack([keys, truth], 1).flatten(0, 1)  # a true frame half-way
     bases = tm.extract_bases(keys, faces, progress=False)
     times, half = torch.arange(12.0) / 2, 2 ** (LEVELS - 1)

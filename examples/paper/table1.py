@@ -16,6 +16,7 @@ from typing import Any
 import _paths  # noqa: F401
 import torch
 from _bipeds import KINDS, biped
+from _meshes import gallop, poses
 from results import Table, wanted
 
 import torch_modal as tm
@@ -50,8 +51,17 @@ def processor() -> float:
     return sum(os.times()[:4])
 
 
-def key_poses(name: str) -> tuple[torch.Tensor, torch.Tensor]:
-    """Key-frames and faces of a sample or of a body."""
+MESHES = {"horse": 50, "lion": 30, "cat": 30}
+"""Modes of each key-frame of the paper's own meshes, for ``--meshes``."""
+
+
+def key_poses(name: str, meshes: Path | None) -> tuple[torch.Tensor, torch.Tensor]:
+    """Key-frames and faces of a sample, of a body, or of a mesh of the paper."""
+    if meshes:
+        if name == "horse":
+            return gallop(meshes)[:2]
+        shapes, faces = poses(meshes, name)
+        return shapes[:2], faces
     if name in KINDS:
         body = biped(name, None)
         return torch.stack([torch.from_numpy(body.pose(t)) for t in (0.0, 1.0)]), torch.from_numpy(body.faces)
@@ -77,15 +87,18 @@ class Counted:
         return found
 
 
-def main(table: Table, out: Path | None, only: Sequence[str]) -> None:
+def main(table: Table, out: Path | None, only: Sequence[str], meshes: Path | None = None) -> None:
     """A row for each body, and the paper's."""
-    for name, (mesher, theirs) in ROWS.items():
+    published = {row[0].removeprefix("paper: "): row for _, theirs in ROWS.values() for row in theirs}
+    rows = {name: (tm.Lattice(), (published[name],)) for name in MESHES} if meshes else ROWS
+    for name, (mesher, theirs) in rows.items():
         if not wanted(name, only):
             continue
-        x, faces = key_poses(name.split(",")[0])
+        x, faces = key_poses(name.split(",")[0], meshes)
+        n_modes = MESHES[name] if meshes else N_MODES
         counted = Counted(mesher)
         start = processor()
-        bases = tm.extract_bases(x, faces, N_MODES, mesher=counted, cache=False, progress=False)
+        bases = tm.extract_bases(x, faces, n_modes, mesher=counted, cache=False, progress=False)
         prepare, updates = processor() - start, []
         for preset in ("paper", "accurate"):
             layer = tm.MidShape(bases[:2], faces, preset=preset)
@@ -94,7 +107,7 @@ def main(table: Table, out: Path | None, only: Sequence[str]) -> None:
                 start = processor()
                 layer(*x[:2])
             updates.append(f"{processor() - start:.2f}")
-        sizes = f"{x.shape[1]:,}", f"{counted.counts[0]:,}", str(len(x)), str(2 * N_MODES)
+        sizes = f"{x.shape[1]:,}", f"{counted.counts[0]:,}", str(len(x)), str(2 * n_modes)
         table.add(name, *sizes, f"{prepare:.1f}", *updates)
         for row in theirs:
             table.add(*row, "")

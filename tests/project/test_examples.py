@@ -8,6 +8,8 @@ from types import ModuleType
 import pytest
 import torch
 
+from torch_modal.data.samples import load_sample
+from torch_modal.io.frames import save_mesh
 from torch_modal.registration.landmarks import read_landmarks
 from torch_modal.registration.load import load_keyframes
 
@@ -130,3 +132,23 @@ def test_train_motion_learns_more_in_amplitudes() -> None:
     assert own.held < 1 and own.shapes.shape == data.test[0, 2:].shape
     assert own.stride < 0.85 * min(other.stride for other in found.values())
     assert own.edges < 0.5 * min(other.edges for other in found.values())
+
+
+@pytest.mark.slow
+def test_figures_of_the_paper_run_on_its_own_meshes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the user has them; here the sample creature stands in for all three animals."""
+    sample = load_sample("creature")
+    frames = torch.stack([sample.keyframes, sample.truth], 1).flatten(0, 1)
+    for folder, shapes in (("horse-gallop", frames), ("lion-poses", frames[2:4]), ("cat-poses", frames[4:6])):
+        for number, shape in enumerate(shapes):
+            save_mesh(shape, sample.faces, tmp_path / folder / f"{folder}-{number:02d}.obj")
+    run = load_example("paper/run")
+    rows: list[tuple[str, ...]] = []
+    monkeypatch.setattr(run.Table, "add", lambda table, *cells: rows.append(cells))
+    monkeypatch.setattr(sys, "argv", ["run", "--meshes", str(tmp_path), "--only", "linear", "lion"])
+    run.main()
+    assert [row[0] for row in rows] == ["linear", "linear", "lion", "paper: lion"]
+    assert rows[0][1] == "4.04 %"  # as in the page
+    monkeypatch.setattr(sys, "argv", ["run", "--meshes", str(tmp_path / "elsewhere"), "--parts", "2"])
+    with pytest.raises(SystemExit, match="poses of the lion are needed there"):
+        run.main()
