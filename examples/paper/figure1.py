@@ -14,8 +14,8 @@ import torch
 from _meshes import gallop
 from errors import edge_error, percents, vertex_error
 from figure5 import around_vertices
+from hildebrandt import spacetime
 from results import Table, wanted
-from spacetime import spacetime
 from torch import Tensor
 
 import torch_modal as tm

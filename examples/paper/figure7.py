@@ -12,8 +12,8 @@ import _paths  # noqa: F401
 import numpy as np
 import torch
 from _bipeds import Biped, biped
+from decimated_pair import ReducedPair, froehlich_botsch
 from errors import edge_error, percents, vertex_error
-from reduced import ReducedPair, froehlich_botsch
 from results import Table, wanted
 from torch import Tensor
 

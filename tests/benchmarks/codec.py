@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 
 import torch
 from cases import keyframes_of
+from known_motions import OPENED, closed_part, sculpted
 from measures import edge_lengths, mean_ratio
-from motions import OPENED, closed_part, sculpted
 from results import Table, add_keep
 from timing import limit_threads
 from torch import Tensor

@@ -15,8 +15,8 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from decimated_pair import ReducedPair
 from numpy.typing import NDArray
-from reduced import ReducedPair
 from scipy import sparse
 from scipy.optimize import minimize
 from torch import Tensor

@@ -19,9 +19,9 @@ from typing import Literal, NamedTuple
 import numpy as np
 import torch
 from cases import HALF, Case
+from decimated_pair import ReducedPair, froehlich_botsch
 from full_space import full_space
 from geodesic import geodesic
-from reduced import ReducedPair, froehlich_botsch
 from timing import timed
 
 import torch_modal as tm
@@ -133,7 +133,7 @@ def by_peer(case: Case, limit: float = PEER_SECONDS) -> Outcome:
         request, answer = Path(scratch) / "request.npz", Path(scratch) / "answer.npz"
         arrays = {"x_a": case.x_a[used].numpy(), "x_b": case.x_b[used].numpy(), "faces": number[case.faces].numpy()}
         np.savez(request, times=np.array(case.times), **arrays)
-        command = [python, str(Path(__file__).with_name("peer_worker.py")), str(request), str(answer)]
+        command = [python, str(Path(__file__).with_name("morphomatics_worker.py")), str(request), str(answer)]
         environment = {**os.environ, **PEER_ENVIRONMENT}
         environment.pop("PYTHONPATH", None)
         try:

@@ -19,10 +19,9 @@ from typing import Any, NamedTuple
 
 import torch
 from cases import Case
+from known_motions import MOTIONS, Motion, fractions
 from measures import NAN, Yardstick, mean_ratio
-from motions import MOTIONS, Motion, fractions
-from results import Table, add_keep
-from tables import number
+from results import Table, add_keep, number
 from timing import limit_threads, timed
 from torch import Tensor
 

@@ -17,8 +17,7 @@ import numpy as np
 import torch
 import trimesh
 from measures import edge_lengths, mean_ratio
-from results import Table, add_keep
-from tables import number, percent
+from results import Table, add_keep, number, percent
 from timing import limit_threads, timed
 from torch import Tensor
 

@@ -19,8 +19,7 @@ import torch
 from cases import Case
 from measures import Yardstick
 from methods import linear
-from results import Table, add_keep, wanted
-from tables import percent
+from results import Table, add_keep, percent, wanted
 from timing import limit_threads, timed
 from torch import Tensor
 

@@ -22,11 +22,10 @@ from pathlib import Path
 import cases
 import torch
 from cases import HALF, Case
+from error_pictures import draw_sheet
 from measures import Yardstick
 from methods import METHODS, Outcome, UnavailableError, add_peer
-from results import Table, add_keep, wanted
-from sheet import draw_sheet
-from tables import geometric_mean, number, percent
+from results import Table, add_keep, geometric_mean, number, percent, wanted
 from timing import limit_threads
 
 FEW = ["hand-path", "hand 00/04", "woman 00/02", "face 00/01", "cube 1/2", "creature 1", "creature 2", "sample hand"]

@@ -1,13 +1,15 @@
 """How well meshes are registered whose truth is known.
 
-    python tests/benchmarks/registration.py [--parts poses pairs animals hands middle] [--n-pairs 12]
+    python tests/benchmarks/registration.py [--parts poses pairs middle] [--n-pairs 12]
+    python tests/benchmarks/registration.py --across [--only TEXT ...]
     python tests/benchmarks/registration.py --picture docs/images/registration.png
 
 The template is a pose decimated to 60 % of its vertices and shuffled; the target is another pose, turned, scaled and
 moved, and often damaged. The truth of a template vertex is the point of the other pose with the same place in the same
-face. Errors are in percent of the target's bounding-box diagonal: of a pair of poses the mean over the vertices, across
-subjects the distances of points that are held out, of an in-between the mean distance to that of the true connectivity,
-both ways. Mean and maximum are those of trusted results. Times are processor seconds of one thread.
+face. Errors are in percent of the target's bounding-box diagonal: of a pair of poses the mean over the vertices, of an
+in-between the mean distance to the one of the true connectivity, both ways. Mean and maximum are of trusted results.
+Times are processor seconds of one thread. ``--across`` registers different subjects by eight landmarks and without, and
+judges by other places; the woman in another connectivity is judged by all vertices.
 """
 
 import argparse
@@ -22,11 +24,12 @@ from statistics import fmean
 from typing import Any, NamedTuple
 
 import numpy as np
-from results import Table, add_keep
+from results import Table, add_keep, wanted
 from scipy import sparse
 from scipy.sparse import csgraph
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
+from timing import limit_threads
 
 import torch_modal as tm
 from torch_modal.arrays import FloatArray, IntArray
@@ -36,9 +39,10 @@ from torch_modal.io.read import open_asset
 from torch_modal.registration.surface import MeshSurface, referenced
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "examples"))
-from _animals import animal, held_out, tips
+from _animals import animal, galloping, held_out, tips
 from _sculpt import sculpt
 from make_samples import hand
+from morph_animals import TIMES
 
 SHARED = Path(__file__).parents[2].parent / "shared" / "data"
 BODIES = {
@@ -204,33 +208,67 @@ def web(surface: MeshSurface, tips: tuple[int, int]) -> int:
     return way[int(away.argmax())]
 
 
-def animals() -> Result:
-    """An animal on one of other proportions and tessellation, by eight landmarks; other places are held out."""
-    (first, first_faces, cones), (second, second_faces, second_cones) = animal("slender"), animal("stout")
-    here, there = MeshSurface(first, first_faces), MeshSurface(second, second_faces)
-    marks = np.stack([here.closest(tips(cones)).points, there.closest(tips(second_cones)).points], axis=1)
-    others, places = here.closest(held_out(cones)), there.closest(held_out(second_cones)).points
-    return across(here, there, marks, lambda x: here.rows(others) @ x - places)
+Subjects = tuple[MeshSurface, MeshSurface, FloatArray, FloatArray]
+"""The template, the target, and the same places on both: first those that are landmarks."""
 
 
-def hands() -> Result:
-    """A hand on a hand of another maker, eight landmarks; the webs between the four fingers are held out."""
-    first, first_faces, places = own_hand()
-    second, second_faces = (part[0] if part.ndim == 3 else part for part in poses("mh-hand"))
-    here, there = MeshSurface(first, first_faces), MeshSurface(second, second_faces)
+def animals(times: dict[str, float] | None, there: str = "stout") -> Subjects:
+    """One of the animals on the other, standing or at times of their strides."""
+    found = []
+    for kind in ("slender", "stout"):
+        rest, faces, cones = animal(kind)
+        surface = MeshSurface(rest, faces)
+        rows = surface.rows(surface.closest(np.concatenate([tips(cones), held_out(cones)])))
+        x = rest if times is None else galloping(kind, times[kind])
+        found.append((surface.moved(x), rows @ x))
+    (here, places), (other, its_places) = found if there == "stout" else found[::-1]
+    return here, other, places, its_places
+
+
+def hands(pose: int) -> Subjects:
+    """The sample's hand on one of another maker, judged by the webs between the fingers."""
+    first, faces, places = own_hand()
+    shapes, other_faces = poses("mh-hand")
+    here, there = MeshSurface(first, faces), MeshSurface(shapes[0], other_faces)
     marks = np.stack([cKDTree(first).query(places)[1], HAND_LANDMARKS], axis=1)
-    pairs = [(web(here, (a[0], b[0])), web(there, (a[1], b[1]))) for a, b in itertools.pairwise(marks[1:5])]
-    own, others = (list(column) for column in zip(*pairs, strict=True))
-    return across(here, there, marks, lambda x: x[own] - second[others])
+    webs = [
+        [web(s, p) for s, p in zip((here, there), zip(*pair, strict=True), strict=True)]
+        for pair in itertools.pairwise(marks[1:5].tolist())
+    ]
+    own, its = np.concatenate([marks, webs]).T
+    return here, there.moved(shapes[pose]), first[own], shapes[pose][its]
 
 
-def across(here: MeshSurface, there: MeshSurface, marks: Any, off: Callable[[FloatArray], FloatArray]) -> Result:
-    """A registration across subjects, with the distances of what is held out."""
-    meshes = here.vertices, here.faces, there.vertices, there.faces
-    found, seconds = registered(*meshes, landmarks=marks, same_subject=False)
-    assert found is not None
-    distances = 100 / there.diagonal * np.linalg.norm(off(found.positions.numpy()), axis=1)
-    return Result(distances.tolist(), found.confidence >= 0.5, seconds)
+def woman() -> Subjects:
+    """A woman on herself, with other vertices and faces."""
+    case = pair("mh-woman", 0, 0, "none", 5)
+    surface = MeshSurface(case.rest, case.triangles)
+    return surface, MeshSurface(case.there, case.there_faces), case.rest, case.truth
+
+
+SUBJECTS: dict[str, Callable[[], Subjects]] = {
+    "slender on stout animal": lambda: animals(None),
+    "stout on slender animal, in the strides of Figure 8": lambda: animals(TIMES, "slender"),
+    "hand on a hand of another maker": lambda: hands(0),
+    "woman on herself": woman,
+}
+
+
+def across(only: Iterable[str], table: Table) -> None:
+    """Bodies of two subjects, by landmarks and without: errors of places that are no landmarks."""
+    for name, subjects in SUBJECTS.items():
+        if not wanted(name, only):
+            continue
+        here, there, places, its_places = subjects()
+        n = 8 if len(places) < len(here.vertices) else 0
+        for marks in (np.stack([places[:n], its_places[:n]], axis=1), None) if n else (None,):
+            meshes = here.vertices, here.faces, there.vertices, there.faces
+            found, _ = registered(*meshes, landmarks=marks, same_subject=False)
+            assert found is not None
+            at = here.rows(here.closest(places[n:])) @ found.positions.numpy()
+            errors = 100 / there.diagonal * np.linalg.norm(at - its_places[n:], axis=1)
+            shown = f"{errors.mean():.2f} %", f"{errors.max():.2f} %", f"{found.confidence:.2f}"
+            table.add(name, "none" if marks is None else str(n), *shown)
 
 
 def middle(name: str, i: int, j: int) -> Result:
@@ -254,8 +292,6 @@ def parts(n_pairs: int) -> dict[str, tuple[str, Iterable[Callable[[], Result]]]]
     return {
         "poses": ("whole poses, no landmarks", (partial(one, *case) for case in pose_cases())),
         "pairs": ("random poses, no landmarks", (partial(one, *case) for case in random_cases(n_pairs))),
-        "animals": ("slender on stout animal, eight landmarks", [animals]),
-        "hands": ("hand on a hand of another maker, eight landmarks", [hands]),
         "middle": ("in-between of a registered pair", (partial(middle, *case) for case in middles)),
     }
 
@@ -294,13 +330,24 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--parts", nargs="*", default=list(parts(0)), choices=list(parts(0)))
     parser.add_argument("--n-pairs", type=int, default=12)
+    parser.add_argument("--across", action="store_true", help="different subjects instead")
+    parser.add_argument(
+        "--only", nargs="+", default=[""], metavar="TEXT", help="subjects whose names hold one of these"
+    )
     parser.add_argument("--picture", type=Path, help="only draw three examples there")
     add_keep(parser)
     given = parser.parse_args()
+    limit_threads()
     if given.picture:
         picture(given.picture)
         return
-    with Table("registration", COLUMNS, given.keep, COLUMNS[-1:], "--parts animals") as table:
+    if given.across:
+        columns = ["", "landmarks", "error, mean", "at most", "confidence"]
+        check = "--across --only 'slender on stout'"
+        with Table("registration-across", columns, given.keep, check=check, labels=2) as table:
+            across(given.only, table)
+        return
+    with Table("registration", COLUMNS, given.keep, COLUMNS[-1:], "--parts middle") as table:
         for part in given.parts:
             name, tasks = parts(given.n_pairs)[part]
             results = [task() for task in tasks]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import re
 import shlex
@@ -15,6 +16,7 @@ import subprocess
 import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 ROOT = Path(__file__).parents[2]
@@ -137,3 +139,19 @@ def refreshed(page: str) -> str:
 def names(page: str) -> list[str]:
     """The tables of a page."""
     return [found[1] for found in MARKED.findall(page)]
+
+
+def geometric_mean(values: list[float]) -> float:
+    """Of the values that are finite and positive."""
+    logarithms = [math.log(value) for value in values if math.isfinite(value) and value > 0]
+    return math.exp(fmean(logarithms)) if logarithms else math.nan
+
+
+def percent(value: float) -> str:
+    """A fraction as a percentage."""
+    return number(100 * value, ".2f") + (" %" if math.isfinite(value) else "")
+
+
+def number(value: float, form: str) -> str:
+    """A number, or a dash where there is none."""
+    return format(value, form) if math.isfinite(value) else "-"

@@ -7,8 +7,7 @@ Means over the known in-betweens of the mean relative errors of edge lengths, an
 
 import argparse
 
-from results import Table, add_keep
-from tables import percent
+from results import Table, add_keep, percent
 from timing import limit_threads
 
 import torch_modal as tm

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from motions import sculpted
+from known_motions import sculpted
 from PIL import Image
 from results import Table, add_keep
 

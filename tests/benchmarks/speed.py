@@ -2,7 +2,7 @@
 
     python tests/benchmarks/speed.py [--peer-python FILE] [--rounds 2] [--only TEXT ...]
     python tests/benchmarks/speed.py --before CHECKOUT
-    python tests/benchmarks/speed.py --parts growth first
+    python tests/benchmarks/speed.py --parts blends first
     python tests/benchmarks/speed.py --parts batches [--device cuda] [--threads 16]
     python tests/benchmarks/speed.py --parts threads [--rounds 10]
 
@@ -11,8 +11,9 @@ of all rounds, so that what else a machine does slows all sides. In-betweens, wi
 without; making a layer is over the set-up of their shape space. ``--before`` names the folder of another checkout, for
 example of an earlier commit, which each column is then compared with. Bases are there before the clock starts, but for
 ``--parts first``: from two new key-frames to a sequence with nothing cached, on the clock. ``--parts batches`` compares
-batches, forward and with their gradients, with single calls, and a GPU with the CPU beside it. ``--parts threads``
-compares two threads with one, in turns, on the clock: more rounds find the quiet moments of a machine.
+batches, forward and with their gradients, with single calls, and a GPU with the CPU beside it; ``--parts blends`` a blend
+of six key-frames with a pair. ``--parts threads`` compares two threads with one, in turns, on the clock: more rounds find
+the quiet moments of a machine.
 """
 
 import argparse
@@ -28,13 +29,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-import trimesh
 from cases import Case, KeyframeSet, divided, samples, shared
 from methods import by_peer
-from results import ROOT, Table, add_keep, wanted
-from tables import geometric_mean
+from results import ROOT, Table, add_keep, geometric_mean, wanted
 from timing import limit_threads, timed
 
 import torch_modal as tm
@@ -123,23 +121,21 @@ def compare(given: argparse.Namespace) -> None:
         table.add("geometric mean", "", *(f"{geometric_mean(list(each)):.3f}" for each in zip(*means, strict=True)))
 
 
-def growth(arguments: argparse.Namespace) -> None:
-    """The same shapes with more and more vertices."""
+def blends(arguments: argparse.Namespace) -> None:
+    """A weighted in-between of six key-frames over one of two, without gradients and with them."""
     limit_threads()
-    case = next(iter(all_cases().values()))
-    shapes, faces = torch.stack([case.x_a, case.x_b]), case.faces
-    for _ in range(3):
-        bases = tm.extract_bases(shapes, faces)
-        for backend in ("warp", "torch"):
-            solvers = [tm.Solver(backend=backend), tm.Solver(backend=backend, local_steps=0)]
-            both = [tm.InBetween(bases, faces, solver=solver) for solver in solvers]
-            with torch.no_grad():
-                whole, modal = (timed(lambda: layer(*shapes, 0.5))[1] for layer in both)  # noqa: B023
-            print(
-                f"{shapes.shape[1]:>7} vertices, {backend:<5}: whole {1e3 * whole:7.1f} ms, modal {1e3 * modal:7.1f} ms"
-            )
-        finer = [trimesh.remesh.subdivide(x.numpy(), faces.numpy()) for x in shapes]
-        shapes, faces = torch.tensor(np.stack([x for x, _ in finer])), torch.tensor(finer[0][1])
+    x, faces = load_sample("creature")[:2]
+    bases, weights = tm.extract_bases(x, faces), torch.full((len(x),), 1 / len(x), dtype=torch.float64)
+    blend, pair = tm.Blend(bases, faces), tm.InBetween([bases[0], bases[-1]], faces)
+    works: list[Callable[[torch.Tensor], torch.Tensor]] = [
+        lambda x: blend(x, weights),
+        lambda x: pair(x[0], x[-1], 0.5),
+    ]
+    with torch.no_grad():
+        six, two = (timed(lambda: work(x))[1] for work in works)  # noqa: B023
+    leaf = x.clone().requires_grad_()
+    back_six, back_two = (timed(lambda: work(leaf).square().sum().backward())[1] for work in works)  # noqa: B023
+    print(f"Blend of {len(x)} over InBetween: {six / two:.1f}, with gradients {back_six / back_two:.1f}")
 
 
 def batches(arguments: argparse.Namespace) -> None:
@@ -250,7 +246,7 @@ def first(arguments: argparse.Namespace) -> None:
         )
 
 
-PARTS = {"compare": compare, "growth": growth, "first": first, "batches": batches, "threads": threads}
+PARTS = {"compare": compare, "blends": blends, "first": first, "batches": batches, "threads": threads}
 
 
 def main() -> None:

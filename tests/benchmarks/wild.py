@@ -9,7 +9,7 @@ More than a hundred bodies (tests/benchmarks/wild_bodies.py): with thin limbs, o
 manifold, of high genus, of 12 to 60,000 faces, in tiny and huge units, with loose vertices, slivers and noise, machines
 and animals. The key-frames are the body at rest, and bent and twisted; the true in-between is the same motion half-way.
 Each body is tried with each preset, and those that ``--list`` marks with contact, too, which "paper" does not have.
-Kinds take turns, so that a run that is ended early has seen all of them; ``--show FILE.json`` prints its table.
+Kinds take turns, so that a run that is ended early has seen all of them.
 
 An outcome is one of
 
@@ -21,8 +21,7 @@ An outcome is one of
 - hang, past a limit of time;
 - died: the process ended.
 
-The last four are mistakes; with one, the exit code is 1. A child process tries one body after the other, and is
-replaced when it died or is past a limit.
+The last four are mistakes; with one, the exit code is 1. A child process tries each body.
 
 Edge errors are means of ``|l - l_true| / max(l_true, l_mean / 100)``: edges of next to no length do not count for more
 than all others. Times are seconds on the clock for the bases of both key-frames, and processor time for one in-between.
@@ -33,9 +32,9 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import multiprocessing
 import os
 import signal
+import subprocess
 import sys
 import tempfile
 import time
@@ -45,15 +44,13 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from itertools import zip_longest
-from multiprocessing.connection import Connection
 from pathlib import Path
 from statistics import median
 from typing import Any
 
 import numpy as np
 import torch
-from results import wanted
-from tables import geometric_mean, number
+from results import geometric_mean, number, wanted
 from timing import limit_threads
 from tqdm import tqdm
 from wild_bodies import bent_and_twisted
@@ -70,7 +67,8 @@ PRESETS = ("accurate", "fast", "paper")
 WORSE = 1.1  # times linear interpolation's edge error
 SHORT = 0.01  # of the mean edge; shorter ones are measured by this
 LIMITS = {"modes": 400.0, "in-between": 200.0, "contact": 400.0}  # seconds on the clock
-START = 600.0  # seconds until a child process answers
+STEPS = {False: "in-between", True: "contact"}
+START = 60.0  # seconds until a child process has imported all
 REPEATED = 5.0  # seconds; what takes less is called again for its time
 
 OUTCOMES = ("good", "fell back", "not converged", "refused", "silent", "foreign", "hang", "died")
@@ -113,11 +111,8 @@ class Row:
 # ------------------------------------------------------------------------------------------------- in the child process
 
 
-def attempt(
-    body: WildBody, ways: Sequence[tuple[str, bool]], say: Callable[[Any], None], method: Method = "auto"
-) -> None:
-    """Try a body: a step's name is said before it starts, and a row after each way."""
-    say("modes")
+def attempt(body: WildBody, ways: Sequence[tuple[str, bool]], method: Method) -> None:
+    """Try a body, and print a row after each way."""
     rows = [Row(body.name, body.kind, preset, contact) for preset, contact in ways]
     vertices, faces = body.make()
     poses = [torch.from_numpy(bent_and_twisted(vertices, faces, time)) for time in (0.0, 0.5, 1.0)]
@@ -133,7 +128,6 @@ def attempt(
         )
         spent = time.perf_counter() - start
     for row in rows:
-        say("contact" if row.contact else "in-between")
         row.vertices, row.faces, row.modes = len(vertices), len(faces), spent
         row.linear, row.means = linear, means
         with warnings.catch_warnings(record=True) as more:
@@ -145,7 +139,7 @@ def attempt(
         row.warned = "; ".join(
             dict.fromkeys(f"{w.category.__name__}: {str(w.message)[:150]}" for w in [*warned, *more])
         )
-        say(row)
+        print(json.dumps(asdict(row)), flush=True)
 
 
 def in_between(row: Row, bases: list[tm.ModalBasis], faces: torch.Tensor, poses: list[torch.Tensor]) -> None:
@@ -221,103 +215,34 @@ def error_of(length: torch.Tensor, wanted: torch.Tensor) -> float:
     return float(((length - wanted).abs() / wanted.clamp(min=SHORT * float(wanted.mean()))).mean())
 
 
-def serve(pipe: Connection) -> None:
-    """Try what is asked for, until the pipe is closed."""
-    os.setsid()  # so that its own children end with it
-    limit_threads()
-    while True:
-        try:
-            name, ways, method = pipe.recv()
-        except EOFError:
-            return
-        attempt(BODIES[name], ways, pipe.send, method)
-        pipe.send("done")
-
-
 # ------------------------------------------------------------------------------------------------ in the parent process
 
 
-class Worker:
-    """A child process that tries bodies, started when it is needed."""
-
-    def __init__(
-        self,
-        patience: float,
-        serve: Callable[[Connection], None] = serve,
-        start: str = "spawn",
-        method: Method = "auto",
-    ) -> None:
-        self.patience, self.serve, self.start_method, self.method = patience, serve, start, method
-        self.process: Any = None
-
-    def try_body(self, body: WildBody, ways: Sequence[tuple[str, bool]]) -> Iterator[Row]:
-        """Rows of all ways; a way that ends the process has one, too, and the others are tried by another."""
-        left = list(ways)
-        while left:
-            self._start()
-            self.pipe.send((body.name, left, self.method))
-            step, outcome = "start", ""
-            while not outcome:
-                limit = self.patience * LIMITS[step] if step in LIMITS else START
-                try:
-                    said = self.pipe.recv() if self.pipe.poll(limit) else f"no answer in {limit:.0f} s"
-                except (EOFError, OSError):
-                    self.process.join()
-                    said, outcome = f"exit code {self.process.exitcode}", "died"
-                    break
-                if isinstance(said, Row):
-                    left = left[1:]
-                    yield said
-                elif said == "done":
-                    return
-                elif said in LIMITS:
-                    step = said
-                else:
-                    outcome = "hang"
-            self.stop()
-            lost = left if step in ("start", "modes") else left[:1]
-            for preset, contact in lost:
-                yield Row(body.name, body.kind, preset, contact, outcome, f"{step}: {said}")
-            left = left[len(lost) :]
-
-    def _start(self) -> None:
-        if self.process is None:
-            context = multiprocessing.get_context(self.start_method)
-            self.pipe, other = context.Pipe()
-            self.process = context.Process(target=self.serve, args=(other,))
-            self.process.start()
-            other.close()
-
-    def stop(self) -> None:
-        """End the process and what it started."""
-        if self.process is not None:
-            try:
-                os.killpg(self.process.pid, signal.SIGKILL)
-            except ProcessLookupError:
-                self.process.kill()
-            self.process.join()
-            self.pipe.close()
-            self.process = None
+def rows_of(body: WildBody, ways: list[tuple[str, bool]], arguments: argparse.Namespace) -> list[Row]:
+    """Rows of all ways. One that ends its child process, or hangs, has a row too; another child tries the rest."""
+    rows: list[Row] = []
+    while len(rows) < len(ways):
+        left = ways[len(rows) :]
+        limit = arguments.patience * (START + LIMITS["modes"] + sum(LIMITS[STEPS[contact]] for _, contact in left))
+        command = [sys.executable, __file__, "--child", body.name, json.dumps(left), arguments.method]
+        child = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, start_new_session=True)
+        try:
+            said, outcome = child.communicate(timeout=limit)[0], "died"
+        except subprocess.TimeoutExpired:
+            os.killpg(child.pid, signal.SIGKILL)  # with its own children
+            said, outcome = child.communicate()[0], "hang"
+        rows += [Row(**json.loads(line)) for line in said.splitlines() if line.startswith("{")]
+        if len(rows) < len(ways):
+            preset, contact = ways[len(rows)]
+            reason = f"no answer in {limit:.0f} s" if outcome == "hang" else f"exit code {child.returncode}"
+            rows.append(Row(body.name, body.kind, preset, contact, outcome, reason))
+    return rows
 
 
 def run(chosen: list[WildBody], arguments: argparse.Namespace) -> Iterator[list[Row]]:
     """All bodies, the rows of each as it is done."""
-    workers: list[Worker] = [Worker(arguments.patience, method=arguments.method) for _ in range(arguments.jobs)]
-
-    def one(body: WildBody) -> list[Row]:
-        worker = workers.pop()
-        try:
-            return list(worker.try_body(body, ways_of(body, arguments)))
-        finally:
-            workers.append(worker)
-
     with ThreadPoolExecutor(arguments.jobs) as pool:
-        try:
-            yield from pool.map(one, chosen)
-        finally:
-            pool.shutdown(cancel_futures=True)
-            for worker in workers:
-                worker.stop()
+        yield from pool.map(lambda body: rows_of(body, ways_of(body, arguments), arguments), chosen)
 
 
 def ways_of(body: WildBody, arguments: argparse.Namespace) -> list[tuple[str, bool]]:
@@ -408,9 +333,7 @@ def parse(words: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--jobs", type=int, default=1, metavar="N", help="child processes")
     parser.add_argument("--patience", type=float, default=1.0, metavar="FACTOR", help=f"of the limits, {LIMITS} s")
     parser.add_argument("--out", type=Path, metavar="FILE.json", help="keep all rows")
-    parser.add_argument(
-        "--show", type=Path, metavar="FILE.json", help="print the table of rows that were kept, and end"
-    )
+    parser.add_argument("--child", nargs=3, help=argparse.SUPPRESS)
     parser.add_argument("--list", action="store_true", help="name all bodies, and end")
     return parser.parse_args(words)
 
@@ -422,8 +345,10 @@ def main(words: Sequence[str] | None = None) -> int:
     if arguments.list:
         print("\n".join(f"{body.kind}: {body.name}{', also with contact' * body.contact}" for body in chosen))
         return 0
-    if arguments.show:
-        print(table([Row(**row) for row in json.loads(arguments.show.read_text())]))
+    if arguments.child:
+        name, ways, method = arguments.child
+        limit_threads()
+        attempt(BODIES[name], json.loads(ways), method)
         return 0
     rows: list[Row] = []
     start = time.perf_counter()

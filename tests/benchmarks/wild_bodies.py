@@ -136,7 +136,6 @@ def _slivers() -> None:
     body("shaft", lambda: turned([(0, 0), (0.3, 0), (0.3, 1), (0.6, 1), (0.6, 1.4), (0.3, 1.4), (0.3, 3), (0, 3)], 32))
     body("box of 12", lambda: of(creation.box(extents=(3, 1, 1))))
     body("box of 192", lambda: block((3, 1, 1), 2))
-    body("bracket", lambda: level_set(_bracket, (1.3, 1.3, 0.6), 0.09))
     body("letters", lambda: of_vtk(pyvista.Text3D("wild", depth=0.3)))
     body("icosahedron", lambda: of(creation.icosahedron()))
 
@@ -175,16 +174,6 @@ def _gear(n: int) -> Surface:
         b, c = np.roll(a, -1), np.roll(d, -1)
         faces += [np.stack([a, d, c], 1), np.stack([a, c, b], 1)]
     return split((np.concatenate(profile), np.concatenate(faces)), 1)
-
-
-def _bracket(x: FloatArray, y: FloatArray, z: FloatArray) -> FloatArray:
-    """An L of two plates with a hole in each."""
-
-    def cuboid(centre: tuple[float, float, float], half: tuple[float, float, float]) -> FloatArray:
-        return np.max([np.abs(c - m) - h for c, m, h in zip((x, y, z), centre, half, strict=True)], axis=0)
-
-    corner = np.minimum(cuboid((0, -0.9, 0), (1.1, 0.2, 0.5)), cuboid((-0.9, 0, 0), (0.2, 1.1, 0.5)))
-    return np.max([corner, 0.25 - np.hypot(x - 0.4, z), 0.25 - np.hypot(y - 0.4, z)], axis=0)
 
 
 # ----------------------------------------------------------------------------------------------------------------- data

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from functools import partial
 
 import numpy as np
-import trimesh
 from trimesh import creation
 from wild_making import (
     FloatArray,
@@ -28,7 +27,6 @@ from wild_making import (
     super_ellipsoid,
     tube,
     turned,
-    welded,
 )
 
 # ---------------------------------------------------------------------------------------------------------------- plain
@@ -134,26 +132,6 @@ def _pieces() -> None:
     body("ball in a ball", lambda: joined(ball(3), ball(2, 0.5)))
     body("chain of 12", lambda: joined(*[moved(_link(k % 2), 1.3 * k, 0, 0) for k in range(12)]), contact=True)
     body("41 balls", lambda: _cloud(41, 2), contact=True)
-    body(
-        "41 bones",
-        lambda: joined(
-            *[
-                moved(stretched(ball(1), 0.3, 0.06, 0.06), 0.4 * (k % 10), 0.3 * (k // 10), 0.2 * np.sin(k))
-                for k in range(41)
-            ]
-        ),
-    )
-    body(
-        "100 tetrahedra",
-        lambda: joined(
-            *[
-                moved((v, f), *(4 * np.random.default_rng(k).random(3) * [2, 1, 1]))
-                for k in range(100)
-                for v, f in [_tetrahedron()]
-            ]
-        ),
-    )
-    body("feathered bird", _bird)
     body("ball and a crumb", lambda: joined(ball(3), moved(ball(0, 0.01), 1.3, 0, 0)))
     body(
         "ball and ten crumbs",
@@ -176,26 +154,6 @@ def _cloud(n: int, level: int) -> Surface:
             for r, p in zip(random.uniform(0.15, 0.4, n), random.normal(size=(n, 3)) * [2, 0.8, 0.8], strict=True)
         ]
     )
-
-
-def _tetrahedron() -> Surface:
-    return np.array([[0.0, 0, 0], [0.3, 0, 0], [0, 0.3, 0], [0, 0, 0.3]]), np.array(
-        [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]
-    )
-
-
-def _bird() -> Surface:
-    """A low-poly body, two legs and forty feathers as thin closed plates."""
-    random = np.random.default_rng(8)
-    body = stretched(ball(1), 1, 0.6, 0.6)
-    parts = [body, moved(ball(0, 0.3), 1.1, 0, 0.5), moved(stretched(ball(0), 0.05, 0.05, 0.5), 0, 0.3, -0.9)]
-    for _ in range(38):
-        plate = block((0.5, 0.12, 0.01), 0)
-        direction = random.normal(size=3)
-        direction /= np.linalg.norm(direction)
-        turn = trimesh.geometry.align_vectors([1, 0, 0], direction)[:3, :3]
-        parts.append((plate[0] @ turn.T + direction * [1.1, 0.7, 0.7], plate[1]))
-    return joined(*parts)
 
 
 def _sheet_at(k: int) -> Surface:
@@ -225,7 +183,6 @@ def _genus() -> None:
     body("chain of tori", lambda: level_set(_tori(5), (3.2, 0.9, 0.4), 0.05))
     body("frame of a cube", lambda: level_set(limbs(_frame(), 0.02), (1.2, 1.2, 1.2), 0.05))
     body("lattice of bars", lambda: level_set(limbs(_bars(3), 0.015), (1.7, 1.2, 1.2), 0.07))
-    body("sponge", lambda: _sponge())
     body("figure eight", lambda: level_set(_tori(2), (1.7, 0.9, 0.4), 0.05))
 
 
@@ -244,28 +201,6 @@ def _bars(n: int) -> list[tuple]:
     bars = [([-1.5, a, b], [1.5, a, b], 0.07, 0.07) for a in ticks for b in ticks]
     bars += [([1.5 * a, -1, b], [1.5 * a, 1, b], 0.07, 0.07) for a in ticks for b in ticks]
     return bars + [([1.5 * a, b, -1], [1.5 * a, b, 1], 0.07, 0.07) for a in ticks for b in ticks]
-
-
-def _sponge() -> Surface:
-    """A cube with three square tunnels, of unit cells."""
-    cells = {(i, j, k) for i in range(9) for j in range(3) for k in range(3) if sum((i % 3 == 1, j == 1, k == 1)) < 2}
-    quads = []
-    for cell in sorted(cells):
-        for axis in range(3):
-            for side in (0, 1):
-                beside = list(cell)
-                beside[axis] += 2 * side - 1
-                if tuple(beside) in cells:
-                    continue
-                u, v = (axis + 1) % 3, (axis + 2) % 3
-                corners = np.array([cell] * 4, dtype=float)
-                corners[:, axis] += side
-                corners[[1, 2], u] += 1
-                corners[[2, 3], v] += 1
-                quads.append(corners if side else corners[::-1])
-    vertices = np.concatenate(quads)
-    halves = np.array([[0, 1, 2], [0, 2, 3]])
-    return split(welded(vertices, (4 * np.arange(len(quads))[:, None, None] + halves).reshape(-1, 3)), 1)
 
 
 for _make in (_plain, _limbs, _pieces, _genus):

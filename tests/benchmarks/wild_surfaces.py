@@ -36,18 +36,6 @@ def _thin() -> None:
         body(f"plate {thickness}", partial(plate, thickness), contact=thickness == 0.01)
     body("wavy plate", lambda: thick(lambda u, v: (3 * u, v, 0.15 * np.sin(9 * u)), 0.01, 40, 12))
     body(
-        "disc",
-        lambda: turned(
-            [
-                (0, 0),
-                *[(r, 0) for r in np.linspace(0.1, 1, 10)],
-                *[(r, 0.01) for r in np.linspace(1, 0.1, 10)],
-                (0, 0.01),
-            ],
-            40,
-        ),
-    )
-    body(
         "cup with walls",
         lambda: turned(
             [
@@ -96,18 +84,6 @@ def _open() -> None:
     body("Moebius strip", lambda: of_vtk(pyvista.ParametricMobius(u_res=40, v_res=12, w_res=10)))
     body("helicoid", lambda: patch(lambda u, v: (4 * u, (v - 0.5) * np.cos(6 * u), (v - 0.5) * np.sin(6 * u)), 50, 10))
     body("sieve", lambda: _sieve(0.3))
-    body(
-        "skirt",
-        lambda: patch(
-            lambda u, v: (
-                (0.3 + u) * np.cos(2 * np.pi * v),
-                (0.3 + u) * np.sin(2 * np.pi * v),
-                2 * u + 0.1 * u * np.sin(40 * v),
-            ),
-            20,
-            60,
-        ),
-    )
     body("airplane", lambda: of_vtk(pyvista.read(f"{examples.dir_path}/airplane.ply")), contact=True)
 
 
@@ -133,7 +109,6 @@ def _non_manifold() -> None:
     body("box with inner wall", lambda: welded(*joined(block((2, 1, 1), 2), _wall())))
     body("T of sheets", lambda: welded(*joined(_page(0), _page(1), _page(2))))
     body("book of five pages", lambda: welded(*joined(*[_page(k, 5) for k in range(5)])), contact=True)
-    body("bow-tie of cones", _bow_tie)
     body("repeated faces", lambda: (ball(2)[0] * [2, 1, 1], np.concatenate([ball(2)[1], ball(2)[1][:30]])))
     body("mixed winding", lambda: _mixed_winding())
     body("triangle soup", lambda: _soup(stretched(ball(2), 2, 1, 1)))
@@ -149,16 +124,6 @@ def _wall() -> Surface:
 def _page(k: int, n: int = 3) -> Surface:
     angle = 2 * np.pi * k / n
     return patch(lambda u, v: (3 * u, v * np.cos(angle), v * np.sin(angle)), 24, 8)
-
-
-def _bow_tie() -> Surface:
-    cone = of(creation.cone(radius=0.6, height=1.5, sections=16))
-    return welded(
-        *joined(
-            moved(split(cone, 2), 0, 0, -1.5),
-            (split(cone, 2)[0] * [1, 1, -1] + [0, 0, 1.5], split(cone, 2)[1][:, ::-1]),
-        )
-    )
 
 
 def _mixed_winding() -> Surface:

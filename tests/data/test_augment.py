@@ -587,5 +587,5 @@ def creature() -> Shapes:
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "n"), [("creature", 200), ("hands", 1000), ("women", 100)])
 def test_many_draws(name: str, n: int, request: pytest.FixtureRequest) -> None:
-    """A thousand of each mesh: tests/benchmarks/draws.py."""
+    """More of each mesh."""
     check_draws(request.getfixturevalue(name), n)

@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 import zlib
+from functools import cache
 from pathlib import Path
 from types import ModuleType
 
@@ -75,6 +76,14 @@ VARIABLES: dict[str, type] = {
 """Names by which the pages call objects of the package in running text."""
 
 
+OTHERS = {
+    *("min", "sqrt", "net", "fullgraph", "collate_fn", "DeprecationWarning"),  # of Python and torch
+    *("Data", "Meshes", "face", "pos"),  # of PyTorch Geometric and PyTorch3D
+    *("seek", "positionOf", "placeOf"),  # of the page's script
+}
+"""Functions and arguments in inline code that are no public names of the package."""
+
+
 def has_member(owner: type, name: str) -> bool:
     """Members of a class, and attributes that its methods set."""
     sources = [inspect.getsource(each) for each in owner.__mro__ if each.__module__.startswith("torch_modal.")]
@@ -135,9 +144,38 @@ def missing(text: str, page: str = "") -> set[str]:
     return found
 
 
+@cache
+def vocabulary() -> tuple[set[str], set[str]]:
+    """Public names, their methods and arguments; and all words of the package, the examples and the tests."""
+    public = [getattr(tm, name) for name in tm.__all__] + list(vars(tm.losses).values())
+    members = [getattr(each, name) for each in public if inspect.isclass(each) for name in dir(each) if name[0] != "_"]
+    called = [each for each in [*public, *members] if "torch_modal" in str(getattr(each, "__module__", ""))]
+    called = [each for each in called if callable(each) and not (inspect.isclass(each) and issubclass(each, Exception))]
+    defined = {each.__name__ for each in called}.union(*(inspect.signature(each).parameters for each in called))
+    files = [*ROOT.glob("torch_modal/**/*.[pj][ys]"), *ROOT.glob("examples/**/*.py"), *ROOT.glob("tests/**/*.py")]
+    return defined, set(re.findall(r"\w+", "\n".join(file.read_text(encoding="utf-8") for file in files)))
+
+
+def unknown(text: str) -> set[str]:
+    """Functions, arguments and names in inline code that neither the package nor the page itself has."""
+    defined, words = vocabulary()
+    code = "\n".join(re.findall(r"^```.*?^```", text, re.M | re.S))
+    spans = re.findall(r"(?<!`)`([^`]+)`(?!`)", re.sub(r"^```.*?^```", "", text, flags=re.M | re.S))
+    mine = set(re.findall(r"\w+", code)) | OTHERS
+    strict = {name for span in spans for name in re.findall(r"(?<![\w.\[])([A-Za-z][^\W_]\w*)(?:\(|=(?!=))", span)}
+    plain = {span for span in spans if re.fullmatch(r"[A-Za-z_]\w{2,}", span) and span[1] != "_"}
+    return (strict - defined - mine) | (plain - words - mine)
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_what_a_page_names_exists(page: Path) -> None:
-    assert missing(page.read_text(encoding="utf-8"), page.stem) == set()
+    text = page.read_text(encoding="utf-8")
+    assert missing(text, page.stem) | unknown(text) == set()
+
+
+def test_unknown_names_in_inline_code_are_found() -> None:
+    text = "`RandomBlend(member=3)`, `RandomMixture(members=3)`, `subdivided`, `subdivide`, `torch.lerp(a, b)`, `contacts=True`"
+    assert unknown(text) == {"member", "RandomMixture", "contacts"}
 
 
 def test_what_does_not_exist_is_found() -> None:
@@ -166,10 +204,17 @@ torch_modal.layers.in_betwixt, tm.losses.Shell, `tests/project/test_docs.py::tes
     }
 
 
-def test_the_first_block_runs_in_an_empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_first_block_of_readme_runs_in_an_empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     run_python(blocks(ROOT / "README.md")[0], names := {})
     assert names["frames"].shape == (17, 3782, 3) and [file.name for file in tmp_path.iterdir()] == ["grasp.glb"]
+
+
+def test_the_front_page_does_not_scroll_sideways() -> None:
+    """Its column has 88 characters; formulas of other pages scroll by themselves."""
+    lines = [line for block in blocks(ROOT / "README.md") for line in block.text.splitlines()]
+    assert len(lines) > 30 and max(map(len, lines)) <= 88
+    assert re.search(r"div\.math \{[^}]*overflow-x: auto", (DOCS / "_static" / "site.css").read_text())
 
 
 # -------------------------------------------------------------------------------------------------------- messages

@@ -61,9 +61,9 @@ def test_no_measured_table_is_written_by_hand(path: Path) -> None:
         assert 4 * measured < len(cells), rows[0]
 
 
-def test_every_kept_table_stands_in_one_page() -> None:
+def test_every_kept_table_stands_in_a_page() -> None:
     shown = [name for path in results.PAGES for name in results.names(path.read_text(encoding="utf-8"))]
-    assert sorted(shown) == KEPT
+    assert sorted(set(shown)) == KEPT
 
 
 def test_cells_are_compared_by_their_last_digit() -> None:

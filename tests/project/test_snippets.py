@@ -72,6 +72,21 @@ def test_blocks_run_in_their_order(page: Path, meshes: Path, tmp_path: Path, mon
                 run_command(block, words)
 
 
+@pytest.mark.parametrize("page", pages_with("python", "sh"))
+def test_the_first_block_runs_alone(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In an empty folder: it needs no file that the page makes, or names, later."""
+    monkeypatch.chdir(tmp_path)
+    first = next(block for block in blocks(page) if block.language in {"python", "sh"})
+    assert first.is_run
+    if first.language == "python":
+        run_python(first, {"__name__": "__main__"})
+    for words in commands(first) if first.language == "sh" else ():
+        if words[-1].endswith("write_meshes.py"):
+            load_example("write_meshes").main(tmp_path)
+        else:
+            run_command(first, words)
+
+
 def run_command(block: Block, words: list[str]) -> None:
     """Run ``torch-modal``; of all else, check that it could be."""
     program, *arguments = words

@@ -1,4 +1,4 @@
-"""In-betweens by morphomatics, in a process of its own: ``python peer_worker.py request.npz answer.npz``.
+"""In-betweens by morphomatics, in a process of its own: ``python morphomatics_worker.py request.npz answer.npz``.
 
 The Python that runs this needs morphomatics, not torch or torch_modal. The shape space (gradient and divergence of the
 reference, factors of its Poisson system, geodesic compiled by ``jax.jit``) is made first, and timed for itself, once;

@@ -1,9 +1,10 @@
 """Clips of public bodies, of which every eighth frame is given: any method against the frames between.
 
-    python tests/benchmarks/public.py [--bodies fox frog] [--step 8] [--methods linear smooth] [--pictures FOLDER]
-    python tests/benchmarks/public.py --method my_module:my_function [--peer-python FILE]
-    python tests/benchmarks/public.py --export clips; python tests/benchmarks/public.py --results mine
-    python tests/benchmarks/public.py --sequences coma/bareteeth dfaust/registrations_f.hdf5:50004_jumping_jacks ...
+    python tests/benchmarks/animated_clips.py [--bodies fox frog] [--step 8] [--methods linear smooth]
+    python tests/benchmarks/animated_clips.py --pictures FOLDER
+    python tests/benchmarks/animated_clips.py --method my_module:my_function [--peer-python FILE]
+    python tests/benchmarks/animated_clips.py --export clips; python tests/benchmarks/animated_clips.py --results mine
+    python tests/benchmarks/animated_clips.py --sequences coma/bareteeth dfaust/registrations_f.hdf5:NAME ...
 
 Bodies are the animals beside the repository (CC0) and the samples of the package. A method is a function of key-frames
 ``(K, V, 3)``, faces ``(F, 3)``, the times of the key-frames and other times that gives shapes ``(T, V, 3)``: any of
@@ -16,9 +17,8 @@ registrations of COMA, FAUST (``tr_reg_*.ply``, a sequence of poses), SMAL and T
 registrations, with the name of one of its sequences or for all (``pip install h5py``). None is shipped.
 
 Means over the frames that are not given, of means over clips: error of edges, relative; of dihedral angles, in degrees,
-by edge length; distance to the truth, in percent of the diagonal; angle of normals, in degrees; volume over the
-truth's; standard deviation of the area along the clip over its mean; hinges that are more than a right angle from the
-truth's, of a thousand.
+by edge length; distance to the truth, in percent of the diagonal; volume over the truth's; hinges that are more than a
+right angle from the truth's, of a thousand.
 """
 
 import argparse
@@ -174,25 +174,13 @@ class Measures:
         part = self.shell.energy.parts[1]
         hinges = self.shell._rows(self.truth)[..., part.corners[1]] - self.shell._rows(self.truth)[..., part.corners[0]]
         weights = hinges.norm(dim=0)
-        normals, areas = self._normals(x)
-        true_normals, true_areas = self._normals(self.truth)
-        angles = torch.rad2deg(torch.acos((normals * true_normals).sum(-1).clamp(-1, 1)))
-        area = areas.sum(-1)
         return {
             "edges, %": 100 * float(((own.length - true.length).abs() / true.length).mean()),
             "dihedral angles, deg": float(torch.rad2deg((turned * weights).sum() / weights.sum())),
             "distance, %": 100 * float((x - self.truth).norm(dim=-1).mean() / self.diagonal),
-            "normals, deg": float((angles * true_areas).sum() / true_areas.sum()),
             "volume": float((own.volume / true.volume).mean()),
-            "variation of the area, %": 100 * float(area.std(correction=0) / area.mean()),
             "folds, of 1,000": 1000 * float((turned > torch.pi / 2).double().mean()),
         }
-
-    def _normals(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        a, b, c = (x[:, corner] for corner in self.faces.T)
-        normals = torch.linalg.cross(b - a, c - a)
-        doubled = normals.norm(dim=-1)
-        return normals / doubled.clamp_min(1e-300)[..., None], 0.5 * doubled
 
 
 def export(folder: Path, given: Iterable[Clip]) -> None:
@@ -262,7 +250,7 @@ def main() -> None:
         ranked.append((found[last]["edges, %"] / found[first]["edges, %"], clip, answers))
     columns = list(next(iter(found.values())))
     check = "--bodies --methods linear smooth"
-    with Table("public", ["clips", "method", *columns], given.keep, check=check, labels=2) as table:
+    with Table("animated-clips", ["clips", "method", *columns], given.keep, check=check, labels=2) as table:
         for group, by_method in rows.items():
             for name, every in by_method.items():
                 means = (np.mean([values[column] for values in every]) for column in columns)

@@ -1,13 +1,9 @@
-"""Thin things: sheets without a thickness, and modes of the surface beside those of the solid.
+"""Sheets without a thickness, by modes of the surface.
 
-    python tests/benchmarks/thin.py [--only TEXT ...] [--peer-python FILE] [--picture FILE.png]
-    python tests/benchmarks/thin.py --bodies
+    python tests/benchmarks/thin_sheets.py [--only TEXT ...] [--peer-python FILE] [--picture FILE.png]
 
 Mean relative errors of edge lengths at t = 1/4, 1/2 and 3/4 of sheets in closed form (tests/sheets.py), by modes of the
 surface. Morphomatics joins where it is installed, or with ``--peer-python``. ``--picture`` draws the sheets instead.
-
-``--bodies`` compares, on closed bodies at t = 1/2, modes of the surface with those of the solid: edge errors with the
-preset "accurate", and processor seconds of the modes of both key-frames, with nothing cached.
 """
 
 from __future__ import annotations
@@ -16,28 +12,23 @@ import argparse
 import sys
 import warnings
 from collections.abc import Iterator, Sequence
-from functools import partial
-from itertools import chain
 from pathlib import Path
 from statistics import fmean
 
-import cases
 import torch
 from cases import HALF, Case, KeyframeSet
+from error_pictures import look
 from measures import Yardstick
 from methods import METHODS, UnavailableError, add_peer, peer_python
 from results import Table, add_keep, wanted
-from sheet import look
 from sheets import SHEETS, sheet
-from tables import number
-from timing import limit_threads, timed, untimed
+from timing import limit_threads, untimed
 
 import torch_modal as tm
 
 N_MODES = 30
 TIMES = (0.25, HALF, 0.75)
 SHOWN = (0.0, 0.25, HALF, 0.75, 1.0)
-BODIES = ["creature 1/2", "sample hand", "mh-hand-path 00/08"]
 
 
 def sheet_cases(only: Sequence[str]) -> Iterator[Case]:
@@ -68,21 +59,6 @@ def compare_sheets(only: Sequence[str], methods: list[str], table: Table) -> Non
         table.add(case.name, *cells)
 
 
-def compare_bodies(only: Sequence[str], table: Table) -> None:
-    """Add a row for each pair of key-frames."""
-    for case in chain(cases.samples(), cases.hand_path()):
-        if not wanted(case.name, only):
-            continue
-        yardstick, ends, errors, seconds = Yardstick(case), torch.stack([case.x_a, case.x_b]), [], []
-        for method in ("solid", "shell"):
-            bases, spent = timed(partial(tm.extract_bases, ends, case.faces, N_MODES, method=method, cache=False))
-            with torch.no_grad():
-                x = tm.InBetween(bases, case.faces)(*ends, HALF)
-            errors.append(f"{100 * yardstick.edge_error(x, HALF):.2f} %")
-            seconds.append(spent)
-        table.add(case.name, *errors, number(seconds[1] / seconds[0], ".2f"))
-
-
 def draw(path: Path, only: Sequence[str]) -> None:
     """A row for each sheet: the key-frames, and in-betweens of the preset "accurate"."""
     import pyvista
@@ -110,7 +86,6 @@ def main() -> None:
     """Measure and print, or draw."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", nargs="+", metavar="TEXT", help="only what has this in its name")
-    parser.add_argument("--bodies", action="store_true", help="modes of the surface beside those of the solid")
     parser.add_argument("--picture", type=Path, metavar="FILE.png", help="draw the sheets")
     add_peer(parser)
     add_keep(parser)
@@ -119,10 +94,6 @@ def main() -> None:
     warnings.simplefilter("ignore", tm.MeshWarning)
     if given.picture:
         draw(given.picture, given.only or [""])
-    elif given.bodies:
-        columns = ["pair", "modes of the solid", "modes of the surface", "time of the modes, surface over solid"]
-        with Table("surface-modes", columns, given.keep, columns[3:], "--bodies --only 'creature 1/2'") as table:
-            compare_bodies(given.only or BODIES, table)
     else:
         methods = ["linear", "fast", "accurate", *(["morphomatics"] if peer_python() else [])]
         with untimed(), Table("sheets", ["sheet", *methods], given.keep, check="--only 'page folded'") as table:

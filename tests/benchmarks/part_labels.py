@@ -1,6 +1,6 @@
 """Parts and landmarks of a hand from few labelled poses: what each augmentation brings.
 
-    python tests/benchmarks/parts.py [--poses 4] [--seeds 2] [--steps 800]
+    python tests/benchmarks/part_labels.py [--poses 4] [--seeds 2] [--steps 800]
 
 The body is the sample hand in 49 gestures, each digit closed by a random amount, with labels from its bones. The poses
 with labels are far from each other: the first frame, then always the one that is farthest from those chosen. 24 others
@@ -134,7 +134,7 @@ def main() -> None:
     given = parser.parse_args()
     limit_threads()
     warnings.simplefilter("ignore")  # in-betweens that did not converge
-    with Table("parts", ["further shapes", "IoU", "landmarks"], given.keep) as table:
+    with Table("part-labels", ["further shapes", "IoU", "landmarks"], given.keep) as table:
         compare(given.poses, given.seeds, given.steps, table)
 
 
