@@ -105,17 +105,8 @@ def hand_path() -> Iterator[Motion]:
         yield Motion(name, shapes, tuple(map(float, kept)), rest, lambda t, frames=frames: frames[round(t)])
 
 
-def unrelated() -> Iterator[Motion]:
-    """Poses of a hand that are no motion; without a truth."""
-    found = keyframes_of("mh-hand")
-    if found is not None:
-        times = tuple(float(i) for i in range(len(found[0])))
-        yield Motion("mh-hand 00-04, no motion", KeyframeSet(*found), times, fractions(times, 0.25, 0.5), None)
-
-
 MOTIONS: dict[str, Callable[[], Iterator[Motion]]] = {
     "gallop": gallop,
     "hand-path": hand_path,
     "grip": grip,
-    "unrelated": unrelated,
 }

@@ -1,6 +1,6 @@
 """Motion through many key-frames, smooth in time, beside each pair of key-frames alone.
 
-    python tests/benchmarks/motion.py [gallop hand-path grip unrelated]
+    python tests/benchmarks/motion.py [gallop hand-path grip]
 
 Distances are means over the vertices, in % of the diagonal, without any alignment; edge errors are means of
 ``|l - l_true| / l_true``, or, without a truth, of the strain against lengths that change evenly between key-frames.

@@ -25,7 +25,7 @@ from torch import Tensor
 
 import torch_modal as tm
 
-FEW = ["creature 1/2", "sample hand", "00/08", "woman 00/02"]
+FEW = ["creature 1/2", "sample hand", "00/08"]
 WAYS = {"local steps": tm.Solver(), "modal solve alone": tm.Solver(local_steps=0)}
 
 

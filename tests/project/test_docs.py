@@ -174,7 +174,7 @@ def test_what_a_page_names_exists(page: Path) -> None:
 
 
 def test_unknown_names_in_inline_code_are_found() -> None:
-    text = "`RandomBlend(member=3)`, `RandomMixture(members=3)`, `subdivided`, `subdivide`, `torch.lerp(a, b)`, `contacts=True`"
+    text = "`RandomBlend(member=3)`, `RandomMixture(members=3)`, `subdivide`, `torch.lerp(a, b)`, `contacts=True`"
     assert unknown(text) == {"member", "RandomMixture", "contacts"}
 
 
