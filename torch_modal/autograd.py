@@ -1,16 +1,26 @@
-"""Helpers for autograd functions, cached tensors, broadcasting and threads, with less overhead than in torch."""
+"""Helpers for autograd functions, cached tensors, broadcasting and threads, with less overhead than in torch.
+
+Torch's private names are used here alone, and only where no public one exists:
+
+- ``torch._C._functorch.peek_interpreter_stack`` and ``forward_ad._current_level`` tell that a transform of
+  ``torch.func`` or forward mode is active (:func:`within_transforms`);
+- ``_get_current_dispatch_mode`` tells the same of dispatch modes, which other threads would not have;
+- ``torch._C._functorch.is_batchedtensor`` tells ``vmap`` from other transforms;
+- ``_disable_current_modes`` and ``torch._C.DisableTorchFunction`` compute numbers during ``torch.export``, which would
+  otherwise record the computation;
+- ``torch._functorch.eager_transforms.JVP_NESTING`` tells forward mode within forward mode.
+"""
 
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial, wraps
-from itertools import zip_longest
 from typing import Any, ParamSpec, TypeVar
 
 import torch
 from torch import Tensor
 from torch.autograd import forward_ad
-from torch.utils._python_dispatch import _disable_current_modes
+from torch.utils._python_dispatch import _disable_current_modes, _get_current_dispatch_mode
 
 from torch_modal import trees
 
@@ -24,6 +34,16 @@ def traced(x: Tensor) -> bool:
     return torch.compiler.is_compiling() or type(x) not in (Tensor, torch.nn.Parameter) or x.is_meta
 
 
+def within_transforms() -> bool:
+    """True while a transform of ``torch.func`` or forward-mode differentiation is active in this thread."""
+    return torch._C._functorch.peek_interpreter_stack() is not None or forward_ad._current_level >= 0
+
+
+def has_modes_of_thread() -> bool:
+    """True under modes that other threads would not have: transforms, forward mode, dispatch modes."""
+    return within_transforms() or _get_current_dispatch_mode() is not None
+
+
 def transformed(x: Tensor) -> bool:
     """True for a wrapper of a ``torch.func`` transform, or a tensor with a tangent of forward-mode differentiation."""
     if torch.func.debug_unwrap(x, recurse=False) is not x:
@@ -35,7 +55,7 @@ def plain(*given: Tensor) -> bool:
     """True for tensors that all have numbers, which are all that there is to them: neither traced nor transformed."""
     if torch.compiler.is_compiling():
         return False
-    within = torch._C._functorch.peek_interpreter_stack() is not None or forward_ad._current_level >= 0
+    within = within_transforms()
     return not any(traced(x) or (within and transformed(x)) for x in given)
 
 
@@ -185,7 +205,7 @@ def made_outside(make: Callable[..., Made], *seen: Tensor) -> Made:
     if torch.compiler.is_exporting():  # without the modes that would record it
         with _disable_current_modes(), torch._C.DisableTorchFunction():
             return lasting(make)(*seen)
-    if torch._C._functorch.peek_interpreter_stack() is None and forward_ad._current_level < 0:
+    if not within_transforms():
         return lasting(make)(*seen)
     found: list[Made] = []
     _Outside.apply(lambda *given: found.append(make(*given)), torch.empty(0), *seen)
@@ -332,15 +352,7 @@ def broadcast_shapes(*shapes: Sequence[int]) -> torch.Size:
     Raises:
         RuntimeError: They do not broadcast.
     """
-    if torch.compiler.is_compiling():  # sizes may be symbolic
-        return torch.broadcast_tensors(*(torch.empty((), device="meta").expand(shape) for shape in shapes))[0].shape
-    found = []
-    for sizes in zip_longest(*(reversed(shape) for shape in shapes), fillvalue=1):
-        others = {size for size in sizes if size != 1}
-        if len(others) > 1:
-            raise RuntimeError(f"shapes {[tuple(shape) for shape in shapes]} do not broadcast")
-        found.append(others.pop() if others else 1)
-    return torch.Size(reversed(found))
+    return torch.broadcast_tensors(*(torch.empty((), device="meta").expand(shape) for shape in shapes))[0].shape
 
 
 def flattened(n: int, in_dims: Sequence[int | None], tensors: Sequence[Any]) -> list[Tensor]:

@@ -16,11 +16,9 @@ from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
-from torch.utils._python_dispatch import _get_current_dispatch_mode
 
 from torch_modal import trees
-from torch_modal.autograd import one_thread, plain
+from torch_modal.autograd import has_modes_of_thread, one_thread, plain
 
 Result = TypeVar("Result")
 
@@ -72,19 +70,13 @@ def alone() -> Iterator[None]:
         _HERE.n_threads = before
 
 
-def _bound() -> bool:
-    """True under modes that belong to a thread: transforms of ``torch.func``, forward mode, dispatch modes."""
-    transforms = torch._C._functorch.peek_interpreter_stack() is not None or forward_ad._current_level >= 0
-    return transforms or _get_current_dispatch_mode() is not None
-
-
 def run(work: Sequence[Callable[[], Result]]) -> list[Result]:
     """Results of functions, in threads, as many as torch has; each has the modes of gradients and inference of here.
 
     An error is raised, and Ctrl-C ends the call, once no thread computes any more. Within such a thread, and where
     torch has one, the functions run one after another.
     """
-    if min(n_threads(), len(work)) < 2 or _bound():
+    if min(n_threads(), len(work)) < 2 or has_modes_of_thread():
         with alone():
             return [compute() for compute in work]
     recording, inference = torch.is_grad_enabled(), torch.is_inference_mode_enabled()
@@ -134,7 +126,7 @@ def by_chunks(compute: Callable[[Any], Any], samples: Any, n_vertices: int, clos
         closed: True if no other tensor has gradients. Otherwise the backward pass is torch's, on one thread.
     """
     given, tree = trees.leaves(samples), trees.skeleton(samples)
-    if not plain(*given) or _bound() or not given[0].is_cpu:
+    if not plain(*given) or has_modes_of_thread() or not given[0].is_cpu:
         return compute(samples)
     sizes, skeletons = chunk_sizes(len(given[0]), n_vertices), []
 

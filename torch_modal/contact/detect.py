@@ -11,7 +11,8 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from torch_modal.geometry.closest import closest_on_triangles
-from torch_modal.geometry.crossings import BoolArray, Crossings, FloatArray, IntArray, Surface
+from torch_modal.geometry.crossings import BoolArray, Crossings, FloatArray, IntArray
+from torch_modal.geometry.surface import Surface
 from torch_modal.geometry.triangle_pairs import dot
 
 # Lengths are parts of the diagonal.
@@ -40,7 +41,7 @@ class Search:
         self.crossings = crossings
         i, j = crossings.mesh.edges.T
         self._edge = float(np.linalg.norm(crossings.like[i] - crossings.like[j], axis=1).mean())
-        self._known = [Surface(crossings, x) for x in crossings.known]
+        self._known = [Surface(x, crossings.mesh) for x in crossings.known]
 
     def __call__(self, x: FloatArray, watched: BoolArray) -> tuple[IntArray, IntArray, int]:
         """Vertices and faces that face each other, and the number of far pairs; none where nothing intersects.
@@ -55,7 +56,7 @@ class Search:
         corners = np.zeros(len(x), dtype=bool)
         corners[crossings.mesh.faces[pairs.reshape(-1)]] = True
         before = crossings.known_inside
-        surface = Surface(crossings, x)
+        surface = Surface(x, crossings.mesh)
         winds = crossings.winds(surface, crossings.within(corners, DEEP) | (watched & before))
         inside = crossings.hanging(winds & ~before, corners)
         watched |= crossings.grown(np.flatnonzero(corners), 2) | crossings.grown(np.flatnonzero(inside))
@@ -79,16 +80,16 @@ class Search:
         crossings, corners = self.crossings, self.crossings.mesh.faces
         reach, near = REACH * crossings.diagonal, NEAR * crossings.diagonal
         some = np.flatnonzero(seeds[corners].any(1))
-        tree = cKDTree(surface.centres[some])
+        tree = cKDTree(surface.face_centres[some])
         within = inside | stuck
         parts = [np.zeros((2, 0), np.int64)]
         for chosen, radius, n in ((seeds & ~within, near + 1.5 * self._edge, _NEAREST), (within, reach, 4 * _NEAREST)):
             own, n = np.flatnonzero(chosen), min(n, len(some))
-            distance, found = tree.query(surface.x[own], n, distance_upper_bound=radius)
+            distance, found = tree.query(surface.vertices[own], n, distance_upper_bound=radius)
             there = np.isfinite(distance.reshape(-1))
             parts.append(np.stack([np.repeat(own, n)[there], some[found.reshape(-1)[there]]]))
         v, f = np.concatenate(parts, 1)
-        v, f = _kept(dot(surface.vertex_normals[v], surface.normals[f]) < FACING, v, f)
+        v, f = _kept(dot(surface.vertex_normals[v], surface.face_normals[f]) < FACING, v, f)
         v, f = _kept(~(corners[f] == v[:, None]).any(1), v, f)
         height = _heights(surface, v, f)
         keep = (height < near) & (height > -reach) & ((height > -_BEHIND * self._edge) | within[v])
@@ -122,11 +123,11 @@ class Search:
         patch[own] = connected_components(crossings.adjacency[own][:, own], directed=False)[1]
         # The patch of each face that is inside as a whole.
         of_face = np.where((patch[faces] == patch[faces[:, :1]]).all(1), patch[faces[:, 0]], -1)
-        surface = Surface(crossings, x)
+        surface = Surface(x, crossings.mesh)
         n = min(_NEAREST, len(faces))
         v: Any = np.repeat(own, n)
-        f: Any = np.asarray(cKDTree(surface.centres).query(x[own], n)[1]).reshape(-1)
-        facing = dot(surface.vertex_normals[v], surface.normals[f]) < FACING
+        f: Any = np.asarray(cKDTree(surface.face_centres).query(x[own], n)[1]).reshape(-1)
+        facing = dot(surface.vertex_normals[v], surface.face_normals[f]) < FACING
         v, f = _kept(facing & (of_face[f] != patch[v]), v, f)
         v, f = _kept(_heights(surface, v, f) < 0, v, f)
         least = np.full(len(x), np.inf)
@@ -138,12 +139,12 @@ class Search:
 
 def _heights(surface: Surface, v: IntArray, f: IntArray) -> FloatArray:
     """Heights of vertices over the planes of faces. *Shape:* ``(n,), (n,) -> (n,)``."""
-    return dot(surface.x[v] - surface.x[surface.faces[f, 0]], surface.normals[f])
+    return dot(surface.vertices[v] - surface.vertices[surface.faces[f, 0]], surface.face_normals[f])
 
 
 def _distances(surface: Surface, v: IntArray, f: IntArray) -> FloatArray:
     """Distances of vertices from faces. *Shape:* ``(n,), (n,) -> (n,)``."""
-    return closest_on_triangles(surface.x[v], surface.x[surface.faces[f]])[1]
+    return closest_on_triangles(surface.vertices[v], surface.vertices[surface.faces[f]])[1]
 
 
 def _nearest_faces(v: IntArray, f: IntArray, distance: FloatArray, height: FloatArray) -> IntArray:

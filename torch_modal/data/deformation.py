@@ -13,7 +13,7 @@ from torch_modal.data.space import ShapeSpace
 from torch_modal.data.strain import edge_strains
 from torch_modal.geometry.poisson import Reconstruction
 from torch_modal.geometry.rigid import best_fit
-from torch_modal.geometry.triangle_frames import bend, bent_sides, frames, sides
+from torch_modal.geometry.triangle_frames import bend, bent_sides, frames_of, sides
 
 # A draw beyond the bound is scaled to this fraction of it; its largest strain is nearly linear in the scale.
 _WITHIN_BOUND = 0.98
@@ -126,11 +126,9 @@ def deform(x: Tensor, displacement: Tensor, keyframe: Tensor, reconstruction: Re
     *Shape:* ``(B, V, 3), (3, B, V), (V, 3) -> (B, V, 3)``.
     """
     faces, weights = reconstruction.faces, reconstruction.areas.to(x)
-    keyframe_frames = frames(sides(keyframe.mT[:, None].contiguous(), faces))
-    turn, strain = bend(sides(displacement, faces), keyframe_frames)
+    turn, strain = bend(sides(displacement, faces), frames_of(keyframe[None], faces))
     pose = best_fit(keyframe.expand_as(x), x, weights).rotation
     turn = (pose @ turn.movedim(0, 1)).movedim(0, 1)
-    rest = x.movedim(-1, 0).contiguous()
-    wanted = bent_sides(turn, strain, frames(sides(rest, faces)))
-    bent = reconstruction(wanted, rest).movedim(0, -1)
+    wanted = bent_sides(turn, strain, frames_of(x, faces))
+    bent = reconstruction(wanted, x.movedim(-1, 0).contiguous()).movedim(0, -1)
     return best_fit(bent, x, weights).apply(bent)

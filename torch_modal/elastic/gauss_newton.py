@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from torch_modal.autograd import full_precision, untraced
-from torch_modal.elastic.minimise import AmplitudeEnergy, ridged
+from torch_modal.elastic.minimise import AmplitudeEnergy, Solution, Status, ridged
 from torch_modal.elastic.modal import Derivatives
 
 # Parts of a step that are tried side by side.
@@ -103,3 +103,43 @@ def _directions(derivatives: Derivatives, damping: float | None) -> Tensor:
     gradient = derivatives.gradient.expand(len(hessians), -1, -1)[..., None]
     direction = -torch.cholesky_solve(gradient, factor).squeeze(-1)
     return torch.where(definite[..., None], direction, torch.nan)
+
+
+def newton(
+    energy: AmplitudeEnergy,
+    a: Tensor,
+    placement: Any,
+    max_steps: int = 10,
+    tolerance: float = 3e-7,
+    stop_early: bool = True,
+) -> Solution:
+    """Minimise by :class:`GaussNewtonStep`: ten of them, as many as the paper takes.
+
+    They reach its relative decrease of 1e-10 in 6 or 7.
+
+    Args:
+        energy: The energy of the amplitudes.
+        a: Where to start. *Shape:* ``(B, n)``.
+        placement: What the energy knows of each sample.
+        max_steps: Number of steps at most.
+        tolerance: Bound on the gradient norm, relative to the one at the start.
+        stop_early: False to take all steps of all samples, without a branch that depends on data.
+    """
+    step, n_steps, start = GaussNewtonStep(energy), torch.zeros(len(a), dtype=torch.int64, device=a.device), None
+    moving = torch.ones_like(n_steps, dtype=torch.bool)
+    for _ in range(max_steps):
+        reached = step(a, placement)
+        start = reached.gradient_norm if start is None else start
+        if stop_early:
+            moving = moving & reached.moved & (reached.gradient_norm > tolerance * start)
+        a, n_steps = torch.where(moving[:, None], reached.amplitudes, a), n_steps + moving
+        if stop_early and not moving.any():
+            break
+    derivatives = energy.derivatives(a, placement, second_order=False)
+    norm, value = derivatives.gradient.norm(dim=-1), derivatives.value
+    start = norm if start is None else start
+    small = norm <= torch.maximum(tolerance * start, derivatives.floor)
+    status = torch.where(small, Status.CONVERGED, torch.where(moving, Status.OUT_OF_STEPS, Status.STALLED))
+    status = torch.where(norm.isfinite() & value.isfinite(), status, Status.INVALID)
+    relative = norm / start.clamp_min(torch.finfo(start.dtype).tiny)
+    return Solution(a, value, relative.detach(), n_steps, status)

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torch_modal import trees
 from torch_modal.autograd import applied, flattened, recorded, transposed
-from torch_modal.elastic.gauss_newton import GaussNewtonStep
+from torch_modal.elastic.gauss_newton import newton
 from torch_modal.elastic.minimise import AmplitudeEnergy, Solution, Status, minimise, ridged
 from torch_modal.threads import warn
 
@@ -146,19 +146,8 @@ def solve_unrolled(
 ) -> Solution:
     """Take exactly ``max_steps`` steps from zeros; gradients flow back through all of them.
 
-    Nothing here depends on data but what is computed: no early end. Arguments as for :func:`solve_implicit`.
+    Arguments as for :func:`solve_implicit`.
     """
-    step, a = GaussNewtonStep(energy), trees.leaves(placement)[0].new_zeros(len(usable), energy.n_amplitudes)
-    first = None
-    for _ in range(max_steps):
-        taken = step(a, placement)
-        first = taken.gradient_norm if first is None else first
-        a = taken.amplitudes
-    derivatives = energy.derivatives(a, placement, second_order=False)
-    norm = derivatives.gradient.norm(dim=-1)
-    first = norm if first is None else first
-    found = norm <= torch.maximum(tolerance * first, derivatives.floor)
-    status = torch.where(found, Status.CONVERGED, Status.OUT_OF_STEPS)
-    status = torch.where(usable & norm.isfinite(), status, Status.INVALID)
-    relative = norm / first.clamp_min(torch.finfo(first.dtype).tiny)
-    return Solution(a, derivatives.value, relative.detach(), torch.full_like(status, max_steps), status)
+    start = trees.leaves(placement)[0].new_zeros(len(usable), energy.n_amplitudes)
+    solution = newton(energy, start, placement, max_steps, tolerance, stop_early=False)
+    return solution._replace(status=torch.where(usable, solution.status, Status.INVALID))

@@ -17,7 +17,9 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 from torch_modal import extras
 from torch_modal.arrays import BoolArray, FloatArray, IntArray
 from torch_modal.geometry.connectivity import Connectivity
-from torch_modal.geometry.triangle_pairs import cross, dot, triangles_cross
+from torch_modal.geometry.inspect import signed_volume
+from torch_modal.geometry.surface import Surface
+from torch_modal.geometry.triangle_pairs import dot, triangles_cross
 
 RINGS = 2
 """Pairs within so many rings of a crossing of a key-frame belong to it: it grows and shrinks with every rounding."""
@@ -114,7 +116,7 @@ class Crossings:
         for x, pairs in zip(self.known, self.pairs_of_known, strict=True):
             # One closed piece that does not cross itself has nothing inside.
             if len(pairs) or not one_piece:
-                inside |= self.winds(Surface(self, x), np.ones(len(x), dtype=bool))
+                inside |= self.winds(Surface(x, self.mesh), np.ones(len(x), dtype=bool))
         return inside
 
     # ----------------------------------------------------------------------------------------------------- of one shape
@@ -149,10 +151,10 @@ class Crossings:
 
     def reach(self, x: FloatArray, pairs: IntArray) -> float:
         """Largest reach of triangles of given pairs through each other, along a normal. *Shape:* ``(P, 2)``."""
-        surface, least = Surface(self, x), np.full(len(pairs), np.inf)
+        surface, least = Surface(x, self.mesh), np.full(len(pairs), np.inf)
         for own, other in (pairs.T, pairs.T[::-1]):
             arms = x[self.mesh.faces[own]] - x[self.mesh.faces[other, :1]]
-            height = dot(arms, surface.normals[other][:, None])
+            height = dot(arms, surface.face_normals[other][:, None])
             least = np.minimum(least, np.minimum(height.max(1), -height.min(1)))
         return float(least.max(initial=0.0))
 
@@ -208,20 +210,20 @@ class Crossings:
         """
         corners = np.zeros(self.mesh.n_vertices, dtype=bool)
         corners[self.mesh.faces[pairs.reshape(-1)]] = True
-        inside = self.winds(Surface(self, x), np.ones(len(x), dtype=bool) if len(pairs) else corners)
+        inside = self.winds(Surface(x, self.mesh), np.ones(len(x), dtype=bool) if len(pairs) else corners)
         return self.hanging(inside & ~self.known_inside if len(self.known) else inside, corners)
 
-    def winds(self, surface: "Surface", asked: BoolArray) -> BoolArray:
+    def winds(self, surface: Surface, asked: BoolArray) -> BoolArray:
         """Around which of some vertices a shape winds: around a point just outside. *Shape:* ``(V,) -> (V,)``."""
         own, inside = np.flatnonzero(asked), np.zeros(len(asked), dtype=bool)
         if len(own):
-            x, faces = surface.x, self.mesh.faces
+            x, faces = surface.vertices, self.mesh.faces
             points = x[own] + _OFFSET * self.diagonal * surface.vertex_normals[own]
             # About 1 inside, about 0 outside.
             igl = extras.require("igl", "contact", "contact")
             number = igl.fast_winding_number(*(np.ascontiguousarray(a) for a in (x, faces, points)))
-            turned = (surface.doubled * (surface.centres - x.mean(0))).sum() < 0  # a surface that is inside out
-            inside[own] = (-number if turned else number) > 0.5
+            is_inside_out = signed_volume(x - x.mean(0), faces) < 0
+            inside[own] = (-number if is_inside_out else number) > 0.5
         return inside
 
     def hanging(self, vertices: BoolArray, seeds: BoolArray) -> BoolArray:
@@ -239,34 +241,6 @@ class Crossings:
         for _ in range(rings):
             chosen |= self.adjacency @ chosen.astype(np.float64) > 0
         return chosen
-
-
-class Surface:
-    """A shape, with its normals. *Shape:* ``(V, 3)``."""
-
-    def __init__(self, crossings: Crossings, x: FloatArray) -> None:
-        self.x, self.faces, self._incidence = x, crossings.mesh.faces, crossings.incidence
-        a, b, c = x[self.faces.T]
-        #: Of the faces. *Shape:* ``(F, 3)``.
-        self.centres = (a + b + c) / 3
-        #: Normals of the faces, times twice their areas. *Shape:* ``(F, 3)``.
-        self.doubled = cross(b - a, c - a)
-
-    @cached_property
-    def normals(self) -> FloatArray:
-        """Normals of the faces. *Shape:* ``(F, 3)``."""
-        return _unit(self.doubled)
-
-    @cached_property
-    def vertex_normals(self) -> FloatArray:
-        """*Shape:* ``(V, 3)``."""
-        return _unit(self._incidence @ self.doubled)
-
-
-def _unit(vectors: FloatArray) -> FloatArray:
-    """Vectors of length one, or zero. *Shape:* ``(n, 3)``."""
-    length = np.sqrt(dot(vectors, vectors))[:, None]
-    return vectors / np.where(length > 0, length, 1)  # type: ignore[no-any-return]
 
 
 def _ones(matrix: Any) -> sparse.csr_matrix:

@@ -149,13 +149,20 @@ class Reconstruction(nn.Module):
         """Vertices of each piece except the largest, and vertices of the largest that it follows."""
         return [(getattr(self, f"piece_{i}"), getattr(self, f"anchors_{i}")) for i in range(self.n_loose)]
 
+    def fit(self, wanted: Sides, near: Tensor) -> Tensor:
+        """The linear part of :meth:`forward`: all pieces have the centres that they have in a shape nearby.
+
+        *Shape:* ``(3, B, F), (B, V, 3) -> (B, V, 3)``.
+        """
+        edges = edge_means(wanted, self.weights.to(near), self.sides, self.signs.to(near), len(self.edges))
+        return self.poisson(self.poisson.pulls(edges), near)
+
     def forward(self, wanted: Sides, rest: Tensor) -> Tensor:
         """The shape of target sides with the centroid of ``rest``. Unreferenced vertices do not move.
 
         The initial shape, ``rest``, determines the positions of loose pieces. *Shape:* ``(3, B, V) -> (3, B, V)``.
         """
-        edges = edge_means(wanted, self.weights.to(rest), self.sides, self.signs.to(rest), len(self.edges))
-        out = placed = self.poisson(self.poisson.pulls(edges), rest.movedim(0, -1)).movedim(-1, 0)
+        out = placed = self.fit(wanted, rest.movedim(0, -1)).movedim(-1, 0)
         for piece, anchors in self.loose:
             before, after = (x[..., anchors].movedim(0, -1) for x in (rest, placed))
             motion = best_fit(before, after)

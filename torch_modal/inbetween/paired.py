@@ -7,8 +7,6 @@ import torch
 from torch import Tensor, nn
 
 from torch_modal.elastic.energy import RestShapes
-from torch_modal.elastic.gauss_newton import GaussNewtonStep
-from torch_modal.elastic.minimise import AmplitudeEnergy, Solution, Status
 from torch_modal.elastic.modal import Derivatives, Placement
 from torch_modal.inbetween.joint import JointSpace
 
@@ -125,28 +123,3 @@ def _block_diagonal(first: Any, second: Any) -> Tensor:
     """*Shape:* ``(B, m, m), (B, n, n) -> (B, m + n, m + n)``."""
     m, n = first.shape[-1], second.shape[-1]
     return torch.cat([nn.functional.pad(first, (0, n)), nn.functional.pad(second, (m, 0))], -2)
-
-
-def newton(
-    energy: AmplitudeEnergy, a: Tensor, placement: Any, max_steps: int = 10, tolerance: float = 3e-7
-) -> Solution:
-    """Minimise by :class:`~torch_modal.elastic.gauss_newton.GaussNewtonStep`: ten of them, as many as the paper takes.
-
-    They reach its relative decrease of 1e-10 in 6 or 7. Arguments as for :func:`torch_modal.elastic.minimise.minimise`.
-    """
-    step, n_steps, start = GaussNewtonStep(energy), torch.zeros(len(a), dtype=torch.int64, device=a.device), None
-    moving = torch.ones_like(n_steps, dtype=torch.bool)
-    for _ in range(max_steps):
-        taken = step(a, placement)
-        start = taken.gradient_norm if start is None else start
-        moving = moving & taken.moved & (taken.gradient_norm > tolerance * start)
-        a, n_steps = torch.where(moving[:, None], taken.amplitudes, a), n_steps + moving
-        if not moving.any():
-            break
-    found = energy.derivatives(a, placement, second_order=False)
-    norm, value = found.gradient.norm(dim=-1), found.value
-    start = norm if start is None else start
-    small = norm <= torch.maximum(tolerance * start, found.floor)
-    status = torch.where(small, Status.CONVERGED, torch.where(moving, Status.OUT_OF_STEPS, Status.STALLED))
-    status = torch.where(norm.isfinite() & value.isfinite(), status, Status.INVALID)
-    return Solution(a, value, norm / start.clamp_min(torch.finfo(start.dtype).tiny), n_steps, status)

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torch_modal.autograd import plain
 from torch_modal.elastic.backend import TorchBackend, choose
 from torch_modal.elastic.energy import Energy, RestShapes
+from torch_modal.elastic.gauss_newton import newton
 from torch_modal.elastic.implicit import solve_implicit, solve_unrolled
 from torch_modal.elastic.minimise import Solution, Status
 from torch_modal.elastic.shell import N_SHELL_TERMS
@@ -19,7 +20,7 @@ from torch_modal.inbetween.blend import RotationBlend
 from torch_modal.inbetween.coarse import CoarseMesh
 from torch_modal.inbetween.comparison import SLACK, no_worse
 from torch_modal.inbetween.joint import JointSpace
-from torch_modal.inbetween.paired import PairedSpace, newton
+from torch_modal.inbetween.paired import PairedSpace
 from torch_modal.inbetween.regions import LocalInterpolation, worst_regions
 from torch_modal.inbetween.results import InBetweenResult, Samples, unminimised
 from torch_modal.inbetween.settings import Objective, Solver

@@ -17,7 +17,7 @@ from torch_modal.elastic.backend import TorchBackend
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.local_rotations import Trajectory
 from torch_modal.geometry.rotations import exp
-from torch_modal.geometry.triangle_frames import Frames, bend, frames, sides
+from torch_modal.geometry.triangle_frames import Frames, bend, frames_of, sides
 from torch_modal.keyframes.arrays import broadcast_leading, check_tensor
 from torch_modal.keyframes.check import checked_arrays
 from torch_modal.motion.cubics import evaluate_by_interval
@@ -195,7 +195,7 @@ def scaled(modes: Tensor, size: Tensor | float) -> Tensor:
 
 def bending_columns(reference: Tensor, faces: Tensor, displaced: Tensor) -> Tensor:
     """Turns and strains of the triangles by displacements. *Shape:* ``(V, 3), (F, 3), (k, V, 3) -> (k, 6, F)``."""
-    rest = frames(sides(reference.T[:, None].contiguous(), faces))
+    rest = frames_of(reference[None], faces)
     turn, strain = bend(sides(displaced.movedim(-1, 0).contiguous(), faces), rest)
     return _limit_slivers(torch.cat([rest.coordinates(turn), strain]), rest)
 

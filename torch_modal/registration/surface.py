@@ -10,9 +10,9 @@ from scipy.spatial import cKDTree
 from torch_modal import extras
 from torch_modal.arrays import BoolArray, FloatArray, IntArray
 from torch_modal.geometry.closest import closest_on_triangles, dot
-from torch_modal.geometry.connectivity import Connectivity, vertex_areas
+from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.inspect import signed_volume
-from torch_modal.geometry.vectors import vertex_normals
+from torch_modal.geometry.surface import Surface
 
 LEAN = 0.01
 """Weight of normals relative to positions, in diagonals; distinguishes sheets closer than twice this distance."""
@@ -39,52 +39,12 @@ def places_between(corners: IntArray, barycentric: FloatArray, n_vertices: int) 
     return sparse.csr_matrix((barycentric.reshape(-1), where), shape=(n, n_vertices))
 
 
-class MeshSurface:
-    """A triangle mesh with cached derived quantities. *Shape:* ``(V, 3)``, and ``(F, 3)`` or a connectivity."""
-
-    def __init__(self, vertices: FloatArray, faces: IntArray | Connectivity) -> None:
-        self.vertices = np.ascontiguousarray(vertices, dtype=np.float64)
-        self.connectivity = faces if isinstance(faces, Connectivity) else Connectivity(faces, len(self.vertices))
-        self.faces, self.edges = self.connectivity.faces, self.connectivity.edges
+class MeshSurface(Surface):
+    """A triangle mesh with closest-point queries. *Shape:* ``(V, 3)``, and ``(F, 3)`` or a connectivity."""
 
     def moved(self, vertices: FloatArray) -> "MeshSurface":
         """Surface of the same connectivity with other positions."""
         return MeshSurface(vertices, self.connectivity)
-
-    @cached_property
-    def _area_vectors(self) -> FloatArray:
-        a, b, c = (self.vertices[corner] for corner in self.faces.T)
-        return 0.5 * np.cross(b - a, c - a)
-
-    @cached_property
-    def face_areas(self) -> FloatArray:
-        """*Shape:* ``(F,)``."""
-        return np.linalg.norm(self._area_vectors, axis=1)
-
-    @cached_property
-    def face_normals(self) -> FloatArray:
-        """Unit vectors; zero where a face has no area. *Shape:* ``(F, 3)``."""
-        return self._area_vectors / np.where(self.face_areas > 0, self.face_areas, 1)[:, None]
-
-    @cached_property
-    def vertex_normals(self) -> FloatArray:
-        """Area-weighted means of the normals of incident faces. *Shape:* ``(V, 3)``."""
-        return vertex_normals(self.vertices, self.faces)
-
-    @cached_property
-    def vertex_areas(self) -> FloatArray:
-        """A third of the area of incident faces. *Shape:* ``(V,)``."""
-        return vertex_areas(self.vertices, self.faces)
-
-    @property
-    def area(self) -> float:
-        """Total area."""
-        return float(self.face_areas.sum())
-
-    @property
-    def diagonal(self) -> float:
-        """Diagonal of the bounding box."""
-        return float(np.linalg.norm(np.ptp(self.vertices, axis=0)))
 
     @cached_property
     def on_boundary(self) -> BoolArray:

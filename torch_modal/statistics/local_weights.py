@@ -11,7 +11,7 @@ from torch import Tensor
 from torch_modal.autograd import recorded
 from torch_modal.elastic.steps import conjugate_gradients
 from torch_modal.geometry.rigid import RigidMotion, best_fit, centroid, infinitesimal_motions
-from torch_modal.geometry.triangle_frames import edge_means
+from torch_modal.statistics.fitting import levenberg_marquardt
 from torch_modal.statistics.variation import Variation
 
 # Standard deviation, in sizes of the shape, of exact points from shapes of local weights, which have one of one: no
@@ -171,9 +171,7 @@ class LocalWeights:
             parts[:, anchors] += parts[:, piece].sum(1, keepdim=True) / len(anchors)
         first, second = (parts.new_zeros(1, n, len(variation.faces)).requires_grad_() for _ in range(2))
         with torch.enable_grad():
-            weights, signs = reconstruction.weights, reconstruction.signs
-            edges = edge_means((first, second), weights, reconstruction.sides, signs, len(reconstruction.edges))
-            response = reconstruction.poisson(reconstruction.poisson.pulls(edges), parts.new_zeros(n, v, 1))
+            response = reconstruction.fit((first, second), parts.new_zeros(n, v, 1))
             of_first, of_second = torch.autograd.grad((response[..., 0] * parts).sum(), (first, second))
         return of_first[0], of_second[0]
 
