@@ -51,12 +51,12 @@ def transformed(x: Tensor) -> bool:
     return forward_ad._current_level >= 0 and forward_ad.unpack_dual(x).tangent is not None  # the first alone is fast
 
 
-def plain(*given: Tensor) -> bool:
+def plain(*tensors: Tensor) -> bool:
     """True for tensors that all have numbers, which are all that there is to them: neither traced nor transformed."""
     if torch.compiler.is_compiling():
         return False
     within = within_transforms()
-    return not any(traced(x) or (within and transformed(x)) for x in given)
+    return not any(traced(x) or (within and transformed(x)) for x in tensors)
 
 
 def mapped(x: Tensor) -> bool:
@@ -67,7 +67,7 @@ def mapped(x: Tensor) -> bool:
 
 def in_use(index: Tensor, n: int) -> list[int]:
     """The numbers of an index; those that it may have, up to ``n``, where it has no data."""
-    return list(range(n)) if traced(index) else made_outside(lambda own: own.unique().tolist(), index)
+    return list(range(n)) if traced(index) else made_outside(lambda index_values: index_values.unique().tolist(), index)
 
 
 def require_numbers(layer: str, x: Tensor) -> None:
@@ -85,9 +85,9 @@ def require_numbers(layer: str, x: Tensor) -> None:
     )
 
 
-def recorded(*given: Tensor) -> bool:
+def recorded(*tensors: Tensor) -> bool:
     """True where a backward pass is itself differentiated, which kernels cannot be."""
-    return torch.is_grad_enabled() or any(map(transformed, given))
+    return torch.is_grad_enabled() or any(map(transformed, tensors))
 
 
 def lasting(make: Callable[Given, Made]) -> Callable[Given, Made]:
@@ -115,8 +115,8 @@ def full_precision(compute: Callable[Given, Made]) -> Callable[Given, Made]:
 
     @wraps(compute)
     def run(*args: "Given.args", **kwargs: "Given.kwargs") -> Made:
-        given = trees.leaves((*args, *kwargs.values()))
-        device = given[0].device.type if given and not given[0].is_meta else "cpu"  # "meta" has no autocast
+        tensors = trees.leaves((*args, *kwargs.values()))
+        device = tensors[0].device.type if tensors and not tensors[0].is_meta else "cpu"  # "meta" has no autocast
         if torch.is_autocast_enabled(device):  # no region else: exported programs cannot be saved with one
             with torch.autocast(device, enabled=False):
                 return run(*args, **kwargs)
@@ -141,8 +141,8 @@ def untraced(compute: Callable[Given, Made]) -> Callable[Given, Made]:
             return torch.compiler.disable(compute)(*args, **kwargs)  # type: ignore[no-any-return]
         return compute(*args, **kwargs)
 
-    own = run.__code__.replace(co_name=compute.__name__)  # type: ignore[attr-defined]
-    run.__code__ = own  # type: ignore[attr-defined]  # Dynamo limits how often one code is compiled
+    code = run.__code__.replace(co_name=compute.__name__)  # type: ignore[attr-defined]
+    run.__code__ = code  # type: ignore[attr-defined]  # Dynamo limits how often one code is compiled
     return run
 
 
@@ -207,9 +207,9 @@ def made_outside(make: Callable[..., Made], *seen: Tensor) -> Made:
             return lasting(make)(*seen)
     if not within_transforms():
         return lasting(make)(*seen)
-    found: list[Made] = []
-    _Outside.apply(lambda *given: found.append(make(*given)), torch.empty(0), *seen)
-    return found[0]
+    made: list[Made] = []
+    _Outside.apply(lambda *arguments: made.append(make(*arguments)), torch.empty(0), *seen)
+    return made[0]
 
 
 class _Outside(torch.autograd.Function):
@@ -272,18 +272,18 @@ class _Once(torch.autograd.Function):
         message, order = ctx.given
         if not order:
             raise RuntimeError(message)
-        found: Tensor = _Once.apply(derivative, message, order - 1)
-        return found
+        result: Tensor = _Once.apply(derivative, message, order - 1)
+        return result
 
 
-def applied(function: Any, *given: Any) -> Any:
+def applied(function: Any, *arguments: Any) -> Any:
     """``function.apply`` of a :class:`torch.autograd.Function` with ``setup_context``.
 
     Without recording it calls ``forward`` directly: torch inspects the signature at every call, which takes as long as
     a small kernel.
     """
-    alone = not torch.is_grad_enabled() and plain(*(value for value in given if isinstance(value, Tensor)))
-    return function.forward(*given) if alone else function.apply(*given)
+    alone = not torch.is_grad_enabled() and plain(*(value for value in arguments if isinstance(value, Tensor)))
+    return function.forward(*arguments) if alone else function.apply(*arguments)
 
 
 class _LinearMap(torch.autograd.Function):
@@ -313,25 +313,25 @@ class _LinearMap(torch.autograd.Function):
 linear_map: Callable[[Linear, Linear, Tensor], Tensor] = partial(applied, _LinearMap)
 
 
-def pushed(function: Callable[..., Any], given: Sequence[Tensor], tangents: Sequence[Tensor | None]) -> Any:
+def pushed(function: Callable[..., Any], inputs: Sequence[Tensor], tangents: Sequence[Tensor | None]) -> Any:
     """The Jacobian of a function times tangents, None for zero, as the transpose of its gradient.
 
     Within ``torch.autograd.forward_ad``, torch has no other forward mode, but reverse mode.
     """
-    found, back = torch.func.vjp(function, *given)[:2]
-    zeros = torch.zeros_like(found) if isinstance(found, Tensor) else tuple(map(torch.zeros_like, found))
-    return transposed(back, zeros, given, tangents)
+    output, back = torch.func.vjp(function, *inputs)[:2]
+    zeros = torch.zeros_like(output) if isinstance(output, Tensor) else tuple(map(torch.zeros_like, output))
+    return transposed(back, zeros, inputs, tangents)
 
 
 def transposed(
-    linear: Callable[..., Sequence[Tensor]], zeros: Any, given: Sequence[Tensor], tangents: Sequence[Tensor | None]
+    linear: Callable[..., Sequence[Tensor]], zeros: Any, inputs: Sequence[Tensor], tangents: Sequence[Tensor | None]
 ) -> Any:
     """The transpose of a linear function, times tangents of what it gives, None for zero.
 
     Args:
         linear: The function.
         zeros: What it takes.
-        given: What it gives has these shapes.
+        inputs: What it gives has these shapes.
         tangents: One of each.
 
     Raises:
@@ -342,7 +342,7 @@ def transposed(
             "forward mode within forward mode: torch would leave out a part of the second derivative here; take jvp or "
             "jacfwd of grad, vjp or jacrev"
         )
-    known = (torch.zeros_like(x) if own is None else own for x, own in zip(given, tangents, strict=True))
+    known = (torch.zeros_like(x) if tangent is None else tangent for x, tangent in zip(inputs, tangents, strict=True))
     return torch.func.vjp(lambda to: tuple(linear(to)), zeros)[1](tuple(known))[0]
 
 
@@ -356,7 +356,7 @@ def broadcast_shapes(*shapes: Sequence[int]) -> torch.Size:
 
 
 def flattened(n: int, in_dims: Sequence[int | None], tensors: Sequence[Any]) -> list[Tensor]:
-    """Tensors under ``vmap`` as those of one larger batch: the mapped dimension joins the first."""
+    """Tensors under ``vmap`` as one larger batch: the mapped dimension is merged with the first."""
     flat = []
     for tensor, dim in zip(tensors, in_dims, strict=True):
         batched = tensor.expand(n, *tensor.shape) if dim is None else tensor.movedim(dim, 0)

@@ -54,7 +54,7 @@ if hasattr(os, "register_at_fork"):
 
 
 def n_threads() -> int:
-    """Number of threads for :func:`run`: those of torch."""
+    """Number of threads for :func:`run`, which is torch's."""
     return _HERE.n_threads or torch.get_num_threads()
 
 
@@ -96,10 +96,10 @@ def run(work: Sequence[Callable[[], Result]]) -> list[Result]:
         for future in futures:
             future.cancel()
         wait(futures)
-    found, warned = zip(*(future.result() for future in futures), strict=True)
+    results, warned = zip(*(future.result() for future in futures), strict=True)
     for key in dict.fromkeys(key for each in warned for key in each):
         warn(key[0], sum(each.get(key, 0) for each in warned), key[1])
-    return list(found)
+    return list(results)
 
 
 def chunk_sizes(n: int, n_vertices: int) -> list[int]:
@@ -125,78 +125,78 @@ def by_chunks(compute: Callable[[Any], Any], samples: Any, n_vertices: int, clos
         n_vertices: Number of vertices of a sample.
         closed: True if no other tensor has gradients. Otherwise the backward pass is torch's, on one thread.
     """
-    given, tree = trees.leaves(samples), trees.skeleton(samples)
-    if not plain(*given) or has_modes_of_thread() or not given[0].is_cpu:
+    tensors, tree = trees.leaves(samples), trees.skeleton(samples)
+    if not plain(*tensors) or has_modes_of_thread() or not tensors[0].is_cpu:
         return compute(samples)
-    sizes, skeletons = chunk_sizes(len(given[0]), n_vertices), []
+    sizes, skeletons = chunk_sizes(len(tensors[0]), n_vertices), []
 
-    def result(part: Sequence[Tensor]) -> list[Tensor]:
-        found = compute(trees.filled(tree, part))
-        skeletons.append(trees.skeleton(found))
-        return trees.leaves(found)
+    def result(chunk: Sequence[Tensor]) -> list[Tensor]:
+        output = compute(trees.filled(tree, chunk))
+        skeletons.append(trees.skeleton(output))
+        return trees.leaves(output)
 
-    def results(*given: Tensor) -> list[tuple[Sequence[Tensor], list[Tensor]]]:
-        parts = list(zip(*(x.split(sizes) for x in given), strict=True))  # views
-        return list(zip(parts, run([partial(result, part) for part in parts]), strict=True))
+    def results(*tensors: Tensor) -> list[tuple[Sequence[Tensor], list[Tensor]]]:
+        parts = list(zip(*(x.split(sizes) for x in tensors), strict=True))  # views
+        return list(zip(parts, run([partial(result, chunk) for chunk in parts]), strict=True))
 
     with alone():
-        recording = closed and torch.is_grad_enabled() and any(x.requires_grad for x in given)
+        recording = closed and torch.is_grad_enabled() and any(x.requires_grad for x in tensors)
         if len(sizes) == 1 and not recording:
             return compute(samples)
         if recording:
-            found = _Chunks.apply(results, sizes, *given)
+            output = _Chunks.apply(results, sizes, *tensors)
         else:
-            found = [_joined(each) for each in zip(*(own for _, own in results(*given)), strict=True)]
-    return trees.filled(skeletons[0], found)
+            output = [_join(each) for each in zip(*(outputs for _, outputs in results(*tensors)), strict=True)]
+    return trees.filled(skeletons[0], output)
 
 
 class _Chunks(torch.autograd.Function):
     """Each chunk has a graph of its own, from views of what is given: second derivatives go on into that."""
 
     @staticmethod
-    def forward(ctx: Any, results: Callable[..., Any], sizes: list[int], *given: Tensor) -> tuple[Tensor, ...]:
+    def forward(ctx: Any, results: Callable[..., Any], sizes: list[int], *tensors: Tensor) -> tuple[Tensor, ...]:
         ctx.set_materialize_grads(False)
         ctx.results, ctx.sizes = torch.enable_grad()(results), sizes
         holder: Any = torch.empty(0)
         # Kept by a tensor that is saved, graphs are freed as soon as torch frees what is saved.
-        holder.graphs = graphs = ctx.results(*given)
-        ctx.save_for_backward(holder, *given)
+        holder.graphs = graphs = ctx.results(*tensors)
+        ctx.save_for_backward(holder, *tensors)
         each = list(zip(*(results for _, results in graphs), strict=True))
-        found = [_joined([x.detach() for x in parts]) for parts in each]
+        joined = [_join([x.detach() for x in parts]) for parts in each]
         constant = [not any(x.requires_grad for x in parts) for parts in each]
-        ctx.mark_non_differentiable(*(x for x, alone in zip(found, constant, strict=True) if alone))
-        return tuple(found)
+        ctx.mark_non_differentiable(*(x for x, alone in zip(joined, constant, strict=True) if alone))
+        return tuple(joined)
 
     @staticmethod
     @alone()
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
-        (holder, *given), sizes, needed = ctx.saved_tensors, ctx.sizes, ctx.needs_input_grad[2:]
+        (holder, *saved), sizes, needed = ctx.saved_tensors, ctx.sizes, ctx.needs_input_grad[2:]
         graphs, again = getattr(holder, "graphs", None), torch.is_grad_enabled()
         # Second derivatives end the graph that they go through. A hook may have replaced what is saved.
         if again or graphs is None:
-            graphs = ctx.results(*given)
+            graphs = ctx.results(*saved)
 
         def gradients(i: int) -> Sequence[Tensor | None]:
-            part, results = graphs[i]
-            to = [x for x, need in zip(part, needed, strict=True) if need]
+            inputs, results = graphs[i]
+            to = [x for x, need in zip(inputs, needed, strict=True) if need]
             pairs = [(y, x.split(sizes)[i]) for y, x in zip(results, grads, strict=True) if x is not None]
             pairs = [(y, x) for y, x in pairs if y.requires_grad]
             if not pairs:
                 return [None] * len(to)
-            outputs, own = zip(*pairs, strict=True)
-            return torch.autograd.grad(outputs, to, own, retain_graph=True, create_graph=again, allow_unused=True)
+            outputs, slopes = zip(*pairs, strict=True)
+            return torch.autograd.grad(outputs, to, slopes, retain_graph=True, create_graph=again, allow_unused=True)
 
         each = zip(*run([partial(gradients, i) for i in range(len(sizes))]), strict=True)
-        found = (_gradient(x.split(sizes), next(each)) if need else None for x, need in zip(given, needed, strict=True))
-        return None, None, *found
+        sums = (_gradient(x.split(sizes), next(each)) if need else None for x, need in zip(saved, needed, strict=True))
+        return None, None, *sums
 
 
-def _gradient(given: Sequence[Tensor], parts: Sequence[Tensor | None]) -> Tensor | None:
+def _gradient(tensors: Sequence[Tensor], parts: Sequence[Tensor | None]) -> Tensor | None:
     """Gradients of chunks as one; None if no chunk has one."""
     if all(own is None for own in parts):
         return None
-    return _joined([torch.zeros_like(x) if own is None else own for x, own in zip(given, parts, strict=True)])
+    return _join([torch.zeros_like(x) if own is None else own for x, own in zip(tensors, parts, strict=True)])
 
 
-def _joined(parts: Sequence[Tensor]) -> Tensor:
+def _join(parts: Sequence[Tensor]) -> Tensor:
     return parts[0] if len(parts) == 1 else torch.cat(list(parts))

@@ -13,7 +13,7 @@ def leaves(tree: Any) -> list[Tensor]:
     """The tensors, in order."""
     if isinstance(tree, Tensor):
         return [tree]
-    return [tensor for part in tree for tensor in leaves(part)] if isinstance(tree, (tuple, list)) else []
+    return [tensor for branch in tree for tensor in leaves(branch)] if isinstance(tree, (tuple, list)) else []
 
 
 def mapped(tree: Any, function: Callable[[Any], Any]) -> Any:
@@ -21,7 +21,7 @@ def mapped(tree: Any, function: Callable[[Any], Any]) -> Any:
     if isinstance(tree, (Tensor, str)):
         return function(tree)
     if isinstance(tree, (tuple, list)):
-        parts = [mapped(part, function) for part in tree]
+        parts = [mapped(branch, function) for branch in tree]
         return type(tree)(*parts) if hasattr(tree, "_fields") else type(tree)(parts)
     return tree
 

@@ -93,7 +93,7 @@ def full_space(
     rests = [energy.rest(energy.extend(y.T[:, None].contiguous())) for y in (first, aligned)]
     stiffness = [500.0, 10.0, 1000.0]
     both = Rest(*(tuple(torch.stack(each, -2) for each in zip(*own, strict=True)) for own in zip(*rests, strict=True)))
-    reference = energy.merged(both, torch.stack([1 - at_t, at_t], -1), stiffness)
+    reference = energy.merge_rests(both, torch.stack([1 - at_t, at_t], -1), stiffness)
     if example_based:
         reference = energy.against(_interpolated(energy, rests[0], rests[1], t), stiffness)
     fixed = torch.zeros(len(first), dtype=torch.bool) if fixed is None else fixed

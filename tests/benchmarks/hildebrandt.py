@@ -15,8 +15,8 @@ from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.local_rotations import LocalRotations
 from torch_modal.geometry.poisson import Reconstruction
 from torch_modal.geometry.rigid import best_fit
-from torch_modal.geometry.rotations import turned
-from torch_modal.geometry.triangle_frames import bend, bending_between, edge_means, frames_of, sides, stretched
+from torch_modal.geometry.rotations import rotate_by
+from torch_modal.geometry.triangle_frames import bend, bending_between, edge_means, frames_of, sides, stretch
 from torch_modal.geometry.vectors import cross
 
 N_MODES = 50
@@ -53,7 +53,7 @@ class WarpedModes:
         own, turns = self.own, self.rotations.turns(self.basis.reference.expand_as(shapes), shapes)
         turn, strain = bending_between(own, frames_of(shapes, self.faces), turns)
         moved = []
-        for (x, y), rest in zip(stretched(strain, *own[3:]), self.sides, strict=True):
+        for (x, y), rest in zip(stretch(strain, *own[3:]), self.sides, strict=True):
             moved.append(own.world(x, y) - rest + cross(turn, rest.expand_as(turn)))
         r = self.reconstruction
         edges = edge_means((moved[0], moved[1]), r.weights, r.sides, r.signs.to(turn), len(r.edges))
@@ -65,7 +65,7 @@ class WarpedModes:
         displaced = sides(moved, self.faces)
         turn, _ = bend(displaced, self.own)
         pairs = zip(self.sides, displaced, strict=True)
-        first, second = (turned(turn, rest + u - cross(turn, rest.expand_as(u))) for rest, u in pairs)
+        first, second = (rotate_by(turn, rest + u - cross(turn, rest.expand_as(u))) for rest, u in pairs)
         return self.reconstruction((first, second), moved + self.basis.reference.T[:, None]).movedim(0, -1)
 
 

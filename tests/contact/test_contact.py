@@ -19,7 +19,7 @@ from torch_modal.contact import in_between as contact_layer
 from torch_modal.contact import modal, separate
 from torch_modal.contact.acceleration import AccelerationLimit
 from torch_modal.contact.active import ContactEnergy, Contacts, ContactSearch, Pull
-from torch_modal.contact.separate import Timeline, through
+from torch_modal.contact.separate import Timeline, spline_weights
 from torch_modal.data.samples import load_sample
 from torch_modal.elastic.energy import RestShapes
 from torch_modal.elastic.term import Mesh
@@ -81,9 +81,9 @@ def test_energies_have_the_derivatives_of_their_values(kind: str, generator: tor
     if kind == "pull":
         torch.testing.assert_close(at.product(field), full)
     else:  # Gauss-Newton's: along the gradient of each height
-        missing, heights = energy.missing(x)
+        shortfall, heights = energy.shortfall(x)
         rate = (field.view(-1, 3).T[:, energy.corners] * heights.transpose(0, 1)).sum((0, 1))
-        curvature = (2 * energy.weights * (missing < 0) * rate**2).sum()
+        curvature = (2 * energy.weights * (shortfall < 0) * rate**2).sum()
         torch.testing.assert_close((at.product(field) * field).sum(), curvature)
     unit = torch.zeros_like(x)
     unit[0, 5, 0] = 1
@@ -437,13 +437,13 @@ def test_kernels_and_torch_step_alike(hand: Shapes) -> None:
 # ---------------------------------------------------------------------------------------------------------- trajectory
 def test_values_in_time_lie_on_a_curve_through_them() -> None:
     times = torch.tensor([0.2, 0.5, 0.6, 0.9], dtype=DOUBLE)
-    torch.testing.assert_close(through(times, times), torch.eye(4, dtype=DOUBLE))
-    assert float(through(times, torch.tensor([0.0, 1.0], dtype=DOUBLE)).abs().max()) < 1e-15
+    torch.testing.assert_close(spline_weights(times, times), torch.eye(4, dtype=DOUBLE))
+    assert float(spline_weights(times, torch.tensor([0.0, 1.0], dtype=DOUBLE)).abs().max()) < 1e-15
     t = torch.linspace(0, 1, 1001, dtype=DOUBLE)
-    line = through(times, t) @ torch.sin(torch.pi * times)
+    line = spline_weights(times, t) @ torch.sin(torch.pi * times)
     torch.testing.assert_close(line, torch.sin(torch.pi * t), rtol=0, atol=0.02)
     at = torch.tensor([0.3], dtype=DOUBLE, requires_grad=True)
-    (slope,) = torch.autograd.grad(through(times, at) @ torch.sin(torch.pi * times), at)
+    (slope,) = torch.autograd.grad(spline_weights(times, at) @ torch.sin(torch.pi * times), at)
     assert float(slope) == pytest.approx(float((line[301] - line[299]) * 500), rel=1e-4)
 
 
@@ -532,13 +532,13 @@ def test_shapes_beside_keyframes_that_intersect_themselves_all_take_steps() -> N
     for pairs, some in (([], [1]), ([(0, 1)], range(1, 8))):
         search: Any = SimpleNamespace(search=SimpleNamespace(crossings=SimpleNamespace(known_pairs=pairs)))
         wanted = {*range(4, 64, 4), *some, *(64 - i for i in some)}
-        assert separate._chosen(t, search).tolist() == [i - 1 for i in sorted(wanted)]
+        assert separate._choose_shapes(t, search).tolist() == [i - 1 for i in sorted(wanted)]
 
 
 def test_neighbours_in_time_are_watched_on_either_side(hand: Shapes) -> None:
     search = ContactSearch(Mesh.of(hand.faces, 3782), hand.keyframes, torch.ones(3782), 9)
     search.watch(Contacts(torch.tensor([4]), hand.faces[:1, [0, 1, 2, 0]]), 2)
-    rings = search.search.crossings.grown(hand.faces[0].numpy(), 2)
+    rings = search.search.crossings.grow(hand.faces[0].numpy(), 2)
     assert 3 < rings.sum() < 100
     assert [bool((row == rings).all()) for row in search.watched] == [2 <= i <= 6 for i in range(9)]
 
@@ -549,7 +549,7 @@ def test_the_first_displacement_is_smooth_as_its_integral_says(generator: torch.
     mode, x = torch.randn(2, 1, 5, 3, dtype=DOUBLE, generator=generator)
     masses = torch.rand(5, dtype=DOUBLE, generator=generator)
     slope, springs = torch.randn(4, 1, dtype=DOUBLE, generator=generator), torch.tensor([5.0, 1, 2, 3], dtype=DOUBLE)
-    spline = through(times, torch.linspace(0, 1, n + 1, dtype=DOUBLE))
+    spline = spline_weights(times, torch.linspace(0, 1, n + 1, dtype=DOUBLE))
     nothing = Contacts(torch.zeros(0, dtype=torch.int64), torch.zeros(0, 4, dtype=torch.int64))
     shapes = x.expand(4, -1, -1).contiguous()
     energy = ContactEnergy(nothing, masses, shapes)
@@ -605,7 +605,7 @@ def test_shapes_rest_as_far_as_accelerations_allow(generator: torch.Generator, m
     monkeypatch.setattr(separate, "PULL", 3.0)
     start, fake, trajectory = torch.zeros_like(places), Fake(), unlimited(n, 3, 1.0)
     given: Any = start, start, relax, fake, trajectory, nothing, torch.arange(n), torch.full((n,), 99)
-    x, _ = separate._settled(*given)
+    x, _ = separate._settle(*given)
     differences = trajectory.limit.differences.numpy()
     for v in range(3):
         best = minimize(

@@ -539,7 +539,7 @@ def test_composition_says_what_does_not_fit(bars: Shapes, space: tm.ShapeSpace) 
         (None, "NoneType"),
         ([], "none"),
     ):
-        with pytest.raises(ValueError, match=f"bases, one or more, are those of extract_bases; got {got}"):
+        with pytest.raises(ValueError, match=f"bases, one or more, come from extract_bases; got {got}"):
             tm.ShapeSpace(wrong, bars.faces)  # type: ignore[arg-type]
 
 

@@ -23,10 +23,10 @@ from torch_modal.elastic.backend import TorchBackend, choose
 from torch_modal.elastic.bend import Bend
 from torch_modal.elastic.distortion import Distortion, KernelDistortion
 from torch_modal.elastic.energy import Energy, Reference, RestShapes
-from torch_modal.elastic.kernel_energy import KernelEnergy, _Merged
-from torch_modal.elastic.kernel_steps import KernelFineEnergy, KernelProblem, _Relaxed
+from torch_modal.elastic.kernel_energy import KernelEnergy, _MergeRests
+from torch_modal.elastic.kernel_steps import KernelFineEnergy, KernelProblem, _Relaxation
 from torch_modal.elastic.kernels import launch
-from torch_modal.elastic.kernels.function import fused as fused_operation
+from torch_modal.elastic.kernels.function import run_operation as fused_operation
 from torch_modal.elastic.modal import KernelModalEnergy, ModalEnergy, Placement
 from torch_modal.elastic.procrustes import mean_pose
 from torch_modal.elastic.rotations import WarpRotations
@@ -80,7 +80,7 @@ class Case:
 
     def by_warp(self, x: Tensor, *rests: Tensor) -> Tensor:
         to = self.fused.reference(self.rests(*rests))
-        return fused_operation(_Relaxed(self.fused, 2, 4), x, *to.records)[0]
+        return fused_operation(_Relaxation(self.fused, 2, 4), x, *to.records)[0]
 
 
 @pytest.fixture(params=["closed", "open", "flat"])
@@ -186,13 +186,13 @@ class TestModal:
     @torch.no_grad()
     def test_values_and_derivatives(self, case: Case) -> None:
         a = 0.1 * torch.randn(2, 5, dtype=DOUBLE, generator=torch.Generator().manual_seed(3))
-        (fused, own), (plain, truth) = self.both(case)
+        (by_kernel, own), (plain, truth) = self.both(case)
         several = torch.stack([a, 2 * a, -a])
-        torch.testing.assert_close(fused.value(several, own), plain.value(several, truth), rtol=1e-12, atol=0)
-        found, wanted = fused.derivatives(a, own), plain.derivatives(a, truth)
+        torch.testing.assert_close(by_kernel.value(several, own), plain.value(several, truth), rtol=1e-12, atol=0)
+        found, wanted = by_kernel.derivatives(a, own), plain.derivatives(a, truth)
         assert float(wanted.second_order.abs().max()) > 1e-3 * float(wanted.gauss_newton.abs().max())
         assert_alike(found, wanted, 1e-9)
-        value, gradient = fused.value_and_gradient(a, own)
+        value, gradient = by_kernel.value_and_gradient(a, own)
         torch.testing.assert_close(value, plain.value(a, truth), rtol=1e-12, atol=0)
         torch.testing.assert_close(plain.value_and_gradient(a, truth)[0], plain.value(a, truth), rtol=1e-12, atol=0)
         assert_alike((gradient, plain.value_and_gradient(a, truth)[1]), (wanted.gradient,) * 2, 1e-9)
@@ -200,14 +200,14 @@ class TestModal:
     def test_gradients_are_differentiated(self, case: Case) -> None:
         generator = torch.Generator().manual_seed(4)
         a, direction = torch.randn(2, 2, 5, dtype=DOUBLE, generator=generator).mul(0.1)
-        (fused, own), (plain, truth) = self.both(case)
+        (by_kernel, own), (plain, truth) = self.both(case)
         given = [a, *trees.leaves(own)]
 
         def by_kernels(a: Tensor, *leaves: Tensor) -> Tensor:
-            return fused.gradient(a, trees.filled(own, leaves))
+            return by_kernel.gradient(a, trees.filled(own, leaves))
 
         def by_torch(a: Tensor, *leaves: Tensor) -> Tensor:
-            return plain.gradient(a, fused.by_torch(trees.filled(own, leaves)))
+            return plain.gradient(a, by_kernel.by_torch(trees.filled(own, leaves)))
 
         assert_alike([by_kernels(*given)], [plain.derivatives(a, truth).gradient], 1e-10)
         found, wanted = (torch.func.vjp(each, *given)[1](direction) for each in (by_kernels, by_torch))
@@ -216,11 +216,11 @@ class TestModal:
     @pytest.mark.parametrize("relative", [False, True])
     def test_softer_at_needles(self, case: Case, relative: bool) -> None:
         """Shapes with needles, along either side of their triangles; rest shapes with some, too."""
-        (fused, own), _ = self.both(case)
+        (by_kernel, own), _ = self.both(case)
         start = own.base * torch.tensor([0.02, 1.0, 3.0], dtype=DOUBLE)
         rests, weights = case.rests(*case.given[1:])[:2]
         rests = torch.cat([rests[:, :1] * torch.tensor([1.0, 0.04, 1.0], dtype=DOUBLE), rests[:, 1:]], 1)
-        operation, given = _Merged(fused.kernels, [1], relative), [rests, weights, case.given[5]]
+        operation, given = _MergeRests(by_kernel.kernels, [1], relative), [rests, weights, case.given[5]]
         if relative:
             alone = torch.tensor([[1.0, 0.0]] * 2, dtype=DOUBLE)
             as_stiff = operation.by_torch(rests.flip(1), alone, case.given[5], rests[:, 1])[0]
@@ -234,10 +234,10 @@ class TestModal:
     def test_samples_that_are_too_many_at_a_time(self, case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
         """No array of all samples outgrows what kernels count: they are taken in chunks."""
         a = 0.1 * torch.randn(2, 5, dtype=DOUBLE, generator=torch.Generator().manual_seed(3))
-        (fused, own), _ = self.both(case)
+        (by_kernel, own), _ = self.both(case)
         several, many = torch.cat([a, -a, 2 * a])[:5], trees.rows(own, torch.tensor([0, 1, 0, 1, 0]))
-        truth = fused.derivatives(several, many)
-        largest = max(len(fused.blocks) * fused.blocks.shape[1], 81 * len(case.mesh.hinges)) * 3
+        truth = by_kernel.derivatives(several, many)
+        largest = max(len(by_kernel.blocks) * by_kernel.blocks.shape[1], 81 * len(case.mesh.hinges)) * 3
         monkeypatch.setattr(modal, "MOST_NUMBERS", largest)
         sizes: list[int] = []
 
@@ -247,10 +247,10 @@ class TestModal:
 
         monkeypatch.setattr(modal, "launch", watched)
         monkeypatch.setattr(kernel_energy, "launch", watched)
-        found = fused.derivatives(several, many)
+        found = by_kernel.derivatives(several, many)
         assert max(sizes) <= largest
         assert_alike(found, truth, 1e-13)
-        assert fused.derivatives(several, many, second_order=False).second_order is None
+        assert by_kernel.derivatives(several, many, second_order=False).second_order is None
 
     @pytest.mark.parametrize("n_shapes", [1, 2, 4])
     def test_references(self, case: Case, n_shapes: int) -> None:

@@ -54,7 +54,7 @@ def test_a_step_by_the_kernel_is_that_of_torch() -> None:
     rest = norm, inverse, length, 0.5 * norm, torch.zeros(5).double(), torch.arange(5), None
     state = minimisation.State(torch.arange(5), a, there, torch.ones(5).double(), gradient, *rest)
     own = state._replace(**{k: x.clone() for k, x in state._asdict().items() if isinstance(x, Tensor)})
-    wanted = minimisation.updated(state, value, slope)
+    wanted = minimisation.bfgs_update(state, value, slope)
     found = WarpBackend().quasi_newton(own, minimisation.SHORTEST, value, slope.squeeze(-1).clone())
     for got, expected in zip(found[:-1], wanted[:-1], strict=True):
         torch.testing.assert_close(got, expected, rtol=1e-10, atol=1e-10)

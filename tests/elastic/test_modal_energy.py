@@ -47,7 +47,7 @@ class Case:
         factors = [both[:, None] * stiffness for stiffness in self.shell.stiffness]
         rests = [self.shell.rest(r) for r in self.rests]
         stacked = Rest(*(tuple(torch.stack(x, -2) for x in zip(*own, strict=True)) for own in zip(*rests, strict=True)))
-        reference = self.shell.energy.merged(stacked, torch.stack(self.pulls, -1) / both[:, None], factors)
+        reference = self.shell.energy.merge_rests(stacked, torch.stack(self.pulls, -1) / both[:, None], factors)
         self.placement = self.modal.place(base, reference)
         self.a = 0.02 * size * random(BATCH, N)
 

@@ -54,7 +54,7 @@ class Case:
         both = Rest(
             *(tuple(torch.stack(each, -2) for each in zip(*own, strict=True)) for own in zip(*rests, strict=True))
         )
-        return self.core.merged(both, torch.stack(pulls, -1) / (pulls[0] + pulls[1])[:, None], factors)
+        return self.core.merge_rests(both, torch.stack(pulls, -1) / (pulls[0] + pulls[1])[:, None], factors)
 
     def at(self, x: Tensor) -> list[Linearised]:
         return self.core.linearise(self.core.extend(x.movedim(-1, 0).contiguous()), self.reference)

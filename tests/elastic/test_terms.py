@@ -69,7 +69,7 @@ def test_angles_of_any_number_of_shapes_are_one_reference(generator: torch.Gener
     angles, weights = (torch.rand(5, 40, dtype=DOUBLE, generator=generator) for _ in range(2))
     angles = 20 * angles - 10
     term, at = PeriodicTerm(), torch.linspace(-4, 4, 40, dtype=DOUBLE)
-    record, left = term.merged(angles, weights)
+    record, left = term.merge_rests(angles, weights)
     versine = 1 - (at - angles).cos()
     truth = (weights * (2 * versine + versine**2 / 3)).sum(0)
     torch.testing.assert_close(term.energies(at, record) + left, truth)
@@ -79,7 +79,7 @@ def test_angles_of_any_number_of_shapes_are_one_reference(generator: torch.Gener
     bound, beyond = term.curvatures(at, record)
     torch.testing.assert_close(bound + beyond, torch.func.grad(lambda x: slope(x).sum())(at))
     assert bool((beyond <= 1e-12).all())
-    alone, _ = term.merged(torch.zeros(1, 3, dtype=DOUBLE), torch.ones(1, 3, dtype=DOUBLE))
+    alone, _ = term.merge_rests(torch.zeros(1, 3, dtype=DOUBLE), torch.ones(1, 3, dtype=DOUBLE))
     half_a_turn = math.pi + torch.tensor([-1e-9, 0, 1e-9], dtype=DOUBLE)
     assert float(term.slopes(half_a_turn, alone).abs().max()) < 1e-8
     small = torch.tensor([1e-5, 0.1, math.radians(60)], dtype=DOUBLE)

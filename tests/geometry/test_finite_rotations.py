@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 from torch.autograd import gradcheck, gradgradcheck
 
-from torch_modal.geometry.rotations import HALF_TURN_SIDE, SMALL, exp, log, mean, quaternion, rotate, turned
+from torch_modal.geometry.rotations import HALF_TURN_SIDE, SMALL, exp, log, mean, quaternion, rotate, rotate_by
 
 F64 = torch.float64
 BORDER = 2 * math.sqrt(SMALL)  # the angle at which series and closed forms meet
@@ -41,7 +41,7 @@ def through_quaternions(w: Tensor) -> Tensor:
     """All functions one after the other: half of a turn, twice."""
     half = part_of(quaternion(exp(w).movedim((-2, -1), (0, 1))), w.new_full(w.shape[:-1], 0.5))
     rows = w.movedim(-1, 0)
-    return turned(rows, rotate(half, rotate(half, torch.ones_like(rows)))).movedim(0, -1)
+    return rotate_by(rows, rotate(half, rotate(half, torch.ones_like(rows)))).movedim(0, -1)
 
 
 # ----------------------------------------------------------------------------------------------------------- values
@@ -85,7 +85,7 @@ def test_parts_go_the_way_that_the_sign_says(generator: torch.Generator) -> None
         v = torch.randn(3, 1, dtype=F64, generator=generator).expand(3, 5)
         truth = (exp(angle * t[:, None] * w) @ v.T[..., None]).squeeze(-1).T
         torch.testing.assert_close(rotate(part_of(q, t), v), truth, rtol=0, atol=1e-12)
-        torch.testing.assert_close(turned(angle * t * w[:, None], v), truth, rtol=0, atol=1e-12)
+        torch.testing.assert_close(rotate_by(angle * t * w[:, None], v), truth, rtol=0, atol=1e-12)
 
 
 def test_cardinality_and_dtype(generator: torch.Generator) -> None:

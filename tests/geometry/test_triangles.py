@@ -24,9 +24,9 @@ from torch_modal.geometry.triangle_frames import (
     bent_sides,
     edge_means,
     frames,
-    mapped,
     mirrored_sides,
     sides,
+    transform,
 )
 from torch_modal.geometry.vectors import cross
 
@@ -44,7 +44,7 @@ def test_frames_are_orthonormal_and_give_the_sides_back(bars: Shapes) -> None:
     axes = torch.stack([own.e1, own.e2, own.normal]).movedim((0, 1), (-2, -1))
     identity = torch.eye(3, dtype=F64).expand(3, len(bars.faces), 3, 3)
     torch.testing.assert_close(axes @ axes.mT, identity)
-    for side, truth in zip(mapped(own.xx, own.xy, own.xy, own.yy), given, strict=True):
+    for side, truth in zip(transform(own.xx, own.xy, own.xy, own.yy), given, strict=True):
         torch.testing.assert_close(own.world(*side), truth)
     torch.testing.assert_close(2 * own.doubled_areas, 2 * cross(*given).norm(dim=0))
     assert bool((own.xx * own.yy > own.xy**2).all())

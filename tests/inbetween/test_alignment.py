@@ -81,7 +81,7 @@ def test_orthonormal_directions(
     torch.testing.assert_close(fit.T @ span, directions.flatten(1), atol=1e-9, rtol=0)
     a = torch.randn(2, 5, dtype=DOUBLE, generator=generator)
     displaced = torch.einsum("bn,nvc->bvc", a, basis.fine)
-    torch.testing.assert_close(basis.added(x.expand(2, -1, -1), a), x + displaced)
+    torch.testing.assert_close(basis.displace(x.expand(2, -1, -1), a), x + displaced)
 
 
 def test_one_basis_for_both_ends(bars: Shapes) -> None:

@@ -33,7 +33,7 @@ class Setting:
     def energy_by_hand(self, a: Tensor) -> Tensor:
         """Eq. 4, d(x_a, x1) + mu |x1 - x2|^2 + d(x_b, x2), on the coarse mesh."""
         parts = a.split([len(end) for end in self.ends], -1)
-        x1, x2 = (end.added(x, part) for end, x, part in zip(self.ends, self.shapes, parts, strict=True))
+        x1, x2 = (end.displace(x, part) for end, x, part in zip(self.ends, self.shapes, parts, strict=True))
         restrict, (x_a, x_b) = self.coarse.restrict, self.shapes
         similarity = (restrict(x1 - x2) ** 2).sum((-1, -2))
         return self.shell(restrict(x1), restrict(x_a)) + MU * similarity + self.shell(restrict(x2), restrict(x_b))

@@ -57,7 +57,7 @@ def test_each_pose_is_collapsed_once(monkeypatch: pytest.MonkeyPatch) -> None:
     shape = body("limb bent 120")
     shapes = torch.from_numpy(np.stack([shape.pose(0.0), shape.pose(1.0)]))
     whole = Mesh(Connectivity(np.array(shape.faces), shapes.shape[1]))
-    coarse_mesh.resolving(shapes, whole, 300, [torch.ones_like(shapes[:1])] * 2)
+    coarse_mesh.coarsen_until_resolved(shapes, whole, 300, [torch.ones_like(shapes[:1])] * 2)
     assert tried == [300, 450, 675, 1000] and len(calls) == 2
 
 
@@ -67,7 +67,7 @@ def test_stiffness_is_that_of_the_edges(most: int, bound: float, bars: Shapes, m
     monkeypatch.setattr(coarse_mesh, "MOST_EDGES", most)
     x, modes = bars.keyframes[1], bars.bases[1].modes
     mesh = Mesh(Connectivity(bars.faces.numpy(), len(x)))
-    found = coarse_mesh.stretching(mesh, x, modes)
+    found = coarse_mesh.stretching_hessian(mesh, x, modes)
     a = 1e-5 * torch.randn(20, len(modes), dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     moved, rest = (edge_lengths(y, bars.faces) for y in (x + torch.tensordot(a, modes, 1), x))
     energies = ((moved - rest).square() / rest).sum(-1)

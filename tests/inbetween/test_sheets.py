@@ -18,8 +18,8 @@ from torch_modal.elastic.term import Mesh
 from torch_modal.elastic.volume import encloses
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.rigid import blend
-from torch_modal.inbetween.coarse import resolving
-from torch_modal.modes.coarsening import coarsen, collapsed
+from torch_modal.inbetween.coarse import coarsen_until_resolved
+from torch_modal.modes.coarsening import coarsen, collapse
 
 BACKENDS = ["torch", "warp"]
 Direction = Callable[[np.ndarray], np.ndarray]
@@ -140,10 +140,10 @@ def _sphere() -> tuple[Tensor, np.ndarray]:
 def test_the_coarse_mesh_is_that_of_the_curved_key_frame() -> None:
     """Edge collapses of a flat sheet are arbitrary, and leave no more edges where it is going to bend."""
     shapes, whole = torch.stack([fold(0), fold(1)]) * 20, Mesh(Connectivity(strip()[1]))
-    found = resolving(shapes, whole, 100, ())
-    curved = collapsed(shapes[1].numpy(), strip()[1], len(found.faces))
+    found = coarsen_until_resolved(shapes, whole, 100, ())
+    curved = collapse(shapes[1].numpy(), strip()[1], len(found.faces))
     np.testing.assert_array_equal(found.clusters, curved.clusters)
-    both_flat = resolving(shapes[:1].repeat(2, 1, 1), whole, 100, ())
+    both_flat = coarsen_until_resolved(shapes[:1].repeat(2, 1, 1), whole, 100, ())
     np.testing.assert_array_equal(both_flat.clusters, coarsen(shapes[:1].numpy(), strip()[1], 1000).clusters)
 
 

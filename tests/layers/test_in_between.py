@@ -311,7 +311,7 @@ class TestTorch:
         shapes = layer(x_a, bars.keyframes[1], 0.5)
         (truth,) = torch.autograd.grad(shapes.sum(), x_a, retain_graph=True)
         keep = torch.tensor([1.0, 0.0], dtype=DOUBLE)[:, None, None]
-        monkeypatch.setattr(implicit, "ridged", lambda hessian: keep * hessian)
+        monkeypatch.setattr(implicit, "add_ridge", lambda hessian: keep * hessian)
         with pytest.warns(ConvergenceWarning, match="the Hessian of 1 in-betweens is singular"):
             (found,) = torch.autograd.grad(shapes.sum(), x_a)
         torch.testing.assert_close(found[0], truth[0], rtol=1e-6, atol=1e-8)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from torch_modal.modes.bisection import bisected
+from torch_modal.modes.bisection import bisect
 from torch_modal.modes.tetrahedra import Tetrahedra, tet_volumes
 
 Mesh = tuple[Tetrahedra, np.ndarray]
@@ -19,7 +19,7 @@ def everything(places: np.ndarray) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def graded() -> Mesh:
-    return bisected(CUBES, POINTS, WANTED, everything, 10**6)
+    return bisect(CUBES, POINTS, WANTED, everything, 10**6)
 
 
 def test_sizes_are_those_that_are_wanted(graded: Mesh) -> None:
@@ -49,7 +49,7 @@ def test_points_lie_in_their_tetrahedra(graded: Mesh) -> None:
 
 
 def test_the_worst_go_first_within_the_bound() -> None:
-    few, owner = bisected(CUBES, POINTS, WANTED / 2, everything, 3000)
+    few, owner = bisect(CUBES, POINTS, WANTED / 2, everything, 3000)
     assert 3000 <= len(few.tets) < 6000
     ratio = np.cbrt(6 * tet_volumes(few))[owner] / (WANTED / 2)
     assert ratio.max() < 5.0  # without any it is 13
@@ -57,6 +57,6 @@ def test_the_worst_go_first_within_the_bound() -> None:
 
 def test_what_is_outside_is_left_out() -> None:
     left = POINTS[POINTS[:, 0] < 2]
-    mesh, _ = bisected(CUBES, left, np.full(len(left), 0.7), lambda places: places[:, 0] < 2.0, 10**6)
+    mesh, _ = bisect(CUBES, left, np.full(len(left), 0.7), lambda places: places[:, 0] < 2.0, 10**6)
     assert mesh.vertices[mesh.tets][..., 0].min(axis=1).max() < 2.0
     assert tet_volumes(mesh).sum() == pytest.approx(2 * 4 * 3, rel=0.2)

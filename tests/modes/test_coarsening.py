@@ -76,7 +76,7 @@ def test_slivers_of_a_straight_limb_are_avoided() -> None:
     keyframes, faces = np.stack([shape.pose(0.0), shape.pose(1.0)]), np.array(shape.faces)
     keyframes *= 100 / np.linalg.norm(np.ptp(keyframes[0], axis=0))
     ratio = energy_ratio(coarsen(keyframes, faces, 500), keyframes, faces)
-    alone = energy_ratio(coarsening.collapsed(keyframes[0], faces, 500), keyframes, faces)
+    alone = energy_ratio(coarsening.collapse(keyframes[0], faces, 500), keyframes, faces)
     assert alone > 10, "the limb does not show the danger any more"
     assert 0.2 < ratio < 5
 
@@ -126,4 +126,4 @@ def test_candidates_alone_are_tried(fine: tuple[np.ndarray, np.ndarray]) -> None
     keyframes, faces = fine
     for index in range(len(keyframes)):
         found = coarsen(keyframes, faces, 100, [index])
-        np.testing.assert_array_equal(found.clusters, coarsening.collapsed(keyframes[index], faces, 100).clusters)
+        np.testing.assert_array_equal(found.clusters, coarsening.collapse(keyframes[index], faces, 100).clusters)

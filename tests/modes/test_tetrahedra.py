@@ -19,7 +19,7 @@ from torch_modal.data.samples import load_sample
 from torch_modal.modes import tetwild
 from torch_modal.modes.lattice import Lattice
 from torch_modal.modes.surface import CanonicalSurface
-from torch_modal.modes.tetrahedra import Tetrahedra, TetrahedralizationError, oriented, tet_volumes, without_debris
+from torch_modal.modes.tetrahedra import Tetrahedra, TetrahedralizationError, orient, tet_volumes, without_debris
 from torch_modal.modes.tetwild import EDGE_RANGE, Auto, TetWild
 
 Mesh = tuple[np.ndarray, np.ndarray]
@@ -184,7 +184,7 @@ def test_oriented_drops_flat_and_unused() -> None:
     tets = np.concatenate([flat, solid.tets])
     tets[2] = tets[2][[1, 0, 2, 3]]
     assert tet_volumes(Tetrahedra(vertices, tets))[[0, 2]].tolist() == pytest.approx([0.0, -1 / 6])
-    result = oriented(Tetrahedra(vertices, tets))
+    result = orient(Tetrahedra(vertices, tets))
     assert len(result.vertices) == n
     np.testing.assert_allclose(tet_volumes(result), np.full(6, 1 / 6))
 

@@ -13,16 +13,16 @@ from torch import Tensor
 from torch_modal.contact.detect import REACH
 
 ROOM = 1.27
-"""Largest acceleration of a vertex, times that of the trajectory."""
+"""Largest acceleration of a vertex, relative to the largest of the trajectory."""
 LEAST_LIMIT = 8 * 100 * REACH
-"""Smallest bound, at a diagonal of 100 and a duration of 1: that of a parabola as high as the reach of contacts."""
+"""Smallest bound, at a diagonal of 100 and a duration of 1: a parabola as high as the reach of contacts."""
 ROUNDS = 400
 """Most iterations of :meth:`AccelerationLimit.nearest`."""
 TOLERANCE = 0.01
 """Relative tolerance of the bound at which the iteration stops."""
 RELAXATION = 1.7
 PENALTY = 3.0
-"""Of accelerations. Less does not converge with weights; with more, the first result within the bound is far off."""
+"""Penalty of accelerations. Less does not converge with weights; with more, the result is far off."""
 
 
 class AccelerationLimit:
@@ -31,8 +31,8 @@ class AccelerationLimit:
     Args:
         shapes: Even times of a trajectory, with both ends, which have no displacement, in the coordinates of the
             viewer. *Shape:* ``(T + 2, V, 3)``.
-        rotations: Rotations from the coordinates of displacements to those of the viewer. *Shape:* ``(T, 3, 3)``.
-        goes_on: Whether the motion continues beyond the first and the last shape. Each side has half of the room
+        rotations: Rotations from the coordinates of displacements to the viewer's. *Shape:* ``(T, 3, 3)``.
+        goes_on: True if the motion continues beyond the first and the last shape. Each side has half of the room
             there: the motion must not bounce off a key-frame.
         most: The bound. Default: :data:`ROOM` times the largest acceleration, or :data:`LEAST_LIMIT`.
     """
@@ -41,16 +41,16 @@ class AccelerationLimit:
         self, shapes: Tensor, rotations: Tensor, goes_on: tuple[bool, bool] = (False, False), most: float | None = None
     ) -> None:
         x = shapes.double().nan_to_num()
-        own = x[2:] - 2 * x[1:-1] + x[:-2]
+        accelerations = x[2:] - 2 * x[1:-1] + x[:-2]
         each = torch.eye(len(x), dtype=x.dtype, device=x.device)[:, 1:-1]
         second = each[2:] - 2 * each[1:-1] + each[:-2]
         ends = [i for i, beyond in zip((0, -1), goes_on, strict=True) if beyond]
         #: Accelerations of the trajectory. *Shape:* ``(N, V, 3)``.
-        self.trajectory = torch.cat([own, *(own[i][None] for i in ends)])
+        self.trajectory = torch.cat([accelerations, *(accelerations[i][None] for i in ends)])
         #: Accelerations of a displacement from its values at each time. *Shape:* ``(N, T)``.
         self.differences = torch.cat([second, *(2 * each[1:-1][i][None] for i in ends)])
         self.rotations = rotations.double()
-        self.most = most or max(ROOM * float(own.norm(dim=-1).max()), LEAST_LIMIT / (len(x) - 1) ** 2)
+        self.most = most or max(ROOM * float(accelerations.norm(dim=-1).max()), LEAST_LIMIT / (len(x) - 1) ** 2)
 
     def nearest(self, wanted: Tensor, weights: Tensor | float = 1.0) -> tuple[Tensor, Tensor]:
         """Find the displacement nearest to a wanted one, in least squares, that keeps each vertex below the bound.
@@ -60,32 +60,32 @@ class AccelerationLimit:
         """
         rows, seen = self.differences, torch.einsum("tij,tvj->tvi", self.rotations, wanted.double())
         added = self.trajectory + torch.tensordot(rows, seen, 1)
-        own = torch.nonzero(added.norm(dim=-1).amax(0) > self.most).flatten()
-        if not len(own):
-            return wanted, own
+        limited = torch.nonzero(added.norm(dim=-1).amax(0) > self.most).flatten()
+        if not len(limited):
+            return wanted, limited
         # Components before vertices: sums of three long rows are fast.
-        goal, trajectory = (x[:, own].movedim(-1, 1).flatten(1) for x in (seen, self.trajectory))
+        goal, trajectory = (x[:, limited].movedim(-1, 1).flatten(1) for x in (seen, self.trajectory))
         metric = torch.eye(rows.shape[1]).to(rows) * weights
         inverse = torch.linalg.inv(metric + PENALTY * rows.T @ rows)
         # The displacement, and its accelerations, of the accelerations that it is pulled to.
         pull, freely = PENALTY * inverse @ rows.T, inverse @ metric @ goal
         reach, rest = rows @ pull, rows @ freely + trajectory
-        split, dual = self._clipped(rows @ goal + trajectory), torch.zeros_like(trajectory)
+        split, dual = self._clip(rows @ goal + trajectory), torch.zeros_like(trajectory)
         for _ in range(ROUNDS):
             pulled = split - dual - trajectory
             reached = torch.addmm(rest, reach, pulled)
             if float(_lengths(reached).max()) <= (1 + TOLERANCE) * self.most:
                 break
             relaxed = RELAXATION * reached + (1 - RELAXATION) * split + dual
-            split = self._clipped(relaxed)
+            split = self._clip(relaxed)
             dual = relaxed - split
-        found = torch.einsum("tij,tiv->tvj", self.rotations, torch.addmm(freely, pull, pulled).unflatten(1, (3, -1)))
-        return wanted.index_copy(1, own, found.to(wanted)), own
+        nearest = torch.einsum("tij,tiv->tvj", self.rotations, torch.addmm(freely, pull, pulled).unflatten(1, (3, -1)))
+        return wanted.index_copy(1, limited, nearest.to(wanted)), limited
 
-    def _clipped(self, rows: Tensor) -> Tensor:
+    def _clip(self, rows: Tensor) -> Tensor:
         """Vectors shortened to the bound where they are longer. *Shape:* ``(N, 3 V)``."""
-        part = (self.most / _lengths(rows).clamp_min(torch.finfo(rows.dtype).tiny)).clamp_max(1)
-        return (rows.unflatten(1, (3, -1)) * part[:, None]).flatten(1)
+        factor = (self.most / _lengths(rows).clamp_min(torch.finfo(rows.dtype).tiny)).clamp_max(1)
+        return (rows.unflatten(1, (3, -1)) * factor[:, None]).flatten(1)
 
 
 def _lengths(rows: Tensor) -> Tensor:

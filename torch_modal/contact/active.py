@@ -47,11 +47,11 @@ class Contacts(NamedTuple):
         at, place = torch.nonzero(self.shapes[:, None] == some, as_tuple=True)
         return Contacts(place, self.elements[at])
 
-    def beside(self, former: "Contacts") -> "Contacts":
+    def with_former(self, former: "Contacts") -> "Contacts":
         """Add the former contacts of vertices that have none now: without them, what was pushed out falls back."""
         n = 1 + max(int(each.elements.max()) if len(each.elements) else 0 for each in (self, former))
-        own, before = (each.shapes * n + each.elements[:, 3] for each in (self, former))
-        kept = ~torch.isin(before, own)
+        present, before = (each.shapes * n + each.elements[:, 3] for each in (self, former))
+        kept = ~torch.isin(before, present)
         shapes = torch.cat([self.shapes, former.shapes[kept]])
         return Contacts(shapes, torch.cat([self.elements, former.elements[kept]]))
 
@@ -59,7 +59,7 @@ class Contacts(NamedTuple):
 class ContactSearch:
     """Search for active contacts of T shapes between the same known shapes.
 
-    Vertices beside an intersection are watched in all later searches.
+    Vertices next to an intersection are watched in all later searches.
 
     Args:
         mesh: Their connectivity.
@@ -92,8 +92,8 @@ class ContactSearch:
             if not bool(x[i].isfinite().all()):
                 n_far.append(0)
                 continue
-            *found, n = self.search(_numbers(x[i]), self.watched[i])
-            vertices, faces = map(torch.from_numpy, found)
+            *pairs, n = self.search(_numbers(x[i]), self.watched[i])
+            vertices, faces = map(torch.from_numpy, pairs)
             shapes.append(torch.full_like(vertices, i))
             elements.append(torch.cat([self.faces[faces], vertices[:, None]], 1))
             n_far.append(n)
@@ -104,7 +104,7 @@ class ContactSearch:
     def count(self, x: Tensor) -> Tensor:
         """Numbers of far pairs of triangles. *Shape:* ``(S, V, 3) -> (S,)``, int64."""
         crossings = self.search.crossings
-        counts = [len(crossings.far_pairs(_numbers(own))) if bool(own.isfinite().all()) else 0 for own in x]
+        counts = [len(crossings.far_pairs(_numbers(shape))) if bool(shape.isfinite().all()) else 0 for shape in x]
         return torch.tensor(counts, dtype=torch.int64, device=x.device)
 
     def depth(self, x: Tensor) -> float:
@@ -117,7 +117,7 @@ class ContactSearch:
         """Watch the surroundings of contacts, in their shapes and in so many neighbours in time on either side."""
         for i in contacts.shapes.unique().tolist():
             vertices = contacts.elements[contacts.shapes == i].unique().cpu().numpy()
-            self.watched[max(0, i - around) : i + around + 1] |= self.search.crossings.grown(vertices, 2)
+            self.watched[max(0, i - around) : i + around + 1] |= self.search.crossings.grow(vertices, 2)
 
 
 def _numbers(x: Tensor) -> FloatArray:
@@ -133,7 +133,7 @@ class ContactEnergy:
         self.corners = (elements + (self.shapes * like.shape[1])[:, None]).T.contiguous()
         self.weights = STIFFNESS * areas.to(like)[elements[:, 3]]
 
-    def missing(self, x: Tensor, near: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    def shortfall(self, x: Tensor, near: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Missing distances, at most zero, and gradients of the heights in the corners, of all contacts or of some.
 
         *Shape:* ``(B, V, 3), (n,) -> (n,), (4, 3, n)``.
@@ -152,17 +152,17 @@ class ContactEnergy:
 
     def value(self, x: Tensor) -> Tensor:
         """Energy of each shape. *Shape:* ``(B, V, 3) -> (B,)``."""
-        return self._summed(x, self.weights * self.missing(x)[0] ** 2)
+        return self._sum_by_shape(x, self.weights * self.shortfall(x)[0] ** 2)
 
     def at(self, x: Tensor) -> Point:
         """Derivatives, of which the contacts that keep the gap have none. *Shape:* ``(B, V, 3)``."""
-        missing = self.missing(x)[0]
-        near = torch.nonzero(missing).flatten()
-        corners, gradients = self.corners[:, near].flatten(), self.missing(x, near)[1]
+        shortfall = self.shortfall(x)[0]
+        near = torch.nonzero(shortfall).flatten()
+        corners, gradients = self.corners[:, near].flatten(), self.shortfall(x, near)[1]
         on_corners = gradients.transpose(0, 1).flatten(1)
         stiffness = 2 * self.weights[near].repeat(4)
         gradient, diagonal = torch.zeros_like(x), x.new_zeros(*x.shape[:-1], 6)
-        _rows(gradient).index_add_(1, corners, stiffness * missing[near].repeat(4) * on_corners)
+        _rows(gradient).index_add_(1, corners, stiffness * shortfall[near].repeat(4) * on_corners)
         blocks = (stiffness * on_corners)[:, None] * on_corners
         _rows(diagonal).index_add_(1, corners, blocks.flatten(0, 1)[[0, 1, 2, 4, 5, 8]])
 
@@ -172,9 +172,9 @@ class ContactEnergy:
             _rows(out).index_add_(1, corners, stiffness * rate.repeat(4) * on_corners)
             return out
 
-        return Point(self._summed(x, self.weights * missing**2), gradient, diagonal, product)
+        return Point(self._sum_by_shape(x, self.weights * shortfall**2), gradient, diagonal, product)
 
-    def _summed(self, x: Tensor, each: Tensor) -> Tensor:
+    def _sum_by_shape(self, x: Tensor, each: Tensor) -> Tensor:
         """*Shape:* ``(B, V, 3), (N,) -> (B,)``."""
         return x.new_zeros(len(x)).index_add(0, self.shapes, each)
 

@@ -1,6 +1,6 @@
 """Search for contacts: vertices that must stay in front of faces. NumPy and SciPy only.
 
-A contact pairs a vertex with a face where parts pass through each other, or nearly touch beside such a place. It never
+A contact pairs a vertex with a face where parts pass through each other, or nearly touch next to such a place. It never
 pairs a vertex with a face that it was behind in a known shape: a self-intersection of a key-frame stays as it is there.
 """
 
@@ -19,13 +19,13 @@ from torch_modal.geometry.triangle_pairs import dot
 REACH = 0.06
 """Largest depth of a vertex that is pushed out."""
 NEAR = 0.015
-"""Largest distance in front of a face at which a vertex beside an intersection is watched."""
+"""Largest distance in front of a face at which a vertex next to an intersection is watched."""
 FACING = -0.1
 """Largest cosine between the normals of a vertex and of a face that face each other."""
 DEEP = 0.12
 """Distance along the surface, from an intersection, within which penetrating vertices are searched."""
 _STRAIGHT = 0.7
-"""Least part of the distance that lies along the face's normal; with less, the vertex is beside the face."""
+"""Least part of the distance that lies along the face's normal; with less, the vertex lies to the side of the face."""
 _BEHIND = 0.02
 """Part of the mean edge length: how far behind a face a vertex outside may lie, which is rounding of a fold."""
 _TIE = 1e-6
@@ -46,7 +46,7 @@ class Search:
     def __call__(self, x: FloatArray, watched: BoolArray) -> tuple[IntArray, IntArray, int]:
         """Vertices and faces that face each other, and the number of far pairs; none where nothing intersects.
 
-        Vertices beside the intersections are added to ``watched``. *Shape:* ``(V, 3), (V,) -> (n,), (n,)``.
+        Vertices next to the intersections are added to ``watched``. *Shape:* ``(V, 3), (V,) -> (n,), (n,)``.
         """
         crossings = self.crossings
         pairs = crossings.far_pairs(x)
@@ -57,10 +57,10 @@ class Search:
         corners[crossings.mesh.faces[pairs.reshape(-1)]] = True
         before = crossings.known_inside
         surface = Surface(x, crossings.mesh)
-        winds = crossings.winds(surface, crossings.within(corners, DEEP) | (watched & before))
-        inside = crossings.hanging(winds & ~before, corners)
-        watched |= crossings.grown(np.flatnonzero(corners), 2) | crossings.grown(np.flatnonzero(inside))
-        # What was inside in a key-frame is not to go in elsewhere.
+        winds = crossings.encloses(surface, crossings.within(corners, DEEP) | (watched & before))
+        inside = crossings.connected_to(winds & ~before, corners)
+        watched |= crossings.grow(np.flatnonzero(corners), 2) | crossings.grow(np.flatnonzero(inside))
+        # Vertices inside in a key-frame must not enter elsewhere.
         return *self.opposite(surface, watched, inside, winds & before & watched), len(pairs)
 
     def opposite(
@@ -84,27 +84,27 @@ class Search:
         within = inside | stuck
         parts = [np.zeros((2, 0), np.int64)]
         for chosen, radius, n in ((seeds & ~within, near + 1.5 * self._edge, _NEAREST), (within, reach, 4 * _NEAREST)):
-            own, n = np.flatnonzero(chosen), min(n, len(some))
-            distance, found = tree.query(surface.vertices[own], n, distance_upper_bound=radius)
+            queried, n = np.flatnonzero(chosen), min(n, len(some))
+            distance, faces = tree.query(surface.vertices[queried], n, distance_upper_bound=radius)
             there = np.isfinite(distance.reshape(-1))
-            parts.append(np.stack([np.repeat(own, n)[there], some[found.reshape(-1)[there]]]))
+            parts.append(np.stack([np.repeat(queried, n)[there], some[faces.reshape(-1)[there]]]))
         v, f = np.concatenate(parts, 1)
-        v, f = _kept(dot(surface.vertex_normals[v], surface.face_normals[f]) < FACING, v, f)
-        v, f = _kept(~(corners[f] == v[:, None]).any(1), v, f)
+        v, f = _select(dot(surface.vertex_normals[v], surface.face_normals[f]) < FACING, v, f)
+        v, f = _select(~(corners[f] == v[:, None]).any(1), v, f)
         height = _heights(surface, v, f)
         keep = (height < near) & (height > -reach) & ((height > -_BEHIND * self._edge) | within[v])
-        v, f, height = _kept(keep, v, f, height)
+        v, f, height = _select(keep, v, f, height)
         distance = _distances(surface, v, f)
-        v, f, distance = _kept(np.abs(height) > _STRAIGHT * distance - 1e-9 * reach, v, f, distance)
+        v, f, distance = _select(np.abs(height) > _STRAIGHT * distance - 1e-9 * reach, v, f, distance)
         for known in self._known:
             behind = _heights(known, v, f) <= -1e-3 * self._edge
             behind[behind] = _distances(known, v[behind], f[behind]) <= 1.5 * reach
-            v, f, distance = _kept(~behind | stuck[v], v, f, distance)
+            v, f, distance = _select(~behind | stuck[v], v, f, distance)
         first = _nearest_faces(v, f, distance, _heights(surface, v, f))
         v, f = v[first], f[first]
         # Folds are inside, too, where they are in a key-frame.
         keep = np.ones(len(v), dtype=bool)
-        keep[stuck[v]] = crossings.separated(v[stuck[v]], corners[f[stuck[v]]])
+        keep[stuck[v]] = crossings.are_far_apart(v[stuck[v]], corners[f[stuck[v]]])
         return v[keep], f[keep]
 
     def depth(self, x: FloatArray, pairs: IntArray) -> FloatArray:
@@ -116,24 +116,24 @@ class Search:
         """
         crossings, faces = self.crossings, self.crossings.mesh.faces
         deep = np.zeros(len(x))
-        own = np.flatnonzero(crossings.inside(x, pairs))
-        if not len(own):
+        inside = np.flatnonzero(crossings.inside(x, pairs))
+        if not len(inside):
             return deep
         patch = np.full(len(x), -1)
-        patch[own] = connected_components(crossings.adjacency[own][:, own], directed=False)[1]
+        patch[inside] = connected_components(crossings.adjacency[inside][:, inside], directed=False)[1]
         # The patch of each face that is inside as a whole.
         of_face = np.where((patch[faces] == patch[faces[:, :1]]).all(1), patch[faces[:, 0]], -1)
         surface = Surface(x, crossings.mesh)
         n = min(_NEAREST, len(faces))
-        v: Any = np.repeat(own, n)
-        f: Any = np.asarray(cKDTree(surface.face_centres).query(x[own], n)[1]).reshape(-1)
+        v: Any = np.repeat(inside, n)
+        f: Any = np.asarray(cKDTree(surface.face_centres).query(x[inside], n)[1]).reshape(-1)
         facing = dot(surface.vertex_normals[v], surface.face_normals[f]) < FACING
-        v, f = _kept(facing & (of_face[f] != patch[v]), v, f)
-        v, f = _kept(_heights(surface, v, f) < 0, v, f)
+        v, f = _select(facing & (of_face[f] != patch[v]), v, f)
+        v, f = _select(_heights(surface, v, f) < 0, v, f)
         least = np.full(len(x), np.inf)
         np.minimum.at(least, v, _distances(surface, v, f))
-        found = np.isfinite(least)
-        deep[found] = least[found]
+        is_deep = np.isfinite(least)
+        deep[is_deep] = least[is_deep]
         return deep
 
 
@@ -148,7 +148,7 @@ def _distances(surface: Surface, v: IntArray, f: IntArray) -> FloatArray:
 
 
 def _nearest_faces(v: IntArray, f: IntArray, distance: FloatArray, height: FloatArray) -> IntArray:
-    """Indices of the pairs of each vertex with its nearest face; of equally near ones, that of the farthest plane."""
+    """Indices of the pairs of each vertex with its nearest face; of equally near ones, with the farthest plane."""
     # Faces share nearest points, and rounding would choose among them; of those in one plane, the first is taken.
     chosen = np.arange(len(v))
     for lengths, sign in ((distance, 1), (np.abs(height), -1)):
@@ -161,5 +161,5 @@ def _nearest_faces(v: IntArray, f: IntArray, distance: FloatArray, height: Float
     return order[np.flatnonzero(np.diff(v[order], prepend=-1))]
 
 
-def _kept(keep: BoolArray, *arrays: Any) -> list[Any]:
+def _select(keep: BoolArray, *arrays: Any) -> list[Any]:
     return [array[keep] for array in arrays]

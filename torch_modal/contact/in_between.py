@@ -9,10 +9,10 @@ from torch import Tensor
 from torch_modal.contact.acceleration import AccelerationLimit
 from torch_modal.contact.active import ContactEnergy, ContactSearch, refuse_transforms
 from torch_modal.contact.modal import modal_displacement
-from torch_modal.contact.separate import Timeline, separate, through
+from torch_modal.contact.separate import Timeline, separate, spline_weights
 from torch_modal.elastic.energy import RestShapes
 from torch_modal.elastic.minimise import Solution
-from torch_modal.elastic.steps import Beside
+from torch_modal.elastic.steps import ExtraEnergies
 from torch_modal.geometry.connectivity import vertex_areas
 from torch_modal.inbetween.alignment import Pose
 from torch_modal.inbetween.joint import JointSpace
@@ -40,19 +40,19 @@ class ContactSolver(InBetweenSolver):
             return whole
         some = torch.nonzero(n_crossing).flatten()
         parts = [super(ContactSolver, self).forward(samples.rows(slice(i, i + 1))) for i in some.tolist()]
-        each = zip(whole.solution, *(part.solution for part in parts), strict=True)
+        each = zip(whole.solution, *(one.solution for one in parts), strict=True)
         merged = (values[0].index_copy(0, some, torch.cat(values[1:])) for values in each)  # type: ignore[union-attr, arg-type]
-        shapes = whole.shapes.index_copy(0, some, torch.cat([part.shapes for part in parts]))
+        shapes = whole.shapes.index_copy(0, some, torch.cat([one.shapes for one in parts]))
         return InBetweenResult(shapes, Solution(*merged))
 
-    def finished(self, x: Tensor, solution: Solution, rests: RestShapes) -> tuple[Tensor, Solution]:
+    def finish(self, x: Tensor, solution: Solution, rests: RestShapes) -> tuple[Tensor, Solution]:
         """Shapes and solutions with the numbers of far pairs; only one sample alone is separated."""
         refuse_transforms(x)
-        searches = [contact_search(self, own, 1) for own in rests.shapes]
+        searches = [contact_search(self, shape, 1) for shape in rests.shapes]
         if len(x) == 1:
             x, n_crossing = separate(x, _steps(self, rests), searches[0])
         else:
-            counts = [search.count(own[None]) for search, own in zip(searches, x, strict=True)]
+            counts = [search.count(shape[None]) for search, shape in zip(searches, x, strict=True)]
             n_crossing = torch.cat([torch.zeros_like(solution.status[:0]), *counts])
         return x, solution._replace(n_crossing=n_crossing)
 
@@ -70,7 +70,7 @@ class Displacement(NamedTuple):
     search: ContactSearch
 
     def apply(self, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
-        """Displace shapes at any times, by a spline between those of the field; and the far pairs left in each.
+        """Displace shapes at any times, by a spline in time through the field; and the far pairs left in each.
 
         The gradient reaches shapes and times; the field is a constant. *Shape:* ``(B, V, 3), (B,) -> (B, V, 3), (B,)``.
         """
@@ -79,8 +79,8 @@ class Displacement(NamedTuple):
         if torch.equal(u, self.times) and not u.requires_grad:
             return x + self.field, self.n_crossing
         # Not undone where it adds some in between: the motion would jump.
-        found = x + torch.tensordot(through(self.times, u), self.field, 1)
-        return found, self.search.count(found)
+        displaced = x + torch.tensordot(spline_weights(self.times, u), self.field, 1)
+        return displaced, self.search.count(displaced)
 
 
 @torch.no_grad()
@@ -127,6 +127,6 @@ def contact_search(core: InBetweenSolver, ends: Tensor, n_shapes: int) -> Contac
     return ContactSearch(core.mesh, ends, torch.from_numpy(areas).to(ends), n_shapes, pairs, reference)
 
 
-def _steps(core: InBetweenSolver, rests: RestShapes) -> Callable[[Tensor, Tensor, Beside], Tensor]:
-    """Newton steps of all vertices of some of the shapes, with energies beside that of the terms."""
-    return lambda x, some, beside: core.fine.relax(x, rests.rows(some), [(1, PRODUCTS)], beside)
+def _steps(core: InBetweenSolver, rests: RestShapes) -> Callable[[Tensor, Tensor, ExtraEnergies], Tensor]:
+    """Newton steps of all vertices of some of the shapes, with further energies."""
+    return lambda x, some, extra: core.fine.relax(x, rests.rows(some), [(1, PRODUCTS)], extra)

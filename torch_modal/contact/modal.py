@@ -50,16 +50,16 @@ def modal_displacement(
     bend = rate**3 * accelerations.T @ accelerations
     smooth = SMOOTHNESS * bend[:, None, :, None] * ((modes * masses[:, None]).flatten(1) @ flat.T)[:, None, :]
 
-    def displaced(a: Tensor) -> Tensor:
+    def displace(a: Tensor) -> Tensor:
         return x + (a @ flat).view_as(x)
 
     def value(a: Tensor) -> Tensor:
         elastic = (slope * a).sum() + 0.5 * torch.einsum("si,sij,sj->", a, stiffness, a)
-        return elastic + SOFTNESS * contact.value(displaced(a)).sum() + torch.einsum("ia,iajb,jb->", a, smooth, a)
+        return elastic + SOFTNESS * contact.value(displace(a)).sum() + torch.einsum("ia,iajb,jb->", a, smooth, a)
 
     a = torch.zeros_like(slope)
     for _ in range(STEPS):
-        pushed, hardened = _in_modes(contact, displaced(a), modes)
+        pushed, hardened = _in_modes(contact, displace(a), modes)
         gradient = slope + torch.einsum("sij,sj->si", stiffness, a) + SOFTNESS * pushed
         gradient = gradient + 2 * torch.einsum("iajb,jb->ia", smooth, a)
         hessian = 2 * smooth.reshape(a.numel(), -1) + torch.block_diag(*(stiffness + SOFTNESS * hardened))
@@ -69,17 +69,17 @@ def modal_displacement(
             break
         step = -torch.cholesky_solve(gradient.reshape(-1, 1), factor).view_as(a)
         a = a + step_length(value(a), (gradient * step).sum(), value(a + step), step.abs().amax()) * step
-    return displaced(a) - x
+    return displace(a) - x
 
 
 def _in_modes(contact: ContactEnergy, x: Tensor, modes: Tensor) -> tuple[Tensor, Tensor]:
     """Gradient and Gauss-Newton Hessian in the modes. *Shape:* ``(S, V, 3), (n, V, 3) -> (S, n), (S, n, n)``."""
-    missing, gradients = contact.missing(x)
+    shortfall, gradients = contact.shortfall(x)
     n, (n_shapes, n_vertices) = len(modes), x.shape[:2]
     gradient, hessian = x.new_zeros(n_shapes, n), x.new_zeros(n_shapes, n, n)
-    for i in contact.shapes[missing < 0].unique().tolist():
-        own = torch.nonzero((contact.shapes == i) & (missing < 0)).flatten()
-        rates = torch.einsum("nkmc,kcm->mn", modes[:, contact.corners[:, own] - i * n_vertices], gradients[..., own])
-        weighted = 2 * contact.weights[own, None] * rates
-        gradient[i], hessian[i] = missing[own] @ weighted, rates.T @ weighted
+    for i in contact.shapes[shortfall < 0].unique().tolist():
+        rows = torch.nonzero((contact.shapes == i) & (shortfall < 0)).flatten()
+        rates = torch.einsum("nkmc,kcm->mn", modes[:, contact.corners[:, rows] - i * n_vertices], gradients[..., rows])
+        weighted = 2 * contact.weights[rows, None] * rates
+        gradient[i], hessian[i] = shortfall[rows] @ weighted, rates.T @ weighted
     return gradient, hessian

@@ -23,9 +23,9 @@ class SelfContacts(NamedTuple):
     pairs: Tensor
     """Face indices, the smaller first. *Shape:* ``(P, 2)``."""
     new: Tensor
-    """Whether the pair intersects in none of the ignored shapes. *Shape:* ``(P,)``."""
+    """True if the pair intersects in none of the ignored shapes. *Shape:* ``(P,)``."""
     far: Tensor
-    """Whether two separate parts intersect: the pair is new, at least two rings of faces from the intersections of
+    """True if two separate parts intersect: the pair is new, at least two rings of faces from the intersections of
     ignored shapes, and its geodesic distance exceeds 6 % of the diagonal. Other pairs belong to a known intersection or
     a fold. *Shape:* ``(P,)``."""
     depth: Tensor
@@ -60,9 +60,9 @@ def self_contacts(x: Any, faces: Any, ignore: Any = None) -> SelfContacts:
         MissingPackageError: The extra ``contact`` is not installed.
     """
     require_contact()
-    given = as_positions(x)
+    positions = as_positions(x)
     corners = as_faces(faces)
-    shapes = _shapes("x", given, None)
+    shapes = _shapes("x", positions, None)
     known = np.zeros((0, *shapes.shape[1:])) if ignore is None else _shapes("ignore", as_positions(ignore), shapes)
     if corners.ndim != 2 or corners.shape[1] != 3 or not len(corners):
         raise MeshError(f"faces have shape {corners.shape}; (F, 3) is needed, one face or more")
@@ -85,14 +85,14 @@ def self_contacts(x: Any, faces: Any, ignore: Any = None) -> SelfContacts:
         new.append(crossings.is_new(pairs[-1]))
         far.append(crossings.is_far(pairs[-1]))
         depth[i] = search.depth(shape, pairs[-1][far[-1]])
-    lead, device = given.shape[:-2], given.device
-    of_shape = np.repeat(np.arange(n), [len(own) for own in pairs[1:]])
+    lead, device = positions.shape[:-2], positions.device
+    of_shape = np.repeat(np.arange(n), [len(shape_pairs) for shape_pairs in pairs[1:]])
     every, are_new, are_far = (np.concatenate(parts) for parts in (pairs, new, far))
 
     def tensor(array: NDArray[Any]) -> Tensor:
         return torch.from_numpy(array).to(device)
 
-    def counted(which: slice | BoolArray) -> Tensor:
+    def count_by_shape(which: slice | BoolArray) -> Tensor:
         return tensor(np.bincount(of_shape[which], minlength=n)).reshape(lead)
 
     return SelfContacts(
@@ -100,17 +100,17 @@ def self_contacts(x: Any, faces: Any, ignore: Any = None) -> SelfContacts:
         pairs=tensor(every),
         new=tensor(are_new),
         far=tensor(are_far),
-        depth=tensor(depth).to(given.dtype).reshape(given.shape[:-1]),
-        number=counted(slice(None)),
-        n_new=counted(are_new),
-        n_far=counted(are_far),
+        depth=tensor(depth).to(positions.dtype).reshape(positions.shape[:-1]),
+        number=count_by_shape(slice(None)),
+        n_new=count_by_shape(are_new),
+        n_far=count_by_shape(are_far),
     )
 
 
-def _shapes(name: str, given: Tensor, like: FloatArray | None) -> FloatArray:
-    if given.dim() < 2 or given.shape[-1] != 3:
-        raise MeshError(f"{name} has the shape {tuple(given.shape)}; (..., V, 3) is needed")
-    array: FloatArray = given.detach().cpu().double().resolve_neg().numpy().reshape(-1, *given.shape[-2:])
+def _shapes(name: str, x: Tensor, like: FloatArray | None) -> FloatArray:
+    if x.dim() < 2 or x.shape[-1] != 3:
+        raise MeshError(f"{name} has the shape {tuple(x.shape)}; (..., V, 3) is needed")
+    array: FloatArray = x.detach().cpu().double().resolve_neg().numpy().reshape(-1, *x.shape[-2:])
     if like is not None and array.shape[1:] != like.shape[1:]:
         raise MeshError(f"{name} has {array.shape[1]} vertices, the shapes have {like.shape[1]}; they must be equal")
     if not np.isfinite(array).all():

@@ -18,14 +18,14 @@ from torch import Tensor
 
 from torch_modal.contact.acceleration import AccelerationLimit
 from torch_modal.contact.active import GAP, ContactEnergy, Contacts, ContactSearch, Pull
-from torch_modal.elastic.steps import Beside
+from torch_modal.elastic.steps import ExtraEnergies
 
 LOOKED_AT = 8
-"""Number of shapes that are looked at first: without intersections there, nothing is done."""
+"""Number of shapes that are tested first: without intersections there, nothing is done."""
 SOLVED = 16
 """Number of shapes that take steps; the others follow along a cubic spline."""
 BESIDE = 0.125
-"""Duration beside a key-frame that intersects itself, in which all shapes take steps."""
+"""Duration next to a key-frame that intersects itself, in which all shapes take steps."""
 AROUND = 2
 """Neighbours in time of shapes with contacts, in which the same vertices are watched."""
 ROUNDS = 4, 8
@@ -53,7 +53,7 @@ class Timeline(NamedTuple):
 
 def separate(
     start: Tensor,
-    relax: Callable[[Tensor, Tensor, Beside], Tensor],
+    relax: Callable[[Tensor, Tensor, ExtraEnergies], Tensor],
     search: ContactSearch,
     timeline: Timeline | None = None,
 ) -> tuple[Tensor, Tensor]:
@@ -64,8 +64,8 @@ def separate(
 
     Args:
         start: The shapes in the frame, with a diagonal of 100. *Shape:* ``(T, V, 3)``.
-        relax: Takes a Newton step of all vertices of some of the shapes, given those, their indices and energies beside
-            the elastic one. *Shape:* ``(S, V, 3), (S,) -> (S, V, 3)``.
+        relax: Takes a Newton step of all vertices of some of the shapes, from the shapes, their indices and further
+            energies. *Shape:* ``(S, V, 3), (S,) -> (S, V, 3)``.
         search: Search for contacts between the known shapes.
         timeline: Of several shapes; None for one alone.
 
@@ -81,22 +81,22 @@ def separate(
     if not len(active.shapes):
         return start, n_before
     search.watch(active, AROUND)
-    chosen = every if timeline is None else _chosen(timeline.t, search)
+    chosen = every if timeline is None else _choose_shapes(timeline.t, search)
     x = start
     if timeline is not None and timeline.in_modes is not None:
         contact = ContactEnergy(active.rows(chosen), search.areas, start)
-        spline = through(timeline.t[chosen], timeline.t)
+        spline = spline_weights(timeline.t[chosen], timeline.t)
         bend = (timeline.limit.differences[:n] @ spline.double()).to(start)
         x = start + torch.tensordot(spline, timeline.in_modes(chosen, contact, bend), 1)
-    x, n_crossing = _settled(start, x, relax, search, timeline, active, chosen, n_before)
+    x, n_crossing = _settle(start, x, relax, search, timeline, active, chosen, n_before)
     if timeline is not None and x is not start:
         x, n_crossing = _never_worse(start, x - start, search, timeline, n_before)
     return x, n_crossing
 
 
-def _chosen(t: Tensor, search: ContactSearch) -> Tensor:
+def _choose_shapes(t: Tensor, search: ContactSearch) -> Tensor:
     """Shapes of a trajectory that take steps. *Shape:* ``(T,) -> (S,)``."""
-    # The first and the last hardly cost energy, and would be bent by what is done to the next.
+    # End frames are always solved: they are cheap, and neighbours would bend them.
     stride = max(1, (len(t) + 1) // SOLVED)
     chosen = torch.zeros(len(t), dtype=torch.bool, device=t.device)
     chosen[stride - 1 :: stride] = chosen[0] = chosen[-1] = True
@@ -105,10 +105,10 @@ def _chosen(t: Tensor, search: ContactSearch) -> Tensor:
     return torch.nonzero(chosen).flatten()
 
 
-def _settled(
+def _settle(
     start: Tensor,
     x: Tensor,
-    relax: Callable[[Tensor, Tensor, Beside], Tensor],
+    relax: Callable[[Tensor, Tensor, ExtraEnergies], Tensor],
     search: ContactSearch,
     timeline: Timeline | None,
     active: Contacts,
@@ -121,7 +121,7 @@ def _settled(
     # Shapes that relax on their own, what the bound took from them so far, and springs of the vertices it limits.
     alone, dual, springs = x, torch.zeros_like(x), torch.zeros_like(x[0, :, 0])
     for k in range(1, ROUNDS[1] + 1):
-        # Of a trajectory, wider gaps where it cannot be separated would disturb the shapes beside.
+        # In a trajectory, wider gaps where it cannot be separated would disturb neighbouring shapes.
         gap = GAP if timeline is not None else GAP + WIDER * max(0, k - ROUNDS[0])
         energies = _energies(active.rows(chosen), Pull((x - dual)[chosen].detach(), springs), search.areas, gap)
         alone = x.index_copy(0, chosen, relax(alone[chosen], chosen, energies))
@@ -130,14 +130,14 @@ def _settled(
         else:
             wanted = (alone + dual - start)[chosen]
             if len(chosen) < len(x):
-                wanted = torch.tensordot(through(timeline.t[chosen], timeline.t), wanted, 1)
+                wanted = torch.tensordot(spline_weights(timeline.t[chosen], timeline.t), wanted, 1)
             field, limited = timeline.limit.nearest(wanted)
             x = start + field
             dual = dual.index_add(0, chosen, (alone - x)[chosen])
             springs[limited] = PULL * search.areas[limited]
         some = every if k == ROUNDS[0] else torch.unique(torch.cat([active.shapes, torch.nonzero(n_far).flatten()]))
-        found, counts = search(x, some)
-        active, n_far = found.beside(active), n_far.index_copy(0, some, counts)
+        contacts, counts = search(x, some)
+        active, n_far = contacts.with_former(active), n_far.index_copy(0, some, counts)
         if k < ROUNDS[0]:
             continue
         moved, n_left = float((x - start).detach().norm(dim=-1).max()), int(n_far.sum())
@@ -149,34 +149,34 @@ def _settled(
     return best, n_best
 
 
-def _energies(active: Contacts, pull: Pull, areas: Tensor, gap: float = GAP) -> Beside:
-    """Energies beside the elastic one of the shapes that take steps, of which a slice is relaxed at a time."""
+def _energies(active: Contacts, pull: Pull, areas: Tensor, gap: float = GAP) -> ExtraEnergies:
+    """Further energies of the shapes that take steps, of which a slice is relaxed at a time."""
 
-    def beside(own: slice, like: Tensor) -> Sequence[ContactEnergy | Pull]:
-        some = torch.arange(len(pull.to), device=like.device)[own]
-        springs = [Pull(pull.to[own].to(like), pull.weights.to(like))] if bool(pull.weights.any()) else []
+    def extra(samples: slice, like: Tensor) -> Sequence[ContactEnergy | Pull]:
+        some = torch.arange(len(pull.to), device=like.device)[samples]
+        springs = [Pull(pull.to[samples].to(like), pull.weights.to(like))] if bool(pull.weights.any()) else []
         return [ContactEnergy(active.rows(some), areas, like, gap), *springs]
 
-    return beside
+    return extra
 
 
 def _never_worse(
     start: Tensor, field: Tensor, search: ContactSearch, timeline: Timeline, n_before: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Shapes and their far pairs, with less and less of the displacement at the times where it adds some."""
-    # The others keep as much of it as the bound allows: if it faded out beside them, they would be worse in turn.
-    found, weights = field, torch.ones_like(field[:, 0, 0])
+    # The others keep as much of it as the bound allows: if it faded out next to them, they would become worse.
+    kept, weights = field, torch.ones_like(field[:, 0, 0])
     while True:
-        n_far = search.count(start + found)
+        n_far = search.count(start + kept)
         worse = n_far > n_before
         if not bool(worse.any()):
-            return start + found, n_far
+            return start + kept, n_far
         weights = torch.where(worse, GROWTH * weights, weights)
-        found, _ = timeline.limit.nearest(field * (weights == 1)[:, None, None], weights)
-        found = found * (weights < MOST_WEIGHT)[:, None, None]
+        kept, _ = timeline.limit.nearest(field * (weights == 1)[:, None, None], weights)
+        kept = kept * (weights < MOST_WEIGHT)[:, None, None]
 
 
-def through(times: Tensor, t: Tensor) -> Tensor:
+def spline_weights(times: Tensor, t: Tensor) -> Tensor:
     """Weights of a cubic spline through values at given times, and zero at 0 and 1. *Shape:* ``(T,), (B,) -> (B, T)``.
 
     Their first derivative in ``t`` comes as a gradient.

@@ -42,12 +42,12 @@ class TorchBackend:
     """
 
     quasi_newton: Callable[..., Any] | None = None
-    """Does what :func:`torch_modal.elastic.minimise.updated` does."""
+    """A faster :func:`torch_modal.elastic.minimise.bfgs_update`, if there is one."""
 
     mean_pose, signed_volumes = staticmethod(mean_pose), staticmethod(signed_volumes)
 
     def load(self) -> None:
-        """Load what takes long, so that nobody waits for it later."""
+        """Load what takes long, so that the first call does not wait for it."""
 
     def rotations(self, mesh: Connectivity, references: Tensor) -> LocalRotations:
         """Local rotations of triangles between shapes near references. *Shape:* ``(K, V, 3)``."""
@@ -66,11 +66,11 @@ class TorchBackend:
         return FineEnergy(mesh, terms)
 
     def distortion(self, mesh: Mesh, further: Energy | None) -> Distortion:
-        """A bounded measure of shapes, with terms beside Eq. 5 where there are some."""
+        """A bounded measure of shapes, with the terms beyond Eq. 5 where there are some."""
         return Distortion(mesh, further)
 
     def crossings(self, mesh: Connectivity, shape: FloatArray) -> Callable[[FloatArray], IntArray] | None:
-        """A search for pairs of triangles that cross, near a shape; None: that of ``geometry/crossings.py``."""
+        """A search for pairs of triangles that cross, near a shape; None for ``geometry/crossings.py``."""
         return None
 
 
@@ -95,17 +95,17 @@ class WarpBackend(TorchBackend):
         if importlib.util.find_spec("warp") is None:
             return False
         try:
-            one, found = torch.ones(1, 3, dtype=torch.float64), torch.zeros(1, 3, dtype=torch.float64)
-            launch(kernels("steps").inner, (1, 1), [one, one, 1, found])
-            if found[0, 0] != 3:
-                raise RuntimeError(f"a kernel gave {float(found[0, 0])} for 3")
+            one, total = torch.ones(1, 3, dtype=torch.float64), torch.zeros(1, 3, dtype=torch.float64)
+            launch(kernels("steps").inner, (1, 1), [one, one, 1, total])
+            if total[0, 0] != 3:
+                raise RuntimeError(f"a kernel gave {float(total[0, 0])} for 3")
         except Exception as error:  # whatever keeps Warp from compiling: torch does the same, only slower
             warnings.warn(f"Warp is installed, but its kernels cannot be used, so torch is: {error}", stacklevel=2)
             return False
         return True
 
     def load(self) -> None:
-        """As in the base class: the kernels of in-betweens."""
+        """Load the kernels of in-betweens."""
         load_kernels()
 
     def rotations(self, mesh: Connectivity, references: Tensor) -> WarpRotations:
@@ -114,10 +114,10 @@ class WarpBackend(TorchBackend):
 
     def modal_energy(self, energy: Energy, mesh: Mesh, columns: Tensor) -> ModalEnergy:
         """Overrides the base class."""
-        found = KernelEnergy.of(energy, mesh)
-        if found is None or not found.exact:
+        by_kernel = KernelEnergy.of(energy, mesh)
+        if by_kernel is None or not by_kernel.exact:
             return super().modal_energy(energy, mesh, columns)
-        return KernelModalEnergy(found, columns)
+        return KernelModalEnergy(by_kernel, columns)
 
     def fine_energy(self, mesh: Mesh, terms: Sequence[Term]) -> FineEnergy:
         """Overrides the base class."""

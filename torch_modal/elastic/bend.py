@@ -12,7 +12,7 @@ from torch_modal.geometry.vectors import cross, inverse, norm, tiny
 # Eq. 5 divides by rest areas: l^2 / A has this bound, for needles; an equilateral hinge has 1.15.
 MAX_BENDING_RATIO = 1e3
 
-# Altitude of a triangle over its edge below which the triangle has no normal worth the name.
+# Altitude of a triangle over its edge below which its normal is rounding.
 COLLAPSED = 1e-6
 
 # Altitude of a triangle over its longest side at which fullness() is a half, in the modal solve and for the steps of
@@ -54,8 +54,8 @@ class SquaredBend(Term):
         """In closed form: by ``torch.func``, an in-between in torch takes 1.2 to 1.4 times as long."""
         return dihedral_gradient(edge_vectors)
 
-    def linearised(self, edge_vectors: Tensor) -> tuple[Tensor, Tensor]:
-        """Both from the same normals."""
+    def measures_and_gradients(self, edge_vectors: Tensor) -> tuple[Tensor, Tensor]:
+        """Angles and their gradients from the same normals."""
         hinges = normals(edge_vectors)
         return dihedral_angle(edge_vectors, hinges), dihedral_gradient(edge_vectors, hinges)
 
@@ -73,13 +73,13 @@ class Bend(PeriodicTerm, SquaredBend):
     def softening(self, start: Tensor, rest: Tensor, weights: Tensor | None) -> Tensor:
         """Less stiffness at needles: their gradient has no bound, and minimisers would turn their normals over.
 
-        By :func:`fullness`, or by its ratio to that of rest shapes. Arguments as in the base class.
+        The factor is :func:`fullness`, or its ratio to the fullness of the rest shapes.
         """
         if weights is None:
             return fullness(start, NEEDLE)
         usual = (weights[..., None] * fullness(rest, NEEDLE_OF_STEPS)).sum(1).clamp_min(LEAST_FULLNESS)
-        part = (fullness(start, NEEDLE_OF_STEPS) / usual).clamp_max(1)
-        return part * part * (3 - 2 * part)
+        ratio = (fullness(start, NEEDLE_OF_STEPS) / usual).clamp_max(1)
+        return ratio * ratio * (3 - 2 * ratio)
 
     def kernel_functions(self, n: int) -> KernelFunctions | None:
         """Functions of hinges; of a class that inherits from this one, its own."""
@@ -90,7 +90,7 @@ def normals(edge_vectors: Tensor) -> tuple[Tensor, ...]:
     """Normals of both triangles of a hinge, where one has none, and the edge's length. *Shape:* ``(3, 3, ...)``."""
     e, a, b = edge_vectors
     n1, n2 = cross(e, a), cross(b, e)
-    return n1, n2, collapsed(e, n1) | collapsed(e, n2), norm(e)
+    return n1, n2, is_collapsed(e, n1) | is_collapsed(e, n2), norm(e)
 
 
 def dihedral_angle(edge_vectors: Tensor, hinges: tuple[Tensor, ...] | None = None) -> Tensor:
@@ -146,7 +146,7 @@ def dihedral_hessian(edge_vectors: Tensor) -> Tensor:
     e, a, b = edge_vectors
     n1, n2, flat, length = normals(edge_vectors)
     per_length = inverse(length, flat)
-    own = e.new_zeros(())
+    edge_block = e.new_zeros(())
     with_itself, with_edge = [], []
     for normal, tip, w in ((n1, a, cross(n1, e)), (n2, b, cross(e, n2))):
         area = (normal * normal).sum(0)
@@ -156,11 +156,11 @@ def dihedral_hessian(edge_vectors: Tensor) -> Tensor:
         s = half + half.transpose(0, 1)
         u = e[:, None] * (normal * (per_length * per_area))
         r = (tip * e).sum(0) * per_length * per_length
-        own = own + (r * r + 0.5 * area * per_length**4) * s - r * (u + u.transpose(0, 1))
+        edge_block = edge_block + (r * r + 0.5 * area * per_length**4) * s - r * (u + u.transpose(0, 1))
         with_itself.append(s)
         with_edge.append(u - r * s)
-    (a_a, b_b), (a_e, b_e), none = with_itself, with_edge, torch.zeros_like(own)
-    rows = (own, a_e.transpose(0, 1), b_e.transpose(0, 1)), (a_e, a_a, none), (b_e, none, b_b)
+    (a_a, b_b), (a_e, b_e), none = with_itself, with_edge, torch.zeros_like(edge_block)
+    rows = (edge_block, a_e.transpose(0, 1), b_e.transpose(0, 1)), (a_e, a_a, none), (b_e, none, b_b)
     return torch.stack([torch.stack(row, 1) for row in rows])
 
 
@@ -173,7 +173,7 @@ def fullness(edge_vectors: Tensor, needle: float) -> Tensor:
     return (squared * inverse(squared + (needle * longest).square(), longest <= 0)).prod(0)
 
 
-def collapsed(edge: Tensor, normal: Tensor) -> Tensor:
+def is_collapsed(edge: Tensor, normal: Tensor) -> Tensor:
     """True for triangles without an altitude on this edge. *Shape:* ``(3, ...), (3, ...) -> (...)``."""
     bound = max(COLLAPSED, 100 * torch.finfo(edge.dtype).eps)
     base = (edge * edge).sum(0)
@@ -226,31 +226,31 @@ def kernel_functions() -> KernelFunctions:
     @wp.func
     def measure(x: mat33):
         h = hinge_of(x)
-        found = vec2(real(1.0), real(0.0))
+        result = vec2(real(1.0), real(0.0))
         if not h.flat:
-            found = phase(h, x)
-        return found
+            result = phase(h, x)
+        return result
 
     @wp.func
-    def linearised(x: mat33):
+    def linearise(x: mat33):
         h = hinge_of(x)
-        found = vec2(real(1.0), real(0.0))
+        result = vec2(real(1.0), real(0.0))
         gradient = mat33()
         if not h.flat:
-            found = phase(h, x)
+            result = phase(h, x)
             e = x[0]
             to_a = (-h.length * h.per1) * h.n1
             to_b = (-h.length * h.per2) * h.n2
             per = real(1.0) / h.length
             to_e = (-per * per) * (wp.dot(x[1], e) * to_a + wp.dot(x[2], e) * to_b)
             gradient = wp.matrix_from_rows(to_e, to_a, to_b)
-        return found, gradient
+        return result, gradient
 
     @wp.func
-    def turned(x: mat33, d: mat33):
+    def hessian_product(x: mat33, d: mat33):
         """By hand: ``wp.grad`` of the gradient takes twice the time, a tenth of a backward pass."""
         h = hinge_of(x)
-        found = mat33()
+        result = mat33()
         if not h.flat:
             two = real(2.0)
             e = x[0]
@@ -267,8 +267,8 @@ def kernel_functions() -> KernelFunctions:
             to_n2 = (-h.length * h.per2) * (to_b - (two * along_b) * h.n2)
             to_e = wp.cross(x[1], to_n1) + wp.cross(to_n2, x[2]) - ((along_a + along_b) / h.length) * e
             to_e += to_part_a * (x[1] - (two * part_a) * e) + to_part_b * (x[2] - (two * part_b) * e)
-            found = wp.matrix_from_rows(to_e, wp.cross(to_n1, e) + to_part_a * e, wp.cross(e, to_n2) + to_part_b * e)
-        return found
+            result = wp.matrix_from_rows(to_e, wp.cross(to_n1, e) + to_part_a * e, wp.cross(e, to_n2) + to_part_b * e)
+        return result
 
     @wp.func
     def weight(x: mat33, q: vec2, mean: real):
@@ -279,10 +279,10 @@ def kernel_functions() -> KernelFunctions:
         square1 = wp.dot(n1, n1)
         square2 = wp.dot(n2, n2)
         bound = flatness * base
-        found = real(0.0)
+        result = real(0.0)
         if wp.min(square1, square2) > bound * bound + tiny_square:
-            found = wp.min(real(2.0) * base / (wp.sqrt(square1) + wp.sqrt(square2)), ratio)
-        return found
+            result = wp.min(real(2.0) * base / (wp.sqrt(square1) + wp.sqrt(square2)), ratio)
+        return result
 
     @wp.func
     def fullness(x: mat33, altitude: real):
@@ -295,9 +295,12 @@ def kernel_functions() -> KernelFunctions:
         square1 = wp.dot(n1, n1)
         square2 = wp.dot(n2, n2)
         both = (square1 + altitude * longest1 * longest1) * (square2 + altitude * longest2 * longest2)
-        found = real(0.0)
+        result = real(0.0)
         if both > real(0.0):
-            found = square1 * square2 / both
-        return found
+            result = square1 * square2 / both
+        return result
 
-    return KernelFunctions("bend", 3, periodic(), measure, linearised, turned=turned, weight=weight, fullness=fullness)
+    values = measure, linearise
+    return KernelFunctions(
+        "bend", 3, periodic(), *values, hessian_product=hessian_product, weight=weight, fullness=fullness
+    )

@@ -30,14 +30,14 @@ class WarpPairs:
     def __call__(self, x: FloatArray) -> IntArray:
         """The pairs, in no order. *Shape:* ``(V, 3) -> (P, 2)``."""
         n, room = len(self.order), ROOM
-        own, number = torch.as_tensor(x).contiguous(), torch.zeros(1, dtype=torch.int32)
+        positions, number = torch.as_tensor(x).contiguous(), torch.zeros(1, dtype=torch.int32)
         boxes = torch.empty(2 * n, 6, dtype=torch.float64)
         # Of a pair, at most two more stay behind on each level.
         stack = torch.empty(4 * n.bit_length() + 1, 2, dtype=torch.int32)
         while True:
             pairs = torch.empty(room, 2, dtype=torch.int32)
-            given = [own, self._corners, n, boxes, stack, room, pairs, number]
-            launch(kernels("crossings").crossing, (1,), given)
+            args = [positions, self._corners, n, boxes, stack, room, pairs, number]
+            launch(kernels("crossings").crossing, (1,), args)
             if int(number) <= room:
                 return self.order[pairs[: int(number)].numpy()]
             room = int(number)

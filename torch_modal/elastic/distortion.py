@@ -10,9 +10,9 @@ from torch import Tensor, nn
 
 from torch_modal.autograd import plain
 from torch_modal.elastic import bend, stretch
-from torch_modal.elastic.bend import collapsed, dihedral_angle
+from torch_modal.elastic.bend import dihedral_angle, is_collapsed
 from torch_modal.elastic.energy import Energy, RestShapes
-from torch_modal.elastic.kernels.launch import launch, made
+from torch_modal.elastic.kernels.launch import launch, make_once
 from torch_modal.elastic.shell import N_SHELL_TERMS
 from torch_modal.elastic.steps import TermsTowards
 from torch_modal.elastic.term import Mesh, periodic_square
@@ -27,7 +27,7 @@ LARGEST_STRAIN = 4.0
 # Bound on the weight l^2 / A of a hinge with a needle; an equilateral hinge has 1.15.
 LARGEST_WEIGHT = 8.0
 
-# Strain of all edges below which hardly anybody sees a difference.
+# Strain of all edges below which differences are hardly visible.
 SLIGHT = 0.02
 
 
@@ -76,13 +76,13 @@ class Distortion(nn.Module):
         """The distortion of S shapes of each sample. *Shape of each:* ``(B, V, 3) -> (S, B)``."""
         total = self.of_shell(shapes, rests)
         if self.further is not None:
-            terms = TermsTowards.among(self.further, range(N_SHELL_TERMS, len(rests.stiffness)), rests)
+            terms = TermsTowards.of_terms(self.further, range(N_SHELL_TERMS, len(rests.stiffness)), rests)
             total = total + torch.stack([terms.value(x) for x in shapes])
         return total
 
     def of_shell(self, shapes: Sequence[Tensor], rests: RestShapes) -> Tensor:
         """Stretching and bending. *Shape of each:* ``(B, V, 3) -> (S, B)``."""
-        # All shapes at once: the cost of so few elements is that of the number of operations.
+        # All shapes at once: for so few elements, the number of operations determines the time.
         rows = self._rows(*shapes, *rests.shapes.unbind(1))
         hinges = _edge_vectors(rows, self.hinges)
         n, lengths, angles = len(shapes), norm(_edge_vectors(rows, self.edges)[0]), dihedral_angle(hinges)
@@ -95,7 +95,7 @@ class Distortion(nn.Module):
     def on_elements(self, stiffness: Sequence[Tensor]) -> list[Tensor]:
         """Stiffnesses of the edges and hinges that are looked at. *Shape of each:* ``(B, M)`` or ``(B, 1)``."""
         pairs = zip(stiffness, (self.edge, self.hinge), strict=False)
-        return [values if values.shape[-1] == 1 else values[:, own] for values, own in pairs]
+        return [values if values.shape[-1] == 1 else values[:, chosen] for values, chosen in pairs]
 
     def slight(self, stiffness: Sequence[Tensor], like: Tensor) -> Tensor:
         """The distortion of a shape whose edges are all strained by :data:`SLIGHT`. *Shape:* ``(B,)``."""
@@ -116,26 +116,26 @@ class KernelDistortion(Distortion):
 
     def __init__(self, mesh: Mesh, further: Energy | None) -> None:
         super().__init__(mesh, further)
-        for name, own in (("elements", self.edges), ("hinged", self.hinges)):
-            self.register_buffer(name, self.vertices[own].T.int().contiguous(), persistent=False)
+        for name, places in (("elements", self.edges), ("hinged", self.hinges)):
+            self.register_buffer(name, self.vertices[places].T.int().contiguous(), persistent=False)
 
     def of_shell(self, shapes: Sequence[Tensor], rests: RestShapes) -> Tensor:
         """Overrides the base class."""
         values = *shapes, rests.shapes, rests.weights, *rests.stiffness[:2]
         if torch.is_grad_enabled() or not plain(*values):
             return super().of_shell(shapes, rests)
-        given = [x.double().contiguous() for x in (torch.stack([*shapes]), rests.shapes, rests.weights)]
+        args = [x.double().contiguous() for x in (torch.stack([*shapes]), rests.shapes, rests.weights)]
         stiffness = [x.double().contiguous() for x in self.on_elements(rests.stiffness)]
         (n_samples, n_rests), n_vertices = rests.weights.shape, shapes[0].shape[1]
-        found = given[0].new_zeros(len(shapes), n_samples, 2)
+        sums = args[0].new_zeros(len(shapes), n_samples, 2)
         sizes = [len(shapes), n_samples, n_rests, n_vertices, *(x.shape[-1] for x in stiffness)]
-        given += stiffness
+        args += stiffness
         launch(
-            made(kernels).distortion,
+            make_once(kernels).distortion,
             (n_samples, len(self.elements)),
-            [self.elements, self.hinged, *given, *sizes, found],
+            [self.elements, self.hinged, *args, *sizes, sums],
         )
-        return (found @ found.new_tensor(self.shares)).to(rests.weights)
+        return (sums @ sums.new_tensor(self.shares)).to(rests.weights)
 
 
 @cache
@@ -176,8 +176,8 @@ def kernels() -> SimpleNamespace:
                 factor = weights[r] * alpha[place(s * n_alpha, wp.min(k, n_alpha - 1))]
                 for j in range(n_shapes):
                     off = wp.abs(length_of(x, (j * n_samples + s) * n_vertices, q) - rest)
-                    found = factor * off * wp.min(off / rest, largest_strain)
-                    wp.atomic_add(out, place(j * n_samples, s), vec2(found, real(0.0)))
+                    contribution = factor * off * wp.min(off / rest, largest_strain)
+                    wp.atomic_add(out, place(j * n_samples, s), vec2(contribution, real(0.0)))
         for k in range(i - s * threads, hinges.shape[0], threads):
             q4 = hinges[place(k, 0)]
             sums = potential.sums()
@@ -187,11 +187,11 @@ def kernels() -> SimpleNamespace:
                 pull = weights[r] * wp.min(hinge.weight(e, phase, real(0.0)), largest_weight)
                 sums += potential.moments(phase, pull)
             factor = beta[place(s * n_beta, wp.min(k, n_beta - 1))]
-            to = potential.merged(sums, factor)
+            to = potential.merge_rests(sums, factor)
             left = potential.left(sums, factor, to)
             for j in range(n_shapes):
-                found = potential.energy(hinge.measure(hinge_of(x, (j * n_samples + s) * n_vertices, q4)), to)
-                wp.atomic_add(out, place(j * n_samples, s), vec2(real(0.0), found + left))
+                contribution = potential.energy(hinge.measure(hinge_of(x, (j * n_samples + s) * n_vertices, q4)), to)
+                wp.atomic_add(out, place(j * n_samples, s), vec2(real(0.0), contribution + left))
 
     return SimpleNamespace(module=module, distortion=distortion)
 
@@ -206,5 +206,5 @@ def _weights(edge_vectors: Tensor) -> Tensor:
     """The bounded weights of hinges; 0 where a triangle has collapsed. *Shape:* ``(3, 3, ..., H) -> (..., H)``."""
     e, a, b = edge_vectors
     n1, n2 = cross(e, a), cross(b, e)
-    weight = 2 * (e * e).sum(0) * inverse(norm(n1) + norm(n2), collapsed(e, n1) | collapsed(e, n2))
+    weight = 2 * (e * e).sum(0) * inverse(norm(n1) + norm(n2), is_collapsed(e, n1) | is_collapsed(e, n2))
     return weight.clamp_max(LARGEST_WEIGHT)

@@ -1,7 +1,7 @@
 """An energy of several terms on one mesh: values, gradients, and products with a convex Hessian.
 
-Components come first, ``(3, ..., V)``. Shapes are *extended* by the vertices that elements may have beside those of
-the mesh: its centre, and the anchors of the terms.
+Components come first, ``(3, ..., V)``. Shapes are *extended* by further vertices that elements may have: the centre of
+the mesh, and the anchors of the terms.
 """
 
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ from torch_modal.geometry.vectors import pick
 
 
 def energy_rounding(dtype: torch.dtype) -> float:
-    """Difference of energies, relative to them, that says nothing about a step."""
+    """Relative difference of energies that is rounding."""
     return 64.0 * torch.finfo(dtype).eps
 
 
@@ -33,13 +33,13 @@ class Reference(NamedTuple):
     """K rest shapes of each sample as one: what the terms compare their measures with."""
 
     records: tuple[Tensor, ...]
-    """Of each term the rows of :meth:`torch_modal.elastic.term.Term.merged`, the stiffness included; the first is that
-    of the weights. *Shape of each:* ``(..., R, M)``; for kernels ``(B, M, R)``."""
+    """Record of each term (:meth:`torch_modal.elastic.term.Term.merge_rests`), with the stiffness; its first row is the
+    weight. *Shape of each:* ``(..., R, M)``; for kernels ``(B, M, R)``."""
     constant: Tensor
     """The energy that remains, whatever the shape. *Shape:* ``(...)``."""
 
-    def turned(self) -> "Reference":
-        """The records of torch as those of kernels, or the other way round."""
+    def transpose(self) -> "Reference":
+        """Records in the layout of kernels from the layout of torch, or the other way round."""
         return Reference(tuple(record.mT.contiguous() for record in self.records), self.constant)
 
 
@@ -51,7 +51,7 @@ class Linearised(NamedTuple):
     measures: Tensor
     """*Shape:* ``(B, M)``; M is 1 of a total, here and below."""
     gradients: Tensor
-    """Of the measures in the edge vectors, *shape* ``(n-1, 3, B, M)``; of a total in the vertices, ``(3, B, V)``."""
+    """Gradients in the edge vectors, *shape* ``(n-1, 3, B, M)``; of a total, in the vertices, *shape* ``(3, B, V)``."""
     slope: Tensor
     """First derivative of the energy in each measure. *Shape:* ``(B, M)``."""
     curvature: Tensor
@@ -61,18 +61,18 @@ class Linearised(NamedTuple):
 
 
 def _outlasting_buffers(module: nn.Module) -> None:
-    """Terms may have been made in inference mode, or of tensors that were."""
-    for part in module.modules():
-        for name, buffer in part.named_buffers(recurse=False):
+    """Replace buffers that are inference tensors: terms may have been made in inference mode."""
+    for child in module.modules():
+        for name, buffer in child.named_buffers(recurse=False):
             if buffer.is_inference():
-                setattr(part, name, lasting(buffer.clone)())
+                setattr(child, name, lasting(buffer.clone)())
 
 
-class OnMesh(nn.Module):
+class AssembledTerm(nn.Module):
     """A term on a mesh.
 
     Args:
-        term: The term. It is not registered here: terms serve several meshes, and belong to who made them.
+        term: The term. It is not registered here: a term serves several meshes and is owned by the layer.
         elements: Numbers of the vertices of each element. *Shape:* ``(M, n)``.
     """
 
@@ -94,7 +94,7 @@ class OnMesh(nn.Module):
         measures = self.term.measures(edge_vectors)
         return measures.sum(-1, keepdim=True) if self.term.total else measures
 
-    def merged(
+    def merge_rests(
         self,
         rows: Tensor,
         weights: Tensor,
@@ -106,10 +106,10 @@ class OnMesh(nn.Module):
         edge_vectors = self.edge_vectors(rows)
         measures = self.measures(edge_vectors)
         if start is not None:
-            own = self.term.softening(self.edge_vectors(start), edge_vectors, weights if relative else None)
-            stiffness = stiffness if own is None else own * stiffness
+            factor = self.term.softening(self.edge_vectors(start), edge_vectors, weights if relative else None)
+            stiffness = stiffness if factor is None else factor * stiffness
         pulls = weights[..., None] * self.term.weights(edge_vectors, measures).expand_as(measures)
-        return self.term.merged(self.term.at_rest(measures), pulls, stiffness)
+        return self.term.merge_rests(self.term.at_rest(measures), pulls, stiffness)
 
     def on_elements(self, weights: Tensor) -> Tensor:
         """Weights of vertices on the elements: means of their corners. *Shape:* ``(..., V) -> (..., M or 1)``."""
@@ -119,10 +119,10 @@ class OnMesh(nn.Module):
         """From the edge vectors to each vertex of the elements. *Shape:* ``(n-1, 3, ..., M)``; ``(3, ..., M)`` each."""
         return [-on_edge_vectors.sum(0), *on_edge_vectors]
 
-    def scattered(self, out: Tensor, on_edge_vectors: Tensor) -> Tensor:
+    def scatter_vectors(self, out: Tensor, on_edge_vectors: Tensor) -> Tensor:
         """Values of the vertices, and what the edge vectors give to them. *Shape:* ``(3, ..., V)``."""
-        for corner, own in zip(self.corners, self.on_corners(on_edge_vectors), strict=True):
-            out = out.index_add(-1, corner, own)
+        for corner, value in zip(self.corners, self.on_corners(on_edge_vectors), strict=True):
+            out = out.index_add(-1, corner, value)
         return out
 
 
@@ -146,30 +146,31 @@ class Energy(nn.Module):
         n_anchors = [0 if term.anchors is None else len(term.anchors) for term in terms]
         for term, more in zip(terms, n_anchors, strict=True):
             _outlasting_buffers(term)
-            own, last = term.elements(mesh), n + more
-            if own.dim() != 2 or own.shape[1] < 2 or own.is_floating_point():
+            corners, last = term.elements(mesh), n + more
+            if corners.dim() != 2 or corners.shape[1] < 2 or corners.is_floating_point():
                 raise ValueError(
-                    f"{type(term).__name__}.elements gave {tuple(own.shape)} of {own.dtype}; they are rows of two "
-                    "vertex indices or more, (M, n)"
+                    f"{type(term).__name__}.elements gave {tuple(corners.shape)} of {corners.dtype}; they are rows of "
+                    "two vertex indices or more, (M, n)"
                 )
-            if own.numel() and not 0 <= int(own.min()) <= int(own.max()) <= last:
+            lowest, highest = (int(corners.min()), int(corners.max())) if corners.numel() else (0, last)
+            if not 0 <= lowest <= highest <= last:
                 raise ValueError(
-                    f"{type(term).__name__}.elements gave vertices from {int(own.min())} to {int(own.max())}; they are "
-                    f"0 to {last}: those of the mesh, its centre, and the anchors of the term"
+                    f"{type(term).__name__}.elements gave vertices from {lowest} to {highest}; they are 0 to {last}: "
+                    "vertices of the mesh, its centre, and the anchors of the term"
                 )
-            elements.append(own)
+            elements.append(corners)
         vertices = torch.arange(n)
         if sampled:
-            vertices = torch.cat([own.flatten() for own in elements]).unique()
+            vertices = torch.cat([corners.flatten() for corners in elements]).unique()
             vertices = vertices[vertices < n]
         self.n_vertices = len(vertices)
-        # The numbers that the mesh's vertices and its centre have here; each term's anchors follow those before.
+        # Indices of the mesh's vertices and its centre in the extended shape; the anchors of the terms follow in order.
         numbers = torch.full((n + 1,), -1).index_copy(0, vertices, torch.arange(self.n_vertices))
         numbers[n] = -1 if sampled else n
         parts, self.n_extended = [], self.n_vertices + 1
-        for term, own, more in zip(terms, elements, n_anchors, strict=True):
+        for term, corners, more in zip(terms, elements, n_anchors, strict=True):
             anchors = torch.arange(self.n_extended, self.n_extended + more)
-            parts.append(OnMesh(term, torch.cat([numbers, anchors])[own]))
+            parts.append(AssembledTerm(term, torch.cat([numbers, anchors])[corners]))
             self.n_extended += more
         self.parts = nn.ModuleList(parts)
         self.sampled = sampled
@@ -179,8 +180,8 @@ class Energy(nn.Module):
 
     @property
     def anchors(self) -> Tensor | None:
-        """Those of all terms, in the caller's coordinates; None where there are none. *Shape:* ``(P, 3)``."""
-        points = [part.term.anchors for part in self.parts if part.term.anchors is not None]
+        """Anchors of all terms, in the caller's coordinates; None where there are none. *Shape:* ``(P, 3)``."""
+        points = [summand.term.anchors for summand in self.parts if summand.term.anchors is not None]
         return torch.cat(points) if points else None
 
     # ------------------------------------------------------------------------------------------------------- vertices
@@ -201,25 +202,25 @@ class Energy(nn.Module):
     def fold(self, extended: Tensor) -> Tensor:
         """The adjoint of :meth:`extend`: distributes the centre's value to the vertices. *Shape:* ``(3, ..., V)``."""
         share = extended[..., self.n_vertices, None] / len(self.used)
-        own = extended[..., : self.n_vertices].contiguous()
-        return own.index_add(-1, self.used, share.expand(*share.shape[:-1], len(self.used)).contiguous())
+        values = extended[..., : self.n_vertices].contiguous()
+        return values.index_add(-1, self.used, share.expand(*share.shape[:-1], len(self.used)).contiguous())
 
     # ---------------------------------------------------------------------------------------------------- references
     def rest(self, extended: Tensor) -> Rest:
         """Measures and weights of rest shapes. *Shape:* ``(3, ..., V)``, extended."""
         measures, weights = [], []
-        for part in self.parts:
-            edge_vectors = part.edge_vectors(extended)
-            found = part.measures(edge_vectors)
-            measures.append(part.term.at_rest(found))
-            weights.append(part.term.weights(edge_vectors, found))
+        for summand in self.parts:
+            edge_vectors = summand.edge_vectors(extended)
+            values = summand.measures(edge_vectors)
+            measures.append(summand.term.at_rest(values))
+            weights.append(summand.term.weights(edge_vectors, values))
         return Rest(tuple(measures), tuple(weights))
 
     def rest_of(self, x: Tensor) -> Rest:
         """The rest shape from vertices alone. *Shape:* ``(B, V, 3)``."""
         return self.rest(self.extend(x.movedim(-1, 0).contiguous()))
 
-    def merged(self, rest: Rest, weights: Tensor, stiffness: Sequence[float | Tensor]) -> Reference:
+    def merge_rests(self, rest: Rest, weights: Tensor, stiffness: Sequence[float | Tensor]) -> Reference:
         r"""K rest shapes as one: :math:`\sum_k s_k \sum w_k (q - q_k)^2`, by Eq. 8 for any number of them.
 
         Args:
@@ -228,69 +229,69 @@ class Energy(nn.Module):
             stiffness: Of each term: a number, or *shape* ``(..., M)`` or ``(..., 1)``.
         """
         records, constant = [], torch.zeros_like(weights[..., 0])
-        for part, measures, own, factor in zip(self.parts, rest.measures, rest.weights, stiffness, strict=True):
-            record, left = part.term.merged(measures, weights[..., None] * own.expand_as(measures), factor)
+        for summand, measures, own, factor in zip(self.parts, *rest, stiffness, strict=True):
+            record, left = summand.term.merge_rests(measures, weights[..., None] * own.expand_as(measures), factor)
             records.append(record)
             constant = constant + left.sum(-1)
         return Reference(tuple(records), constant)
 
     def mixed(self, rest: Rest, weights: Tensor) -> Rest:
-        """One rest shape whose measures are weighted sums of those of K shapes.
+        """One rest shape whose measures are weighted sums of the measures of K shapes.
 
-        Where weights differ from vertex to vertex, or are far below zero, :meth:`merged` asks for harmonic means.
+        Where weights differ from vertex to vertex, or are far below zero, :meth:`merge_rests` asks for harmonic means.
 
         Args:
             rest: Of K shapes.
             weights: They add up to one. *Shape:* ``(K, V)``.
         """
         measures, stiffness = [], []
-        for part, values, pulls in zip(self.parts, rest.measures, rest.weights, strict=True):
-            own, pulls = part.on_elements(weights), pulls.expand_as(values)
-            measures.append((own * part.term.on_one_branch(values, pulls)).sum(-2))
-            stiffness.append((own * pulls).sum(-2).clamp_min(0))
+        for summand, values, pulls in zip(self.parts, rest.measures, rest.weights, strict=True):
+            element_weights, pulls = summand.on_elements(weights), pulls.expand_as(values)
+            measures.append((element_weights * summand.term.on_one_branch(values, pulls)).sum(-2))
+            stiffness.append((element_weights * pulls).sum(-2).clamp_min(0))
         return Rest(tuple(measures), tuple(stiffness))
 
     def against(self, rest: Rest, stiffness: Sequence[float | Tensor]) -> Reference:
         """One rest shape as the reference."""
         alone = Rest(*(tuple(values.unsqueeze(-2) for values in each) for each in rest))
-        return self.merged(alone, torch.ones_like(rest.measures[0][..., :1]), stiffness)
+        return self.merge_rests(alone, torch.ones_like(rest.measures[0][..., :1]), stiffness)
 
     # --------------------------------------------------------------------------------------------------------- values
     def value(self, extended: Tensor, reference: Reference) -> Tensor:
         """The energy of shapes. *Shape:* ``(3, ..., V) -> (...)``."""
         total: Any = reference.constant
-        for part, record in zip(self.parts, reference.records, strict=True):
-            total = total + part.term.energies(part.measures(part.edge_vectors(extended)), record).sum(-1)
+        for summand, record in zip(self.parts, reference.records, strict=True):
+            total = total + summand.term.energies(summand.measures(summand.edge_vectors(extended)), record).sum(-1)
         return total
 
     # ---------------------------------------------------------------------------------------------------- derivatives
     def linearise(self, extended: Tensor, reference: Reference) -> list[Linearised]:
         """All terms at given shapes. *Shape:* ``(3, B, V)``, extended."""
-        found = []
-        for part, record in zip(self.parts, reference.records, strict=True):
-            edge_vectors = part.edge_vectors(extended)
-            measures, gradients = part.term.linearised(edge_vectors)
-            if part.term.total:
+        each = []
+        for summand, record in zip(self.parts, reference.records, strict=True):
+            edge_vectors = summand.edge_vectors(extended)
+            measures, gradients = summand.term.measures_and_gradients(edge_vectors)
+            if summand.term.total:
                 measures = measures.sum(-1, keepdim=True)
-                gradients = part.scattered(torch.zeros_like(extended), gradients)
-            slope, curvatures = part.term.slopes(measures, record), part.term.curvatures(measures, record)
-            found.append(Linearised(edge_vectors, measures, gradients, slope, *curvatures))
-        return found
+                gradients = summand.scatter_vectors(torch.zeros_like(extended), gradients)
+            slope, curvatures = summand.term.slopes(measures, record), summand.term.curvatures(measures, record)
+            each.append(Linearised(edge_vectors, measures, gradients, slope, *curvatures))
+        return each
 
     def value_at(self, at: Sequence[Linearised], reference: Reference) -> Tensor:
-        """The energy of shapes that were linearised. *Shape:* ``(B,)``."""
-        found: Any = reference.constant
-        for part, one, record in zip(self.parts, at, reference.records, strict=True):
-            found = found + part.term.energies(one.measures, record).sum(-1)
-        return found
+        """The energy of linearised shapes. *Shape:* ``(B,)``."""
+        total: Any = reference.constant
+        for summand, one, record in zip(self.parts, at, reference.records, strict=True):
+            total = total + summand.term.energies(one.measures, record).sum(-1)
+        return total
 
     def rates(self, at: Sequence[Linearised], field: Tensor) -> list[Tensor]:
         """First change of the measures with a displacement. *Shape:* ``(3, B, V)``, extended; ``(B, M)`` of each."""
         return [
             (one.gradients * field).sum((0, -1))[:, None]
-            if part.term.total
-            else (one.gradients * part.edge_vectors(field)).sum((0, 1))
-            for part, one in zip(self.parts, at, strict=True)
+            if summand.term.total
+            else (one.gradients * summand.edge_vectors(field)).sum((0, 1))
+            for summand, one in zip(self.parts, at, strict=True)
         ]
 
     def scatter(self, at: Sequence[Linearised], on_elements: Sequence[Tensor]) -> Tensor:
@@ -305,14 +306,15 @@ class Energy(nn.Module):
             *Shape:* ``(3, B, V)``, extended.
         """
         out = on_elements[0].new_zeros(*at[0].gradients.shape[-3:-1], self.n_extended)
-        for part, one, received in zip(self.parts, at, on_elements, strict=True):
-            out = out + received * one.gradients if part.term.total else part.scattered(out, received)
+        for summand, one, received in zip(self.parts, at, on_elements, strict=True):
+            out = out + received * one.gradients if summand.term.total else summand.scatter_vectors(out, received)
         return out
 
     def gradient(self, at: Sequence[Linearised]) -> Tensor:
         """Gradient of the energy. *Shape:* ``(3, B, V)``, extended."""
-        parts = zip(self.parts, at, strict=True)
-        return self.scatter(at, [one.slope if part.term.total else one.slope * one.gradients for part, one in parts])
+        pairs = zip(self.parts, at, strict=True)
+        slopes = [one.slope if summand.term.total else one.slope * one.gradients for summand, one in pairs]
+        return self.scatter(at, slopes)
 
 
 class RestShapes(NamedTuple):
@@ -345,6 +347,6 @@ class RestShapes(NamedTuple):
         if start is not None:
             begin = energy.extend(start.movedim(-1, 0))
         pairs = zip(energy.parts, self.stiffness, strict=True)
-        found = [part.merged(rows, self.weights, own, begin, relative) for part, own in pairs]
-        records, left = zip(*found, strict=True)
+        merged = [summand.merge_rests(rows, self.weights, own, begin, relative) for summand, own in pairs]
+        records, left = zip(*merged, strict=True)
         return Reference(records, sum((own.sum(-1) for own in left), start=torch.zeros_like(self.weights[:, 0])))

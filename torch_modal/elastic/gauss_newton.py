@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from torch_modal.autograd import full_precision, untraced
-from torch_modal.elastic.minimise import AmplitudeEnergy, Solution, Status, ridged
+from torch_modal.elastic.minimise import AmplitudeEnergy, Solution, Status, add_ridge
 from torch_modal.elastic.modal import Derivatives
 
 # Parts of a step that are tried side by side.
@@ -93,7 +93,7 @@ def _directions(derivatives: Derivatives, damping: float | None) -> Tensor:
     *Shape:* ``(2, B, n)``.
     """
     hessians = torch.stack([derivatives.gauss_newton, derivatives.hessian])
-    hessians = ridged(hessians, damping)
+    hessians = add_ridge(hessians, damping)
     factor, info = torch.linalg.cholesky_ex(hessians)
     definite = info == 0
     if torch.is_grad_enabled():

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch_modal import trees
 from torch_modal.autograd import applied, flattened, recorded, transposed
 from torch_modal.elastic.gauss_newton import newton
-from torch_modal.elastic.minimise import AmplitudeEnergy, Solution, Status, minimise, ridged
+from torch_modal.elastic.minimise import AmplitudeEnergy, Solution, Status, add_ridge, minimise
 from torch_modal.threads import warn
 
 Inverse = Callable[[Any, Tensor, Any, Tensor], Callable[[Tensor], Tensor]]
@@ -61,9 +61,9 @@ class _ArgMin(torch.autograd.Function):
 
     @staticmethod
     def vmap(
-        info: Any, in_dims: tuple[Any, ...], energy: AmplitudeEnergy, limits: Any, tree: Any, *given: Tensor
+        info: Any, in_dims: tuple[Any, ...], energy: AmplitudeEnergy, limits: Any, tree: Any, *tensors: Tensor
     ) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
-        output = _ArgMin.apply(energy, limits, tree, *flattened(info.batch_size, in_dims[3:], given))
+        output = _ArgMin.apply(energy, limits, tree, *flattened(info.batch_size, in_dims[3:], tensors))
         return tuple(value.unflatten(0, (info.batch_size, -1)) for value in output), (0,) * len(output)
 
 
@@ -91,15 +91,15 @@ def dense_inverse(
     energy: AmplitudeEnergy, amplitudes: Tensor, placement: Any, converged: Tensor
 ) -> Callable[[Tensor], Tensor]:
     """Products with the inverse of the full Hessian; zero for samples that did not converge. *Shape:* ``(B, n)``."""
-    hessian = ridged(energy.derivatives(amplitudes, placement).hessian)
+    hessian = add_ridge(energy.derivatives(amplitudes, placement).hessian)
     eye = torch.eye(hessian.shape[-1], dtype=hessian.dtype, device=hessian.device)
     matrix = torch.where(converged[:, None, None], hessian, eye)
 
     def solve(right: Tensor) -> Tensor:
-        found, info = torch.linalg.solve_ex(matrix, right)
+        solution, info = torch.linalg.solve_ex(matrix, right)
         singular = (info != 0)[:, None]
         _warn_of_singular(singular)
-        return torch.where(converged[:, None] & ~singular, found, 0)
+        return torch.where(converged[:, None] & ~singular, solution, 0)
 
     return solve
 
@@ -137,8 +137,8 @@ def solve_implicit(
         method: Minimises, with the arguments of :func:`~torch_modal.elastic.minimise.minimise`.
         inverse: Gives products with the inverse of the Hessian, with the arguments of :func:`dense_inverse`.
     """
-    given = energy, (method, max_steps, tolerance, inverse), trees.skeleton(placement), usable, *trees.leaves(placement)
-    return Solution(*applied(_ArgMin, *given))
+    limits, tree = (method, max_steps, tolerance, inverse), trees.skeleton(placement)
+    return Solution(*applied(_ArgMin, energy, limits, tree, usable, *trees.leaves(placement)))
 
 
 def solve_unrolled(

@@ -1,7 +1,6 @@
 """An energy by kernels, in float64: each term in one pass over its elements, where torch takes dozens.
 
-The torch code stays: it is what these are tested against, what runs where Warp is not, and what differentiates a
-gradient once more.
+The torch code is the reference of the tests, runs where Warp is not installed, and computes second derivatives.
 """
 
 from collections.abc import Callable, Sequence
@@ -13,9 +12,9 @@ from torch import Tensor, nn
 from torch_modal.autograd import plain
 from torch_modal.elastic import volume
 from torch_modal.elastic.bend import NEEDLE, NEEDLE_OF_STEPS
-from torch_modal.elastic.energy import Energy, OnMesh, Reference, RestShapes
-from torch_modal.elastic.kernels.function import by_torch, fused
-from torch_modal.elastic.kernels.launch import launch, made, of_elements
+from torch_modal.elastic.energy import AssembledTerm, Energy, Reference, RestShapes
+from torch_modal.elastic.kernels.function import run_by_torch, run_operation
+from torch_modal.elastic.kernels.launch import launch, make_once, of_elements
 from torch_modal.elastic.term import KernelFunctions, Mesh
 from torch_modal.elastic.volume import Volume
 from torch_modal.geometry.rigid import signed_volumes
@@ -32,15 +31,15 @@ class KernelPoint(NamedTuple):
     diagonal: Any
     """Blocks of the convex Hessian's diagonal, packed, if wanted. *Shape:* ``(B, V, 6)``."""
     factors: list[Any]
-    """Of each pass those of the term, and of the other that rides on it. *Shape of each:* ``(B, M, f)``."""
+    """Factors of the term and of the term that rides on it, for each pass. *Shape of each:* ``(B, M, f)``."""
     normal: Tensor
     """Gradient of the volume. *Shape:* ``(B, V, 3)``."""
     moment: Tensor
     """First derivative of the energy in the volume. *Shape:* ``(B,)``."""
     stiffness: Tensor
     """Second derivative. *Shape:* ``(B,)``."""
-    beside: Callable[[Tensor], Tensor] | None = None
-    """Products with the Hessian of energies beside, whose values and derivatives are counted in."""
+    extra: Callable[[Tensor], Tensor] | None = None
+    """Products with the Hessian of further energies, whose values and derivatives are included above."""
 
     def slope(self, direction: Tensor) -> Tensor:
         """Derivative of the energy along a direction. *Shape:* ``(B, V, 3) -> (B,)``."""
@@ -59,12 +58,12 @@ class KernelTerm(nn.Module):
     elements: Tensor
     functions: Any
 
-    def __init__(self, part: OnMesh, functions: KernelFunctions, elements: Tensor | None = None) -> None:
+    def __init__(self, summand: AssembledTerm, functions: KernelFunctions, elements: Tensor | None = None) -> None:
         super().__init__()
-        self.part, self.functions = part, functions
+        self.part, self.functions = summand, functions
         self.forward_kernels = self.backward_kernels = None
-        own = part.corners.T if elements is None else elements
-        self.register_buffer("elements", own.int().contiguous(), persistent=False)
+        corners = summand.corners.T if elements is None else elements
+        self.register_buffer("elements", corners.int().contiguous(), persistent=False)
         self.n_elements = len(self.elements)
         #: Numbers of elements, and of the factors of each.
         self.size_of_factors = self.n_elements, 3 * functions.n + 1 + (functions.across is not None)
@@ -76,15 +75,15 @@ class KernelTerm(nn.Module):
         super().__setstate__(state)
         self.functions = self.part.term.kernel_functions(len(self.part.corners) - 1)
 
-    def launch(self, name: str, dim: int, *given: Any, back: bool = False) -> None:
+    def launch(self, name: str, dim: int, *arguments: Any, back: bool = False) -> None:
         """Run a kernel over the elements of so many samples."""
         which: Literal["forward", "backward"] = "backward" if back else "forward"
         kernels = self.__dict__[f"{which}_kernels"]
         if kernels is None:
             kernels = self.__dict__[f"{which}_kernels"] = of_elements(which, self.functions)
-        launch(getattr(kernels, name), (dim, self.n_elements), [self.elements, *given])
+        launch(getattr(kernels, name), (dim, self.n_elements), [self.elements, *arguments])
 
-    def seen(self, shapes: Tensor) -> tuple[Tensor, Tensor | None]:
+    def shapes_to_merge(self, shapes: Tensor) -> tuple[Tensor, Tensor | None]:
         """The shapes that elements are merged of, and all measures together, where their mean counts.
 
         *Shape:* ``(N, V, 3) -> (N, n, 3), (N,)``.
@@ -108,7 +107,7 @@ class KernelVolume(KernelTerm):
     faces: Tensor
     used: Tensor
 
-    def __init__(self, part: OnMesh, mesh: Mesh, used: Tensor) -> None:
+    def __init__(self, part: AssembledTerm, mesh: Mesh, used: Tensor) -> None:
         super().__init__(part, volume.kernel_functions(), torch.tensor([[0, 1]]))
         chain = torch.tensor(mesh.connectivity.boundary_chain)
         self.closed = len(chain) == 0
@@ -134,23 +133,23 @@ class KernelVolume(KernelTerm):
         if not self.closed:
             self._spread(-normal.sum(1), normal)
 
-    def of_faces(self, name: str, x: Tensor, *given: Any) -> None:
+    def of_faces(self, name: str, x: Tensor, *arguments: Any) -> None:
         """Run a kernel over the faces of so many samples."""
-        kernel = getattr(made(volume.kernels), name)
-        launch(kernel, (len(x), len(self.faces)), [self.faces, x.shape[1], x, self.centre(x), *given])
+        kernel = getattr(make_once(volume.kernels), name)
+        launch(kernel, (len(x), len(self.faces)), [self.faces, x.shape[1], x, self.centre(x), *arguments])
 
     def at(self, x: Tensor, normal: Tensor | None = None, area: bool = False) -> Tensor:
         """Volumes, and areas if wanted, as the first two components of the second vertex of an element.
 
         Gradients are added where they are wanted. *Shape:* ``(B, V, 3) -> (B, 2, 3)``.
         """
-        found = x.new_zeros(len(x), 2, 3)
-        self.of_faces("sizes", x, found, int(area), normal)
+        sizes = x.new_zeros(len(x), 2, 3)
+        self.of_faces("sizes", x, sizes, int(area), normal)
         if normal is not None:
             self.through_centre(normal)
-        return found
+        return sizes
 
-    def seen(self, shapes: Tensor) -> tuple[Tensor, Tensor | None]:
+    def shapes_to_merge(self, shapes: Tensor) -> tuple[Tensor, Tensor | None]:
         """Overrides the base class."""
         return self.at(shapes, area=True), None
 
@@ -166,28 +165,30 @@ class KernelVolume(KernelTerm):
 
 def by_kernels(energy: Energy, mesh: Mesh) -> list[KernelTerm | None]:
     """The terms of an energy by kernels; None for one that torch computes: all but one volume, for example."""
-    found: list[Any] = []
-    for part in energy.parts:
-        term, n = part.term, len(part.corners) - 1
-        if type(term) is Volume and not any(isinstance(each, KernelVolume) for each in found):
-            found.append(KernelVolume(part, mesh, energy.used))
+    terms: list[Any] = []
+    for summand in energy.parts:
+        term, n = summand.term, len(summand.corners) - 1
+        if type(term) is Volume and not any(isinstance(each, KernelVolume) for each in terms):
+            terms.append(KernelVolume(summand, mesh, energy.used))
             continue
-        fits = term.anchors is None and 1 <= n <= 3 and bool((part.corners < mesh.n_vertices).all())
+        fits = term.anchors is None and 1 <= n <= 3 and bool((summand.corners < mesh.n_vertices).all())
         functions = term.kernel_functions(n) if fits and not energy.sampled else None
-        found.append(None if functions is None else KernelTerm(part, functions))
-    return found
+        terms.append(None if functions is None else KernelTerm(summand, functions))
+    return terms
 
 
 def volumes_by_kernel(x: Tensor, faces: Tensor) -> Tensor:
     """:func:`torch_modal.geometry.rigid.signed_volumes` in one pass, without a gradient; of faces of int32."""
     if not plain(x):
         return signed_volumes(x, faces)
-    own = x.detach().double().contiguous()
-    found = own.new_zeros(*x.shape[:-2], 2, 3)
+    shapes = x.detach().double().contiguous()
+    sizes = shapes.new_zeros(*x.shape[:-2], 2, 3)
     launch(
-        made(volume.kernels).sizes, (found.numel() // 6, len(faces)), [faces, x.shape[-2], own, None, found, 0, None]
+        make_once(volume.kernels).sizes,
+        (sizes.numel() // 6, len(faces)),
+        [faces, x.shape[-2], shapes, None, sizes, 0, None],
     )
-    return found[..., 1, 0].to(x)
+    return sizes[..., 1, 0].to(x)
 
 
 class Pass(nn.Module):
@@ -203,48 +204,48 @@ class Pass(nn.Module):
     own: Tensor | None
 
     def __init__(
-        self, term: tuple[int, KernelTerm], rider: tuple[int, KernelTerm] | None = None, own: Tensor | None = None
+        self, term: tuple[int, KernelTerm], rider: tuple[int, KernelTerm] | None = None, ridden: Tensor | None = None
     ) -> None:
         super().__init__()
         self.number, self.term = term
         both: Any = (None, None) if rider is None else rider
         self.other, self.rider = both
         elements = self.term.elements
-        if self.rider is not None and own is not None:
+        if self.rider is not None and ridden is not None:
             # Where there is no element, all further vertices are the first.
             edges, n = self.rider.elements, elements.shape[1]
             alone = torch.cat([edges, edges[:, :1].expand(-1, n - 2)], 1)
-            elements = torch.where((own < 0)[:, None], alone, elements[own.clamp_min(0)]).contiguous()
+            elements = torch.where((ridden < 0)[:, None], alone, elements[ridden.clamp_min(0)]).contiguous()
         self.kernels = None
         #: Of the factors.
         self.sizes = [None if part is None else part.size_of_factors for part in (self.term, self.rider)]
         self.n_elements, self.n_own = len(elements), self.term.n_elements
         self.register_buffer("elements", elements, persistent=False)
-        self.register_buffer("own", None if own is None else own.int(), persistent=False)
+        self.register_buffer("own", None if ridden is None else ridden.int(), persistent=False)
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "kernels": None}
 
-    def _launch(self, name: str, dim: int, *given: Any) -> None:
+    def _launch(self, name: str, dim: int, *arguments: Any) -> None:
         if self.kernels is None:
             rider = None if self.rider is None else self.rider.functions
             self.kernels = of_elements("convex", self.term.functions, rider)
         kernel = getattr(self.kernels, name)
-        launch(kernel, (dim, self.n_elements), [self.elements, self.own, self.n_own, *given])
+        launch(kernel, (dim, self.n_elements), [self.elements, self.own, self.n_own, *arguments])
 
     def linearise(
-        self, x: Tensor, records: Sequence[Tensor], given: tuple[Any, ...], hessian: bool, volume: tuple[Any, ...]
+        self, x: Tensor, records: Sequence[Tensor], arguments: tuple[Any, ...], hessian: bool, volume: tuple[Any, ...]
     ) -> list[Tensor | None]:
         """Energy and derivatives are added; arguments of the kernel. The factors, if wanted."""
         factors = [x.new_empty(len(x), *size) if hessian and size else None for size in self.sizes]
         others = None if self.other is None else records[self.other]
-        given = x.shape[1], x, records[self.number], others, *given, *factors, *volume
-        self._launch("linearise", len(x), *given)
+        arguments = x.shape[1], x, records[self.number], others, *arguments, *factors, *volume
+        self._launch("linearise", len(x), *arguments)
         return factors
 
-    def product(self, dim: tuple[int, int], *given: Any) -> None:
-        """Likewise."""
-        self._launch("product", dim[0], dim[1], *given)
+    def product(self, dim: tuple[int, int], *arguments: Any) -> None:
+        """Products with the convex Hessian are added; arguments of the kernel."""
+        self._launch("product", dim[0], dim[1], *arguments)
 
 
 def _passes(parts: Sequence[Any], n_vertices: int) -> list[Pass]:
@@ -255,9 +256,9 @@ def _passes(parts: Sequence[Any], n_vertices: int) -> list[Pass]:
         keys = edges[1].elements.long().sort(1)[0] @ ends
         order = keys.argsort()
         for term in (term for term in terms if term[1].functions.n > 1):
-            own = term[1].elements[:, :2].long().sort(1)[0] @ ends
-            at = order[torch.searchsorted(keys[order], own).clamp_max(len(keys) - 1)]
-            if len(own) and bool((keys[at] == own).all()) and len(at.unique()) == len(at):
+            keys_of_term = term[1].elements[:, :2].long().sort(1)[0] @ ends
+            at = order[torch.searchsorted(keys[order], keys_of_term).clamp_max(len(keys) - 1)]
+            if len(keys_of_term) and bool((keys[at] == keys_of_term).all()) and len(at.unique()) == len(at):
                 numbers = torch.full_like(keys, -1).index_copy(0, at, torch.arange(len(at)))
                 others = [each for each in terms if each not in (edges, term)]
                 return [Pass(term, edges, numbers), *map(Pass, others)]
@@ -281,10 +282,10 @@ class KernelEnergy(nn.Module):
         self.energy = energy
         self.modules_of_parts = nn.ModuleList(parts)
         #: Numbers of the volume, and of the other terms.
-        self.volumes = [i for i, part in enumerate(parts) if isinstance(part, KernelVolume)]
+        self.volumes = [i for i, term in enumerate(parts) if isinstance(term, KernelVolume)]
         self.terms = [i for i in range(len(parts)) if i not in self.volumes]
         #: Numbers of the terms whose rest shapes are merged by kernels, and by torch.
-        self.weighed = [i for i, part in enumerate(parts) if part.functions.weight is not None]
+        self.weighed = [i for i, term in enumerate(parts) if term.functions.weight is not None]
         self.unweighed = [i for i in range(len(parts)) if i not in self.weighed]
         #: The terms in passes over elements, each alone or with another that rides on it.
         self.passes: Any = nn.ModuleList(_passes(parts, energy.n_vertices))
@@ -293,30 +294,30 @@ class KernelEnergy(nn.Module):
         self.__dict__["volume"] = parts[self.volumes[0]] if self.volumes else None
         self.__dict__["in_passes"] = [*self.passes]
         #: Whether kernels know the adjoints of all terms.
-        self.exact = all(part.functions.exact for part in parts)
+        self.exact = all(term.functions.exact for term in parts)
 
     @classmethod
     def of(cls, energy: Energy, mesh: Mesh) -> "KernelEnergy | None":
         """An energy by kernels; None where they do not serve all of its terms, or it is a volume alone."""
         parts = by_kernels(energy, mesh)
-        found = [part for part in parts if part is not None]
-        serves = len(found) == len(parts) and not all(isinstance(part, KernelVolume) for part in found)
-        return cls(energy, found) if serves else None
+        served = [part for part in parts if part is not None]
+        serves = len(served) == len(parts) and not all(isinstance(part, KernelVolume) for part in served)
+        return cls(energy, served) if serves else None
 
     def reference(self, rests: RestShapes, start: Tensor | None = None, relative: bool = False) -> Reference:
         """Merge rest shapes into one reference (Eq. 8); arguments as :meth:`RestShapes.reference`."""
         records: dict[int, Tensor] = {}
         constant = rests.weights.new_zeros(len(rests.weights), dtype=torch.float64)
-        for numbers, run in ((self.weighed, fused), (self.unweighed, by_torch)):
+        for numbers, run in ((self.weighed, run_operation), (self.unweighed, run_by_torch)):
             if numbers:
-                given = [rests.shapes, rests.weights, *(rests.stiffness[i] for i in numbers)]
-                given += [] if start is None else [start]
-                *found, left = run(_Merged(self, numbers, relative), *given)
-                records.update(zip(numbers, found, strict=True))
+                tensors = [rests.shapes, rests.weights, *(rests.stiffness[i] for i in numbers)]
+                tensors += [] if start is None else [start]
+                *merged, left = run(_MergeRests(self, numbers, relative), *tensors)
+                records.update(zip(numbers, merged, strict=True))
                 constant = constant + left
         return Reference(tuple(records[i] for i in range(len(self.parts))), constant)
 
-    def _linearised(
+    def _evaluate(
         self, x: Tensor, to: Reference, gradient: Tensor | None, normal: Tensor | None, diagonal: Tensor | None = None
     ) -> tuple[Tensor, Tensor, Tensor, list[Any]]:
         """The energy but for its constant; the volume's moment and stiffness; factors. Derivatives are added."""
@@ -325,8 +326,8 @@ class KernelEnergy(nn.Module):
         # The volume comes with the first pass.
         more: tuple[Any, ...] = (None,) * 4 if volume is None else (volume.faces, volume.centre(x), inside, normal)
         for one in self.in_passes:
-            given = n_references, energy, gradient, diagonal
-            factors.append(one.linearise(x, to.records, given, diagonal is not None, more))
+            sums = n_references, energy, gradient, diagonal
+            factors.append(one.linearise(x, to.records, sums, diagonal is not None, more))
             more = (None,) * 4
         if volume is None:
             return energy, inside, inside, factors
@@ -344,18 +345,18 @@ class KernelEnergy(nn.Module):
         """Value and derivatives, of which the Hessian's may be left out. *Shape:* ``(B, V, 3)``."""
         gradient, normal = x.new_zeros(2, *x.shape).unbind()
         diagonal = x.new_zeros(*x.shape[:2], 6) if hessian else None
-        energy, moment, stiffness, factors = self._linearised(x, to, gradient, normal, diagonal)
+        energy, moment, stiffness, factors = self._evaluate(x, to, gradient, normal, diagonal)
         return KernelPoint(energy, gradient, diagonal, factors, normal, moment, stiffness)
 
     def value_and_gradient(self, x: Tensor, to: Reference) -> tuple[Tensor, Tensor]:
         """The energy but for its constant, and its gradient. *Shape:* ``(B, V, 3) -> (B,), (B, V, 3)``."""
         gradient, normal = x.new_zeros(2, *x.shape).unbind()
-        energy, moment, *_ = self._linearised(x, to, gradient, normal)
+        energy, moment, *_ = self._evaluate(x, to, gradient, normal)
         return energy, gradient.addcmul_(moment[:, None, None], normal) if self.volumes else gradient
 
     def value(self, x: Tensor, to: Reference) -> Tensor:
         """The energy but for its constant, of one shape or more for each reference. *Shape:* ``(D * B, V, 3)``."""
-        return self._linearised(x, to, None, None)[0].flatten()
+        return self._evaluate(x, to, None, None)[0].flatten()
 
     def product(
         self, factors: Sequence[Any], dim: tuple[int, int], fields: Tensor, start: int, out: Tensor, out_start: int,
@@ -365,8 +366,8 @@ class KernelEnergy(nn.Module):
 
         Fields, results and scalars begin at the given places of their arrays.
         """
-        for one, own in zip(self.in_passes, factors, strict=True):
-            one.product(dim, fields, start, *own, out, out_start, scalars, first)
+        for one, pass_factors in zip(self.in_passes, factors, strict=True):
+            one.product(dim, fields, start, *pass_factors, out, out_start, scalars, first)
 
     def back(
         self,
@@ -397,8 +398,8 @@ class KernelEnergy(nn.Module):
         to_diagonal, fields, pushed = products or (None, None, None)
         n_products = 0 if pushed is None else len(pushed)
         for i in self.terms:
-            given = n, x, to.records[i], to_energy, to_gradient, to_diagonal, fields, pushed, b, n_products
-            self.parts[i].launch("linearise", b, *given, to_x, to_records[i], back=True)
+            arguments = n, x, to.records[i], to_energy, to_gradient, to_diagonal, fields, pushed, b, n_products
+            self.parts[i].launch("linearise", b, *arguments, to_x, to_records[i], back=True)
         if not self.volumes:
             return
         i = self.volumes[0]
@@ -407,15 +408,15 @@ class KernelEnergy(nn.Module):
         to_volume, to_weight = at.stiffness * to_moment, 2 * off * to_moment
         if to_energy is not None:
             to_volume, to_weight = to_volume + at.moment * to_energy, to_weight + off**2 * to_energy
-        own = at.moment[:, None, None] * to_gradient
-        own = own if to_normal is None else own.add_(to_normal)
+        to_whole_normal = at.moment[:, None, None] * to_gradient
+        to_whole_normal = to_whole_normal if to_normal is None else to_whole_normal.add_(to_normal)
         to_sizes = x.new_zeros(b, 2, 3)
         to_sizes[:, 1, 0] = to_volume
-        self.parts[i].back(x, to_sizes, own, to_x)
+        self.parts[i].back(x, to_sizes, to_whole_normal, to_x)
         to_records[i].add_(torch.stack([to_weight, -to_volume], -1)[:, None])
 
 
-class _Merged:
+class _MergeRests:
     """Rest shapes, weights, the stiffnesses of some terms, and perhaps a start as records, and what remains."""
 
     def __init__(self, energy: KernelEnergy, numbers: Sequence[int], relative: bool) -> None:
@@ -423,52 +424,51 @@ class _Merged:
         self.n_differentiable = len(numbers)
         self.n_results = self.n_differentiable + 1
 
-    def _parted(self, given: Sequence[Tensor]) -> tuple[Tensor, Tensor, Sequence[Tensor], Tensor | None]:
-        shapes, weights, *more = given
+    def _split(self, tensors: Sequence[Tensor]) -> tuple[Tensor, Tensor, Sequence[Tensor], Tensor | None]:
+        shapes, weights, *more = tensors
         n = len(self.parts)
         return shapes, weights, more[:n], more[n] if len(more) > n else None
 
     def _launch(
-        self, i: int, seen: tuple[Tensor, Tensor | None], given: Sequence[Tensor], results: Sequence[Tensor | None],
+        self, i: int, seen: tuple[Tensor, Tensor | None], tensors: Sequence[Tensor], results: Sequence[Tensor | None],
         back: bool = False,
     ) -> None:  # fmt: skip
-        (x, total), (shapes, weights, stiffness, start), part = seen, self._parted(given), self.parts[i]
-        soft = None if part.functions.fullness is None else start
+        (x, total), (shapes, weights, stiffness, start), term = seen, self._split(tensors), self.parts[i]
+        soft = None if term.functions.fullness is None else start
         relative = self.relative and soft is not None
         sizes = (NEEDLE_OF_STEPS if relative else NEEDLE) ** 2, int(relative), shapes.shape[1], stiffness[i].shape[1]
         first = x.shape[1], x, weights, total, stiffness[i], soft
-        part.launch("merge", len(shapes), *first, *sizes, *results, back=back)
+        term.launch("merge", len(shapes), *first, *sizes, *results, back=back)
 
-    def run(self, kept: list[Any] | None, *given: Tensor) -> tuple[Tensor, ...]:
-        """See :class:`~torch_modal.elastic.kernels.function.Operation`."""
-        shapes, records = given[0], []
+    def run(self, kept: list[Any] | None, *tensors: Tensor) -> tuple[Tensor, ...]:
+        shapes, records = tensors[0], []
         constant = shapes.new_zeros(len(shapes))
-        for i, part in enumerate(self.parts):
-            seen = part.seen(shapes.flatten(0, 1))
-            records.append(shapes.new_empty(len(shapes), part.n_elements, part.functions.potential.n_rows))
-            self._launch(i, seen, given, [records[i], constant])
+        for i, term in enumerate(self.parts):
+            seen = term.shapes_to_merge(shapes.flatten(0, 1))
+            records.append(shapes.new_empty(len(shapes), term.n_elements, term.functions.potential.n_rows))
+            self._launch(i, seen, tensors, [records[i], constant])
             if kept is not None:
                 kept.append(seen)
         return *records, constant
 
-    def back(self, kept: list[Any], grads: Sequence[Tensor], *given: Tensor) -> tuple[Tensor | None, ...]:
-        """See :class:`~torch_modal.elastic.kernels.function.Operation`."""
+    def back(self, kept: list[Any], grads: Sequence[Tensor], *tensors: Tensor) -> tuple[Tensor | None, ...]:
         if not kept:
-            self.run(kept, *given)
-        found = tuple(torch.zeros_like(each) for each in given)
-        to_shapes, to_weights, to_stiffness, to_start = self._parted(found)
-        for i, part in enumerate(self.parts):
-            to_seen = torch.zeros_like(kept[i][0]) if isinstance(part, KernelVolume) else to_shapes
-            self._launch(i, kept[i], given, [grads[i], to_seen, to_weights, to_stiffness[i], to_start], True)
-            if isinstance(part, KernelVolume):
-                part.back(given[0].flatten(0, 1), to_seen, None, to_shapes.flatten(0, 1))
-        return found
+            self.run(kept, *tensors)
+        gradients = tuple(torch.zeros_like(each) for each in tensors)
+        to_shapes, to_weights, to_stiffness, to_start = self._split(gradients)
+        for i, term in enumerate(self.parts):
+            to_seen = torch.zeros_like(kept[i][0]) if isinstance(term, KernelVolume) else to_shapes
+            self._launch(i, kept[i], tensors, [grads[i], to_seen, to_weights, to_stiffness[i], to_start], True)
+            if isinstance(term, KernelVolume):
+                term.back(tensors[0].flatten(0, 1), to_seen, None, to_shapes.flatten(0, 1))
+        return gradients
 
-    def by_torch(self, *given: Tensor) -> tuple[Tensor, ...]:
-        """See :class:`~torch_modal.elastic.kernels.function.Operation`."""
-        shapes, weights, stiffness, start = self._parted(given)
+    def by_torch(self, *tensors: Tensor) -> tuple[Tensor, ...]:
+        shapes, weights, stiffness, start = self._split(tensors)
         extend = self.energy.energy.extend
         rows, begin = extend(shapes.movedim(-1, 0)), None if start is None else extend(start.movedim(-1, 0))
         pairs = zip(self.parts, stiffness, strict=True)
-        found = [part.part.merged(rows, weights, own, begin, self.relative) for part, own in pairs]
-        return *(record.mT.contiguous() for record, _ in found), torch.stack([own.sum(-1) for _, own in found]).sum(0)
+        merged = [term.part.merge_rests(rows, weights, factor, begin, self.relative) for term, factor in pairs]
+        return *(record.mT.contiguous() for record, _ in merged), torch.stack([left.sum(-1) for _, left in merged]).sum(
+            0
+        )

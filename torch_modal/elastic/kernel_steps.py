@@ -10,7 +10,7 @@ from torch_modal import trees
 from torch_modal.autograd import plain
 from torch_modal.elastic.energy import Energy, Reference, RestShapes
 from torch_modal.elastic.kernel_energy import KernelEnergy, KernelPoint, by_kernels
-from torch_modal.elastic.kernels.function import fused
+from torch_modal.elastic.kernels.function import run_operation
 from torch_modal.elastic.kernels.launch import kernels, launch
 from torch_modal.elastic.steps import (
     FineEnergy,
@@ -18,14 +18,14 @@ from torch_modal.elastic.steps import (
     SumOfEnergies,
     TermsTowards,
     descend,
-    descended,
+    descend_in_stages,
     step_length,
 )
 from torch_modal.elastic.term import Mesh, Term
 
 
 class KernelFineEnergy(FineEnergy):
-    """:class:`FineEnergy` by kernels; terms that they do not serve, and contacts, are torch's beside them."""
+    """:class:`FineEnergy` by kernels; torch computes terms without kernels, and contacts."""
 
     def __init__(self, mesh: Mesh, terms: Sequence[Term]) -> None:
         super().__init__(mesh, terms)
@@ -36,35 +36,35 @@ class KernelFineEnergy(FineEnergy):
         )
         shell = Energy(mesh, [terms[i] for i in self.own]) if self.others else self.energy
         self.further = Energy(mesh, [terms[i] for i in self.others]) if self.others else None
-        self.kernels = KernelEnergy(shell, [part for part in parts if part is not None])
+        self.kernels = KernelEnergy(shell, [term for term in parts if term is not None])
 
     def relax_chunk(
-        self, x: Tensor, rests: RestShapes, stages: Sequence[tuple[int, int]], beside: Sequence[FreeEnergy]
+        self, x: Tensor, rests: RestShapes, stages: Sequence[tuple[int, int]], extra: Sequence[FreeEnergy]
     ) -> Tensor:
         """Overrides the base class. With further terms or energies, gradients are left to torch."""
-        alone = self.further is None and not beside
-        given = trees.leaves((x, *rests))  # the start may have no gradient where stiffnesses have one
-        recorded = torch.is_grad_enabled() and any(value.requires_grad for value in given)
-        if not (alone and self.kernels.exact) and (recorded or not plain(*given)):
-            return super().relax_chunk(x, rests, stages, beside)
-        others = [*beside, *([] if self.further is None else [TermsTowards.among(self.further, self.others, rests)])]
+        alone = self.further is None and not extra
+        tensors = trees.leaves((x, *rests))  # the start may have no gradient where stiffnesses have one
+        recorded = torch.is_grad_enabled() and any(value.requires_grad for value in tensors)
+        if not (alone and self.kernels.exact) and (recorded or not plain(*tensors)):
+            return super().relax_chunk(x, rests, stages, extra)
+        others = [*extra, *([] if self.further is None else [TermsTowards.of_terms(self.further, self.others, rests)])]
         to = self.kernels.reference(rests._replace(stiffness=[rests.stiffness[i] for i in self.own]), x, relative=True)
         if alone:
             moved = x
             for n_steps, n_products in stages:
                 if n_steps:
-                    moved = fused(_Relaxed(self.kernels, n_steps, n_products), moved, *to.records)[0]
+                    moved = run_operation(_Relaxation(self.kernels, n_steps, n_products), moved, *to.records)[0]
             return moved.to(x)
         with torch.no_grad():
-            return descended(KernelProblem(self.kernels, to, others), x.double().contiguous(), stages).to(x)
+            return descend_in_stages(KernelProblem(self.kernels, to, others), x.double().contiguous(), stages).to(x)
 
     def towards(
-        self, x: Tensor, reference: Reference, n_steps: int, n_products: int, beside: Sequence[FreeEnergy] = ()
+        self, x: Tensor, reference: Reference, n_steps: int, n_products: int, extra: Sequence[FreeEnergy] = ()
     ) -> Tensor:
         """Overrides the base class. Gradients are left to torch."""
         if self.further is not None or (torch.is_grad_enabled() and x.requires_grad) or not plain(x):
-            return super().towards(x, reference, n_steps, n_products, beside)
-        problem = KernelProblem(self.kernels, reference.turned(), beside)
+            return super().towards(x, reference, n_steps, n_products, extra)
+        problem = KernelProblem(self.kernels, reference.transpose(), extra)
         return descend(problem, x.double().contiguous(), n_steps, n_products).to(x)
 
 
@@ -74,33 +74,33 @@ class KernelProblem:
     Args:
         kernels: The terms.
         to: The reference.
-        beside: Other energies.
+        extra: Other energies.
     """
 
-    def __init__(self, kernels: KernelEnergy, to: Reference, beside: Sequence[FreeEnergy] = ()) -> None:
-        self.kernels, self.to, self.beside = kernels, to, beside
+    def __init__(self, kernels: KernelEnergy, to: Reference, extra: Sequence[FreeEnergy] = ()) -> None:
+        self.kernels, self.to, self.extra = kernels, to, extra
 
     def value(self, x: Tensor) -> Tensor:
         """*Shape:* ``(B, V, 3) -> (B,)``."""
-        return sum((other.value(x) for other in self.beside), start=self.kernels.value(x, self.to))
+        return sum((other.value(x) for other in self.extra), start=self.kernels.value(x, self.to))
 
     def at(self, x: Tensor) -> KernelPoint:
         """*Shape:* ``(B, V, 3)``."""
         at = self.kernels.at(x, self.to)
-        if not self.beside:
+        if not self.extra:
             return at
-        others = SumOfEnergies(self.beside).at(x)
+        others = SumOfEnergies(self.extra).at(x)
         at.gradient.add_(others.gradient)
         at.diagonal.add_(others.diagonal)
-        return at._replace(value=at.value + others.value, beside=others.product)
+        return at._replace(value=at.value + others.value, extra=others.product)
 
-    def solved(self, at: KernelPoint, n_products: int, keep: bool = False) -> tuple[Tensor, Tensor, Tensor]:
+    def newton_direction(self, at: KernelPoint, n_products: int, keep: bool = False) -> tuple[Tensor, Tensor, Tensor]:
         """Conjugate gradients, fused.
 
         Args:
             at: The energy where the step starts; its diagonal is inverted in place.
             n_products: Iterations.
-            keep: Whether each iteration has memory of its own.
+            keep: True to keep the fields of all iterations.
 
         Returns:
             The solution, *shape* ``(B, V, 3)``; residuals, directions, and the Hessian's products with these but for
@@ -116,8 +116,8 @@ class KernelProblem:
             first = k % n_kept * b * n
             place = n_kept * b * n + first, kept, 2 * n_kept * b * n + first
             self.kernels.product(at.factors, (b, n), kept, *place, scalars, k * b)
-            if at.beside is not None:
-                pushed = at.beside(kept[1, k % n_kept])
+            if at.extra is not None:
+                pushed = at.extra(kept[1, k % n_kept])
                 kept[2, k % n_kept].add_(pushed)
                 scalars[k, :, 2].add_((pushed * kept[1, k % n_kept]).sum((1, 2)))
             launch(module.advance, (b, n), [at.normal, at.diagonal, at.stiffness, k, n_kept, n, *results])
@@ -130,7 +130,7 @@ class Taken(NamedTuple):
     """A step of :func:`torch_modal.elastic.steps.descend`."""
 
     x: Tensor
-    """Where it started. *Shape:* ``(B, V, 3)``."""
+    """The shape before the step. *Shape:* ``(B, V, 3)``."""
     at: KernelPoint
     """The energy there, its diagonal inverted."""
     solution: Tensor
@@ -138,12 +138,12 @@ class Taken(NamedTuple):
     length: Tensor
     """*Shape:* ``(B,)``."""
     kept: Tensor
-    """Of :meth:`KernelProblem.solved`, of all iterations."""
+    """Fields of all iterations of :meth:`KernelProblem.newton_direction`."""
     scalars: Tensor
-    """Likewise."""
+    """Scalars of all iterations."""
 
 
-class _Relaxed:
+class _Relaxation:
     """Steps of all vertices from shapes, towards the records of a reference."""
 
     n_results = n_differentiable = 1
@@ -155,27 +155,24 @@ class _Relaxed:
         return Reference(tuple(records), records[0].new_zeros(len(records[0])))
 
     def run(self, kept: list[Any] | None, x: Tensor, *records: Tensor) -> tuple[Tensor, ...]:
-        """See :class:`~torch_modal.elastic.kernels.function.Operation`."""
         problem = KernelProblem(self.kernels, self._reference(records))
         with torch.no_grad():
             return (descend(problem, x, self.n_steps, self.n_products, kept),)
 
     def back(self, kept: list[Any], grads: Sequence[Tensor], x: Tensor, *records: Tensor) -> tuple[Tensor | None, ...]:
-        """See :class:`~torch_modal.elastic.kernels.function.Operation`."""
         if not kept:
             self.run(kept, x, *records)
-        to_x, to, to_records = grads[0], self._reference(records), [torch.zeros_like(own) for own in records]
+        to_x, to, to_records = grads[0], self._reference(records), [torch.zeros_like(record) for record in records]
         for step in reversed(kept):
             to_x = self._step_back(Taken(*step), to, to_x, to_records)
         return to_x, *to_records
 
     def by_torch(self, x: Tensor, *records: Tensor) -> tuple[Tensor, ...]:
-        """See :class:`~torch_modal.elastic.kernels.function.Operation`."""
-        own = TermsTowards(self.kernels.energy, self._reference(records).turned())
-        return (descend(SumOfEnergies([own]), x, self.n_steps, self.n_products),)
+        terms = TermsTowards(self.kernels.energy, self._reference(records).transpose())
+        return (descend(SumOfEnergies([terms]), x, self.n_steps, self.n_products),)
 
     def _step_back(self, step: Taken, to: Reference, to_reached: Tensor, to_records: Sequence[Tensor]) -> Tensor:
-        """The gradient at the start of a step from that at its end; those of the records are added.
+        """Gradient at the start of a step from the gradient at its end; gradients of the records are added.
 
         *Shape:* ``(B, V, 3)``.
         """
@@ -189,12 +186,12 @@ class _Relaxed:
         launch(module.inner, (b, n), [to_solution, kept[1, -1], n, received[-1]])
         for k in reversed(range(n_products)):
             common = [at.normal, at.stiffness, k, n_products, n, kept, scalars]
-            given = [*common, to_solution, residual, force, direction, received]
-            launch(module.back_to_direction, (b, n), given)
+            args = [*common, to_solution, residual, force, direction, received]
+            launch(module.back_to_direction, (b, n), args)
             self.kernels.product(at.factors, (b, n), force, k * b * n, direction, 0)
             launch(module.back_to_normal, (b, n), [*common, force, direction, to_normal, received])
-            given = [*common, at.diagonal, to_solution, direction, residual, to_diagonal, received]
-            launch(module.back_to_residual, (b, n), given)
+            args = [*common, at.diagonal, to_solution, direction, residual, to_diagonal, received]
+            launch(module.back_to_residual, (b, n), args)
         # The right side is the gradient's opposite.
         to_gradient = -residual if to_slope is None else to_slope[:, None, None] * solution - residual
         products = to_diagonal, kept, force
@@ -214,8 +211,8 @@ class _Relaxed:
         to_reached, at, whole = to_x.clone(), step.at, step.x + step.solution
         there = self.kernels.at(whole, to, hessian=False)
         with torch.enable_grad():
-            given = step.solution, at.value, there.value, at.slope(step.solution)
-            solution, before, after, slope = leaves = [value.detach().requires_grad_() for value in given]
+            values = step.solution, at.value, there.value, at.slope(step.solution)
+            solution, before, after, slope = leaves = [value.detach().requires_grad_() for value in values]
             along = slope + at.slope(solution - step.solution)
             length = step_length(before, along, after, solution.abs().amax((1, 2)))
             taken = length[:, None, None] * solution

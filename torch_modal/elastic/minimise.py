@@ -54,7 +54,7 @@ class Status(IntEnum):
     """No in-between exists: NaN or infinite entries, no size, or one key-frame of a closed mesh is a mirror image."""
     FELL_BACK = 4
     """The minimiser is worse than its start, which is returned: the blend by local rotations, or linear
-    interpolation. Gradients are those of the returned shape; amplitudes and energy are those of the minimiser."""
+    interpolation. Gradients belong to the returned shape, amplitudes and energy to the minimiser."""
 
 
 class Solution(NamedTuple):
@@ -73,7 +73,7 @@ class Solution(NamedTuple):
     n_crossing: Tensor | None = None
     """With contact, the pairs of triangles of parts that still go through each other. *Shape:* ``(B,)``, int64."""
     distortion_ratio: Tensor | None = None
-    """Distortion of the minimiser over that of a start, the largest of all; starts count as strained by 2 % at least.
+    """Largest ratio of the minimiser's distortion to a start's; starts count as strained by 2 % at least.
     From 1.1 on the shape is blended into its start, from 1.2 on (paths: 2 and 3) replaced by it. *Shape:* ``(B,)``."""
     start_weights: Tensor | None = None
     """Parts, 0 to 1, of the starts in the shape: the blend by local rotations, and linear interpolation; of a smooth
@@ -98,21 +98,21 @@ class State(NamedTuple):
     a: Tensor
     """*Shape:* ``(B, n, 1)``."""
     there: Tensor
-    """Where the next step leads. *Shape:* ``(B, n, 1)``."""
+    """Amplitudes after the next step. *Shape:* ``(B, n, 1)``."""
     energy: Tensor
     """*Shape:* ``(B,)``."""
     gradient: Tensor
     """*Shape:* ``(B, n, 1)``."""
     norm: Tensor
-    """Of the gradient. *Shape:* ``(B,)``."""
+    """Norm of the gradient. *Shape:* ``(B,)``."""
     inverse: Tensor
     """The approximate inverse of the Hessian. *Shape:* ``(B, n, n)``."""
     length: Tensor
-    """Of the next step, relative to the quasi-Newton step; 0 of converged samples. *Shape:* ``(B,)``."""
+    """Length of the next step, relative to the quasi-Newton step; 0 for converged samples. *Shape:* ``(B,)``."""
     goal: Tensor
     """The gradient norm at which it has converged. *Shape:* ``(B,)``."""
     rounding: Tensor
-    """Rounding of the energy that that of the positions explains, over the root of the energy. *Shape:* ``(B,)``."""
+    """Energy error due to rounding of positions, over the root of the energy. *Shape:* ``(B,)``."""
     n_steps: Tensor
     """Steps taken. *Shape:* ``(B,)``, int64."""
     placement: Any
@@ -136,18 +136,18 @@ def minimise(
         max_steps: Evaluations of the gradient at most.
         tolerance: Bound on the gradient norm, relative to the one at the start.
     """
-    found, norm, n_steps = a.clone(), a.new_zeros(len(a)), torch.zeros(len(a), dtype=torch.int64, device=a.device)
-    reached, start, goal, drowned = norm, norm, norm, norm > 0
+    best, norm, n_steps = a.clone(), a.new_zeros(len(a)), torch.zeros(len(a), dtype=torch.int64, device=a.device)
+    reached, start, goal, below_rounding = norm, norm, norm, norm > 0
     rows = torch.arange(len(a), device=a.device)
     for used in range(0, max(max_steps, 1), MOST_EVALUATIONS):
         some = placement if len(rows) == len(a) else trees.rows(placement, rows)
-        derivatives = energy.derivatives(found[rows], some, second_order=False)
-        factor, info = torch.linalg.cholesky_ex(ridged(derivatives.gauss_newton))
+        derivatives = energy.derivatives(best[rows], some, second_order=False)
+        factor, info = torch.linalg.cholesky_ex(add_ridge(derivatives.gauss_newton))
         if bool(info.any()):  # too singular for single precision
-            exact = energy.derivatives(found[rows], some).gauss_newton
+            exact = energy.derivatives(best[rows], some).gauss_newton
             exact = torch.where((info != 0)[:, None, None], exact, derivatives.gauss_newton)
             derivatives = derivatives._replace(gauss_newton=exact)
-            factor, info = torch.linalg.cholesky_ex(ridged(exact))
+            factor, info = torch.linalg.cholesky_ex(add_ridge(exact))
         own_norm = derivatives.gradient.norm(dim=-1)
         if not used:
             reached, start = derivatives.value.clone(), own_norm.clone()
@@ -159,11 +159,11 @@ def minimise(
         length, before = (regular & (own_norm > goal[rows])).to(a), n_steps[rows]
         stiffest = derivatives.gauss_newton.diagonal(dim1=-2, dim2=-1).amax(-1)
         rounding = derivatives.resolution / stiffest.clamp_min(torch.finfo(a.dtype).tiny).sqrt()
-        own, slope = found[rows, :, None], derivatives.gradient[..., None]
-        there = own - length[:, None, None] * torch.bmm(inverse, slope)
-        given = reached[rows], slope, own_norm, inverse, length, goal[rows], rounding, before.clone(), some
-        state = State(rows, own, there, *given)
-        whole = found, reached, norm, n_steps, drowned
+        here, slope = best[rows, :, None], derivatives.gradient[..., None]
+        there = here - length[:, None, None] * torch.bmm(inverse, slope)
+        rest_of_state = reached[rows], slope, own_norm, inverse, length, goal[rows], rounding, before.clone(), some
+        state = State(rows, here, there, *rest_of_state)
+        whole = best, reached, norm, n_steps, below_rounding
         for _ in range(min(MOST_EVALUATIONS, max_steps - used)):
             n_active = int(torch.count_nonzero(state.length))
             if not n_active:
@@ -171,48 +171,49 @@ def minimise(
             if 2 * n_active <= len(state.row):
                 _put(whole, state)
                 state = trees.rows(state, torch.nonzero(state.length).flatten())
-            state = _advanced(energy, state)
+            state = _evaluate_step(energy, state)
         _put(whole, state)
         # A Hessian at the new place may help the others, if they have moved.
-        rows = rows[(norm[rows] > goal[rows]) & ~drowned[rows] & (n_steps[rows] > before)]
+        rows = rows[(norm[rows] > goal[rows]) & ~below_rounding[rows] & (n_steps[rows] > before)]
         if not len(rows):
             break
     status = torch.full_like(n_steps, Status.STALLED)
     status[rows] = Status.OUT_OF_STEPS
-    status = torch.where((norm <= goal) | drowned, Status.CONVERGED, status)
+    status = torch.where((norm <= goal) | below_rounding, Status.CONVERGED, status)
     status = torch.where(norm.isfinite() & reached.isfinite(), status, Status.INVALID)
-    return Solution(found, reached, norm / start.clamp_min(torch.finfo(start.dtype).tiny), n_steps, status)
+    return Solution(best, reached, norm / start.clamp_min(torch.finfo(start.dtype).tiny), n_steps, status)
 
 
 def _put(whole: tuple[Tensor, ...], state: State) -> None:
-    """Write the amplitudes, energies, gradient norms and numbers of steps of some samples into those of all.
+    """Write amplitudes, energies, gradient norms and numbers of steps of some samples into the tensors of the batch.
 
-    The last says where all that is left to gain is less than the rounding of the energy: nothing compares steps then.
+    The last tensor is True where the remaining gain is below the rounding of the energy: steps cannot be compared then.
     """
     step = torch.bmm(state.inverse, state.gradient)
-    # At a start that has converged there is nothing to gain, and perhaps only rounding to follow.
+    # A start that has converged takes no last step, which would follow rounding.
     ended = ((state.norm <= state.goal) & (state.n_steps > 0))[:, None, None]
     gain = 0.5 * (state.gradient * step).sum((1, 2))
-    drowned = gain <= energy_rounding(gain.dtype) * state.energy.abs()
+    below_rounding = gain <= energy_rounding(gain.dtype) * state.energy.abs()
     a = torch.where(ended, state.a - step, state.a).squeeze(-1)
-    for values, own in zip(whole, (a, state.energy, state.norm, state.n_steps, drowned), strict=True):
-        values[state.row] = own
+    for values, new_values in zip(whole, (a, state.energy, state.norm, state.n_steps, below_rounding), strict=True):
+        values[state.row] = new_values
 
 
-def _advanced(energy: AmplitudeEnergy, state: State) -> State:
+def _evaluate_step(energy: AmplitudeEnergy, state: State) -> State:
     """One evaluation: a step where the energy falls, a shorter one next where it does not."""
     value, slope = energy.value_and_gradient(state.there.squeeze(-1), state.placement)
     by_kernel = getattr(energy, "quasi_newton", None)
     if by_kernel is None or value.device.type != "cpu" or {state.a.dtype, slope.dtype} != {torch.float64}:
-        return updated(state, value, slope[..., None])
+        return bfgs_update(state, value, slope[..., None])
     return by_kernel(state, SHORTEST, value, slope)
 
 
-def updated(state: State, value: Tensor, slope: Tensor) -> State:
+def bfgs_update(state: State, value: Tensor, slope: Tensor) -> State:
     """The state after an evaluation at its next place. *Shape:* ``(B,), (B, n, 1)``."""
     a, there, gradient, inverse, length = state.a, state.there, state.gradient, state.inverse, state.length
     norm = torch.linalg.vector_norm(slope, dim=(1, 2))
-    # Energies are sums of squares. They may rise by their rounding, and where the gradient falls, by that of positions.
+    # Energies are sums of squares. They may rise by their rounding, and where the gradient falls, by the effect of the
+    # rounding of positions.
     bound = state.energy * (1 + energy_rounding(value.dtype))
     bound = torch.where(norm < state.norm, bound + state.rounding * state.energy.clamp_min(0).sqrt(), bound)
     better = (length > 0) & (value <= bound)
@@ -240,7 +241,7 @@ def updated(state: State, value: Tensor, slope: Tensor) -> State:
     )
 
 
-def ridged(hessian: Tensor, damping: float | None = None) -> Tensor:
+def add_ridge(hessian: Tensor, damping: float | None = None) -> Tensor:
     """A Hessian with a ridge relative to its mean diagonal. *Shape:* ``(..., n, n)``."""
     if damping is None:
         damping = 1e-12 if hessian.dtype == torch.float64 else 1e-6

@@ -16,7 +16,7 @@ from torch_modal import trees
 from torch_modal.autograd import plain
 from torch_modal.elastic.energy import Energy, Linearised, Reference, RestShapes
 from torch_modal.elastic.kernel_energy import KernelEnergy
-from torch_modal.elastic.kernels.function import fused
+from torch_modal.elastic.kernels.function import run_operation
 from torch_modal.elastic.kernels.launch import launch, of_elements
 from torch_modal.elastic.shell import ShellEnergy
 from torch_modal.elastic.term import Term
@@ -28,7 +28,7 @@ MOST_BYTES = 2**26
 _BLOCK = 8
 
 MOST_NUMBERS = 2**27
-"""Of an array that all samples of a batch have at a time (1 GiB): kernels index with 32 bits, and memory is finite."""
+"""Largest array for all samples of a batch (1 GiB): kernels index with 32 bits, and memory is finite."""
 
 
 class Derivatives(NamedTuple):
@@ -39,8 +39,8 @@ class Derivatives(NamedTuple):
     gradient: Tensor
     """*Shape:* ``(B, n)``."""
     gauss_newton: Tensor
-    """``2 J^T J``, positive semi-definite but for rounding: that of single precision without the second-order term,
-    where a metric is wanted. *Shape:* ``(B, n, n)``."""
+    """``2 J^T J``, positive semi-definite but for rounding; of single precision without the second-order term.
+    *Shape:* ``(B, n, n)``."""
     second_order: Tensor | None
     """The second-order term of the full Hessian. *Shape:* ``(B, n, n)``."""
     resolution: Tensor
@@ -78,11 +78,11 @@ class ModalEnergy(nn.Module):
 
     columns: Tensor
     tabulated = True
-    """Whether the edge vectors of elements along all columns are kept, or computed at each use."""
+    """True if the edge vectors of elements along all columns are kept; otherwise they are computed at each use."""
 
     def __init__(self, energy: Energy | ShellEnergy, columns: Tensor) -> None:
         super().__init__()
-        #: Whether the shapes are in the caller's coordinates, as the anchors of terms are.
+        #: True if the shapes are in the caller's coordinates, as the anchors of terms are.
         self.unscaled = isinstance(energy, ShellEnergy)
         self.energy = energy.energy if isinstance(energy, ShellEnergy) else energy
         rows = self.energy.extend(columns.movedim(-1, 0))
@@ -113,8 +113,8 @@ class ModalEnergy(nn.Module):
         Args:
             base: The shape at amplitudes of zero. *Shape:* ``(B, V, 3)``.
             reference: What is compared with, for example of :meth:`torch_modal.ShellEnergy.against`.
-            anchors: Of the energy's terms, where there are some; by default those of a
-                :class:`torch_modal.ShellEnergy` as they are. *Shape:* ``(B, P, 3)``.
+            anchors: Anchors of the energy's terms; by default the anchors of a :class:`torch_modal.ShellEnergy`.
+                *Shape:* ``(B, P, 3)``.
         """
         if anchors is None and self.unscaled and self.energy.anchors is not None:
             anchors = self.energy.anchors.to(base)[None]
@@ -136,22 +136,22 @@ class ModalEnergy(nn.Module):
         Args:
             a: Amplitudes. *Shape:* ``(B, n)``.
             placement: The space of each sample and its reference.
-            second_order: Whether the term beyond Gauss-Newton is wanted.
+            second_order: True to compute the term beyond Gauss-Newton.
         """
         x = self.rows(a, placement)
         at = self.energy.linearise(x, placement.reference)
         gradients, inner, curved = [], [], []
-        for i, (part, one) in enumerate(zip(self.energy.parts, at, strict=True)):
+        for i, (summand, one) in enumerate(zip(self.energy.parts, at, strict=True)):
             columns = getattr(self, f"edge_vectors_{i}") if self.tabulated else self._edge_vectors(i)
-            if part.term.total:
+            if summand.term.total:
                 row = self._along_columns(one.gradients)
-                gradient, own = one.slope * row, one.curvature[..., None] * row[:, :, None] * row[:, None, :]
+                gradient, normal_matrix = one.slope * row, one.curvature[..., None] * row[:, :, None] * row[:, None, :]
             else:
-                gradient, own = _normal_equations(one, columns, second_order)
+                gradient, normal_matrix = _normal_equations(one, columns, second_order)
             gradients.append(gradient)
-            inner.append(own)
+            inner.append(normal_matrix)
             if second_order:
-                curved.append(_second_order(part.term, one, columns))
+                curved.append(_second_order(summand.term, one, columns))
         gauss_newton = reduce(torch.add, inner)
         stiffness = sum(one.curvature.sum(-1) for one in at)
         stiffest = gauss_newton.diagonal(dim1=-2, dim2=-1).amax(-1)
@@ -203,15 +203,15 @@ def _second_order(term: Term, one: Linearised, columns: Tensor) -> Tensor:
         curved = curved + (one.beyond * gradients)[:, None] * gradients
     most = max(1, MOST_BYTES // max(1, columns.numel() * columns.element_size()))
     # (b, M, c, c) by (M, c, n), of some samples at a time.
-    parts = (own.contiguous() @ columns for own in curved.permute(2, 3, 0, 1).split(most))
+    parts = (some.contiguous() @ columns for some in curved.permute(2, 3, 0, 1).split(most))
     return torch.cat([columns.flatten(0, 1).mT @ pushed.flatten(1, 2) for pushed in parts])
 
 
 class KernelModalEnergy(ModalEnergy):
     """:class:`ModalEnergy` whose values and derivatives come from kernels, in float64.
 
-    What is differentiated once more is torch's, and what has no numbers. Shapes are not extended, and the records of
-    references are those of kernels.
+    Torch computes second derivatives and tensors without data. Shapes are not extended, and records of references have
+    the layout of kernels.
 
     Args:
         kernels: The terms.
@@ -232,17 +232,17 @@ class KernelModalEnergy(ModalEnergy):
         self.register_buffer("blocks", blocks, persistent=False)
 
     def reference(self, rests: RestShapes, base: Tensor | None = None) -> Reference:
-        """As in the base class."""
+        """Overrides the base class."""
         return self.kernels.reference(rests, base)
 
     def place(self, base: Tensor, reference: Reference, anchors: Tensor | None = None) -> Placement:
-        """As in the base class."""
+        """Overrides the base class."""
         return Placement(base.double(), reference)
 
     def by_torch(self, placement: Placement) -> Placement:
         """A placement for torch."""
         base, reference = trees.mapped(placement, lambda value: value.to(self.columns.dtype))
-        return super().place(base, reference.turned())
+        return super().place(base, reference.transpose())
 
     def _plain(self, placement: Placement) -> Placement | None:
         """The placement for torch; None where it is for kernels."""
@@ -257,22 +257,22 @@ class KernelModalEnergy(ModalEnergy):
         return ((a @ flat).unflatten(-1, (-1, 3)) + base).flatten(0, -3)
 
     def value(self, a: Tensor, placement: Placement) -> Tensor:
-        """As in the base class."""
-        own = self._plain(placement)
-        if own is not None:
-            return super().value(a.to(own.base), own).to(placement.base)
-        found = self.kernels.value(self._shapes(a, placement.base), placement.reference)
-        return found.unflatten(0, a.shape[:-1]) + placement.reference.constant
+        """Overrides the base class."""
+        for_torch = self._plain(placement)
+        if for_torch is not None:
+            return super().value(a.to(for_torch.base), for_torch).to(placement.base)
+        energies = self.kernels.value(self._shapes(a, placement.base), placement.reference)
+        return energies.unflatten(0, a.shape[:-1]) + placement.reference.constant
 
     def derivatives(self, a: Tensor, placement: Placement, second_order: bool = True) -> Derivatives:
-        """As in the base class."""
-        own = self._plain(placement)
-        if own is not None:
-            found = super().derivatives(a.to(own.base), own, second_order)
-            return trees.mapped(found, lambda value: value.to(placement.base))
+        """Overrides the base class."""
+        for_torch = self._plain(placement)
+        if for_torch is not None:
+            result = super().derivatives(a.to(for_torch.base), for_torch, second_order)
+            return trees.mapped(result, lambda value: value.to(placement.base))
         terms = [self.kernels.parts[i] for i in self.kernels.terms]
-        rows = max(sum(len(part.elements) for part in terms) + 1, len(self.blocks))
-        local = [len(part.elements) * (3 * part.functions.n) ** 2 for part in terms]
+        rows = max(sum(len(term.elements) for term in terms) + 1, len(self.blocks))
+        local = [len(term.elements) * (3 * term.functions.n) ** 2 for term in terms]
         most = max(1, MOST_NUMBERS // max(self.blocks.shape[1] * rows, *local))
         parts = [
             self._derivatives(a[i : i + most], trees.rows(placement, slice(i, i + most)), second_order)
@@ -290,13 +290,13 @@ class KernelModalEnergy(ModalEnergy):
         )
         (b, n_vertices, _), n, n_blocks = x.shape, len(self.columns), self.blocks.shape[1] // _BLOCK
         terms = [(kernels.parts[i], to.records[i]) for i in kernels.terms]
-        starts = [0, *itertools.accumulate(len(part.elements) for part, _ in terms)]
+        starts = [0, *itertools.accumulate(len(term.elements) for term, _ in terms)]
         n_rows, totals = starts[-1] + len(kernels.volumes), x.new_zeros(b, 2)
         # One row for each measure, the last for the volume; the residuals are a column like the others.
         jacobian = x.new_empty(b, n_rows, blocks.shape[1])
-        for (part, record), first in zip(terms, starts, strict=False):
-            given = n_vertices, x, record, blocks, n, n_blocks, first, n_rows, jacobian, jacobian, totals
-            part.launch("jacobian", b, *given)
+        for (term, record), first in zip(terms, starts, strict=False):
+            arguments = n_vertices, x, record, blocks, n, n_blocks, first, n_rows, jacobian, jacobian, totals
+            term.launch("jacobian", b, *arguments)
         stiffness, value = totals.unbind(1)
         for i in kernels.volumes:
             normal = torch.zeros_like(x)
@@ -314,11 +314,11 @@ class KernelModalEnergy(ModalEnergy):
         curved = None
         if second_order:
             pushed = x.new_zeros(b, *blocks.shape)
-            for part, record in terms:
-                hessians = x.new_empty(b, len(part.elements), (3 * part.functions.n) ** 2)
-                part.launch("hessians", b, n_vertices, x, record, hessians, back=True)
-                curve, local = of_elements("curving", part.functions.n).curved, (part.elements, hessians)
-                launch(curve, (b, len(part.elements)), [*local, n_vertices + 1, blocks, n_blocks, pushed])
+            for term, record in terms:
+                hessians = x.new_empty(b, len(term.elements), (3 * term.functions.n) ** 2)
+                term.launch("hessians", b, n_vertices, x, record, hessians, back=True)
+                curve, local = of_elements("curving", term.functions.n).curved, (term.elements, hessians)
+                launch(curve, (b, len(term.elements)), [*local, n_vertices + 1, blocks, n_blocks, pushed])
             for i in kernels.volumes:
                 kernels.parts[i].of_faces("curved", x, moment, blocks, n_blocks, pushed)
             curved = (blocks.mT @ pushed)[:, :n, :n]
@@ -326,18 +326,18 @@ class KernelModalEnergy(ModalEnergy):
         return Derivatives(value, gradient, inner, curved, rounding * (stiffest * stiffness).sqrt())
 
     def value_and_gradient(self, a: Tensor, placement: Placement) -> tuple[Tensor, Tensor]:
-        """As in the base class."""
-        own = self._plain(placement)
-        if own is not None:
-            value, gradient = super().value_and_gradient(a.to(own.base), own)
+        """Overrides the base class."""
+        for_torch = self._plain(placement)
+        if for_torch is not None:
+            value, gradient = super().value_and_gradient(a.to(for_torch.base), for_torch)
             return value.to(placement.base), gradient.to(placement.base)
         to = placement.reference
         value, x = self.kernels.value_and_gradient(self._shapes(a, placement.base), to)
         return value + to.constant, x.flatten(1) @ self.flat.double().mT
 
     def gradient(self, a: Tensor, placement: Placement) -> Tensor:
-        """As in the base class."""
-        return fused(_Gradient(self), a, placement.base, *placement.reference.records)[0].to(placement.base)
+        """Overrides the base class."""
+        return run_operation(_Gradient(self), a, placement.base, *placement.reference.records)[0].to(placement.base)
 
 
 class _Gradient:
@@ -349,12 +349,10 @@ class _Gradient:
         self.modal = modal
 
     def run(self, kept: list[Any] | None, a: Tensor, *place: Tensor) -> tuple[Tensor, ...]:
-        """See :class:`~torch_modal.elastic.kernels.function.Operation`."""
         with torch.no_grad():
             return (self.modal.value_and_gradient(a, self._placement(*place))[1],)
 
     def back(self, kept: list[Any], grads: Sequence[Tensor], a: Tensor, *place: Tensor) -> tuple[Tensor | None, ...]:
-        """See :class:`~torch_modal.elastic.kernels.function.Operation`."""
         modal, (base, to) = self.modal, self._placement(*place)
         x, moved = modal._shapes(a, base), modal._shapes(grads[0], torch.zeros_like(base))
         to_base, to_records = torch.zeros_like(x), [torch.zeros_like(record) for record in to.records]
@@ -362,9 +360,8 @@ class _Gradient:
         return to_base.flatten(1) @ modal.flat.double().mT, to_base, *to_records
 
     def by_torch(self, a: Tensor, *place: Tensor) -> tuple[Tensor, ...]:
-        """See :class:`~torch_modal.elastic.kernels.function.Operation`."""
-        own = self.modal.by_torch(self._placement(*place))
-        return (ModalEnergy.gradient(self.modal, a.to(own.base), own).to(a),)
+        placement = self.modal.by_torch(self._placement(*place))
+        return (ModalEnergy.gradient(self.modal, a.to(placement.base), placement).to(a),)
 
     @staticmethod
     def _placement(base: Tensor, *records: Tensor) -> Placement:

@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torch_modal.elastic.kernels.function import fused
+from torch_modal.elastic.kernels.function import run_operation
 from torch_modal.elastic.kernels.launch import kernels, launch
 from torch_modal.geometry import procrustes
 
@@ -15,7 +15,7 @@ def mean_pose(to_reference: Tensor, among: Tensor, weights: Tensor) -> tuple[Ten
     """:func:`torch_modal.geometry.procrustes.mean_pose`; of two shapes by a kernel, in float64."""
     if weights.shape[1] != 2:
         return procrustes.mean_pose(to_reference, among, weights)
-    turns, pose = fused(_MeanPose(), to_reference, among, weights)
+    turns, pose = run_operation(_MeanPose(), to_reference, among, weights)
     return turns.to(among), pose.to(among)
 
 
@@ -26,14 +26,14 @@ class _MeanPose:
     by_torch = staticmethod(procrustes.mean_pose)
 
     @staticmethod
-    def run(kept: list[Any] | None, *given: Tensor) -> tuple[Tensor, ...]:
-        turns, pose = torch.empty_like(given[0]), torch.empty_like(given[0][:, 0])
-        launch(kernels("procrustes").mean_pose, (len(pose),), [*given, turns, pose])
+    def run(kept: list[Any] | None, *tensors: Tensor) -> tuple[Tensor, ...]:
+        turns, pose = torch.empty_like(tensors[0]), torch.empty_like(tensors[0][:, 0])
+        launch(kernels("procrustes").mean_pose, (len(pose),), [*tensors, turns, pose])
         return turns, pose
 
     @staticmethod
-    def back(kept: list[Any], grads: Sequence[Tensor], *given: Tensor) -> tuple[Tensor | None, ...]:
-        found = [torch.zeros_like(x) for x in given]
+    def back(kept: list[Any], grads: Sequence[Tensor], *tensors: Tensor) -> tuple[Tensor | None, ...]:
+        gradients = [torch.zeros_like(x) for x in tensors]
         scratch = [torch.empty_like(x) for x in grads]
-        launch(kernels("rotations_adjoint").mean_pose, (len(given[0]),), [*given, *scratch], [*found, *grads])
-        return tuple(found)
+        launch(kernels("rotations_adjoint").mean_pose, (len(tensors[0]),), [*tensors, *scratch], [*gradients, *grads])
+        return tuple(gradients)

@@ -9,9 +9,9 @@ from torch_modal.elastic.kernels.launch import kernels, launch
 
 
 def update(state: Any, shortest: float, value: Tensor, slope: Tensor) -> Any:
-    """:func:`torch_modal.elastic.minimise.updated` in float64 on the CPU, in place: one thread serves each sample."""
+    """:func:`torch_modal.elastic.minimise.bfgs_update` in float64 on the CPU, in place, with one thread per sample."""
     n_samples, n = state.a.shape[:2]
-    given = [
+    args = [
         n,
         value,
         slope,
@@ -22,6 +22,6 @@ def update(state: Any, shortest: float, value: Tensor, slope: Tensor) -> Any:
         state.a,
         state.there,
     ]
-    given += [state.energy, state.gradient, state.norm, state.inverse, state.length, state.n_steps]
-    launch(kernels("quasi_newton").update, (n_samples,), [*given, value.new_empty(n_samples, n)])
+    args += [state.energy, state.gradient, state.norm, state.inverse, state.length, state.n_steps]
+    launch(kernels("quasi_newton").update, (n_samples,), [*args, value.new_empty(n_samples, n)])
     return state

@@ -15,7 +15,7 @@ STIFFEST = 1e4
 
 
 def rest_hessian(points: FloatArray, edges: IntArray, hinges: IntArray, stretch: float = 1.0) -> sp.csc_matrix:
-    """Hessian of edge lengths and dihedral angles in Eq. 5 at rest, where it is that of Gauss and Newton.
+    """Hessian of edge lengths and dihedral angles in Eq. 5 at rest, where it equals the Gauss-Newton Hessian.
 
     Args:
         points: Shape of a size of 100. *Shape:* ``(N, 3)``.

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torch_modal.autograd import plain
-from torch_modal.elastic.kernels.function import fused
+from torch_modal.elastic.kernels.function import run_operation
 from torch_modal.elastic.kernels.launch import Constants, kernels, launch
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.local_rotations import LocalRotations, Trajectory
@@ -53,37 +53,37 @@ class WarpRotations(LocalRotations):
         """Overrides the base class."""
         if self.clusters is not None or weights.shape[1] != 2:
             return super().pulls(shapes, weights, poisson)
-        return fused(_Turned(self, poisson), shapes, weights)[0].to(shapes)
+        return run_operation(_RightHandSide(self, poisson), shapes, weights)[0].to(shapes)
 
     def turns(self, first: Tensor, second: Tensor) -> Tensor:
         """Overrides the base class."""
-        quaternions, sign, _ = self.turned(torch.stack([first, second], 1).double())
+        quaternions, sign, _ = self.signed_quaternions(torch.stack([first, second], 1).double())
         return (sign[..., None] * quaternions).movedim(-1, 0).to(first)
 
-    def turned(self, shapes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def signed_quaternions(self, shapes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Quaternions between two shapes, their signs, frames and stretches, ``(B, F, 4), (B, F), (B, F, 12)``."""
         quaternions, areas, frames = (shapes.new_empty(len(shapes), len(self.faces), n) for n in (4, 1, 12))
-        given = [self.constants, shapes, quaternions, areas, frames]
-        launch(kernels("rotations").turns, (len(shapes), len(self.faces)), given)
+        args = [self.constants, shapes, quaternions, areas, frames]
+        launch(kernels("rotations").turns, (len(shapes), len(self.faces)), args)
         return quaternions, self.sign(quaternions, areas[..., 0]), frames
 
     def sign(self, quaternions: Tensor, areas: Tensor) -> Tensor:
         """Overrides the base class, on a CPU: the walk down the tree is one thread's."""
         if areas.device.type != "cpu" or not plain(areas):
             return super().sign(quaternions, areas)
-        given, weights = quaternions.double().contiguous(), areas.double().contiguous()
+        rows, weights = quaternions.double().contiguous(), areas.double().contiguous()
         sign, vote = torch.ones_like(weights), weights.new_zeros(len(weights), self.n_pieces)
-        launch(kernels("rotations").sign_votes, (len(weights),), [self.constants, given, weights, sign, vote])
+        launch(kernels("rotations").sign_votes, (len(weights),), [self.constants, rows, weights, sign, vote])
         return sign.to(areas)
 
     def along(self, trajectory: Trajectory, which: Tensor, t: Tensor) -> Tensor:
         """Overrides the base class."""
         packed = torch.cat(list(trajectory)).movedim(0, -1)
-        return fused(_OnTrajectory(self, len(packed)), packed, which, t)[0].movedim(-1, 0).to(trajectory.size)
+        return run_operation(_OnTrajectory(self, len(packed)), packed, which, t)[0].movedim(-1, 0).to(trajectory.size)
 
 
 @dataclass(frozen=True, eq=False)
-class _Turned:
+class _RightHandSide:
     """Pulls of the edge vectors between two shapes. *Shape:* ``(B, 2, V, 3), (B, 2) -> (B, V, 3)``."""
 
     rotations: WarpRotations
@@ -91,20 +91,20 @@ class _Turned:
     n_results = n_differentiable = 1
 
     def run(self, kept: list[Any] | None, shapes: Tensor, weights: Tensor) -> tuple[Tensor, ...]:
-        own, pulls = self.rotations, torch.zeros_like(shapes[:, 0])
-        quaternions, sign, frames = own.turned(shapes)
-        given = [own.constants, quaternions, sign, frames, weights, *self._stiffness(), pulls]
-        launch(kernels("rotations").part_turned, (len(shapes), len(own.faces)), given)
+        rotations, pulls = self.rotations, torch.zeros_like(shapes[:, 0])
+        quaternions, sign, frames = rotations.signed_quaternions(shapes)
+        args = [rotations.constants, quaternions, sign, frames, weights, *self._stiffness(), pulls]
+        launch(kernels("rotations").right_hand_side, (len(shapes), len(rotations.faces)), args)
         if kept is not None:
             kept.append(sign)
         return (pulls,)
 
     def back(self, kept: list[Any], grads: Sequence[Tensor], shapes: Tensor, weights: Tensor) -> tuple[Tensor, ...]:
-        own, found = self.rotations, (torch.zeros_like(shapes), torch.zeros_like(weights))
-        sign = kept[0] if kept else own.turned(shapes)[1]
-        given = [own.constants, shapes, weights, sign, *self._stiffness(), grads[0], *found]
-        launch(kernels("rotations_adjoint").part_turned, (len(shapes), len(own.faces)), given)
-        return found
+        rotations, gradients = self.rotations, (torch.zeros_like(shapes), torch.zeros_like(weights))
+        sign = kept[0] if kept else rotations.signed_quaternions(shapes)[1]
+        args = [rotations.constants, shapes, weights, sign, *self._stiffness(), grads[0], *gradients]
+        launch(kernels("rotations_adjoint").right_hand_side, (len(shapes), len(rotations.faces)), args)
+        return gradients
 
     def by_torch(self, shapes: Tensor, weights: Tensor) -> tuple[Tensor, ...]:
         return (LocalRotations.pulls(self.rotations, shapes, weights, self.poisson),)
@@ -123,16 +123,16 @@ class _OnTrajectory:
     n_results = n_differentiable = 1
 
     def run(self, kept: list[Any] | None, packed: Tensor, which: Tensor, t: Tensor) -> tuple[Tensor, ...]:
-        own, total = self.rotations, t.new_zeros(len(t), self.rotations.n_edges, 4)
-        given = [own.constants, packed, self._index(packed, which), t, total]
-        launch(kernels("rotations").trajectory_edges, (len(t), len(own.faces)), given)
+        rotations, total = self.rotations, t.new_zeros(len(t), self.rotations.n_edges, 4)
+        args = [rotations.constants, packed, self._index(packed, which), t, total]
+        launch(kernels("rotations").trajectory_edges, (len(t), len(rotations.faces)), args)
         sums, areas = total[..., :3], total[..., 3:].clamp_min(torch.finfo(total.dtype).tiny)
         if kept is not None:
             kept += [sums, areas]
         return (sums / areas,)
 
-    def back(self, kept: list[Any], grads: Sequence[Tensor], *given: Tensor) -> tuple[Tensor | None, ...]:
-        packed, which, t = given
+    def back(self, kept: list[Any], grads: Sequence[Tensor], *tensors: Tensor) -> tuple[Tensor | None, ...]:
+        packed, which, t = tensors
         if not kept:
             self.run(kept, packed, which, t)
         sums, areas = kept

@@ -17,7 +17,7 @@ ALPHA, BETA, GAMMA = 500.0, 10.0, 1000.0
 """The paper's stiffnesses. Eq. 5 is not scale-invariant: they are meant for shapes of `CANONICAL_SIZE`."""
 
 N_SHELL_TERMS = 3
-"""How many terms Eq. 5 has; they come first."""
+"""Number of terms in Eq. 5; they come first."""
 
 
 class Measures(NamedTuple):
@@ -101,7 +101,7 @@ class ShellEnergy(nn.Module):
     def measure(self, x: Tensor) -> Measures:
         """Lengths, angles and volume of shapes. *Shape:* ``(..., V, 3)``."""
         rows = self._rows(x)
-        length, angle, volume = (part.measures(part.edge_vectors(rows)) for part in list(self.energy.parts)[:3])
+        length, angle, volume = (term.measures(term.edge_vectors(rows)) for term in list(self.energy.parts)[:3])
         return Measures(length, angle, volume[..., 0])
 
     def residuals(self, x: Tensor, x_rest: Tensor) -> Tensor:
@@ -116,11 +116,11 @@ class ShellEnergy(nn.Module):
         """
         rows, rest = self._rows(x), self.rest(x_rest)
         parts = [
-            (factor * weights).sqrt() * part.term.difference(part.measures(part.edge_vectors(rows)), measures)
-            for part, measures, weights, factor in zip(self.energy.parts, *rest, self.stiffness, strict=True)
+            (factor * weights).sqrt() * summand.term.difference(summand.measures(summand.edge_vectors(rows)), measures)
+            for summand, measures, weights, factor in zip(self.energy.parts, *rest, self.stiffness, strict=True)
         ]
-        lead = broadcast_shapes(*(part.shape[:-1] for part in parts))
-        return torch.cat([part.expand(*lead, -1) for part in parts], -1)
+        lead = broadcast_shapes(*(summand.shape[:-1] for summand in parts))
+        return torch.cat([summand.expand(*lead, -1) for summand in parts], -1)
 
     def forward(self, x: Tensor, x_rest: Tensor) -> Tensor:
         """Energy of Eq. 5.

@@ -1,4 +1,4 @@
-"""The energy on the caller's mesh with every vertex free: a convex Hessian, never assembled, and steps with it."""
+"""The energy on the caller's mesh with every vertex free: a convex Hessian, never summand, and steps with it."""
 
 from collections.abc import Callable, Sequence
 from functools import reduce
@@ -18,7 +18,7 @@ RIDGE = 1e-6
 # Rows and columns of the upper triangle of a symmetric block.
 _ROWS, _COLUMNS = [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]
 
-# Where steps are small, the curvature along them is rounding of energies.
+# The curvature along a shorter step is rounding of energies.
 SLIGHT = 1e-5 * CANONICAL_SIZE
 
 # Vertices of all samples that are relaxed at a time: more would not fit into a processor's caches, or, of a GPU, into
@@ -66,18 +66,18 @@ class ConvexHessian:
         self.energy, self.at = energy, at
         #: Stiffness across each element of two vertices; along it, there is the curvature. *Shape:* ``(B, M)``.
         self.tensions = [
-            part.term.tension(one.edge_vectors, one.slope, one.curvature)
-            for part, one in zip(energy.parts, at, strict=True)
+            summand.term.tension(one.edge_vectors, one.slope, one.curvature)
+            for summand, one in zip(energy.parts, at, strict=True)
         ]
 
     def __call__(self, field: Tensor) -> Tensor:
         """The product with displacements. *Shape:* ``(3, B, V)``, extended."""
         received = []
-        for part, one, tension in zip(self.energy.parts, self.at, self.tensions, strict=True):
-            if part.term.total:
+        for summand, one, tension in zip(self.energy.parts, self.at, self.tensions, strict=True):
+            if summand.term.total:
                 received.append(one.curvature * (one.gradients * field).sum((0, -1))[:, None])
                 continue
-            edge_vectors = part.edge_vectors(field)
+            edge_vectors = summand.edge_vectors(field)
             rate = (one.gradients * edge_vectors).sum((0, 1))
             if tension is None:
                 received.append(one.curvature * rate * one.gradients)
@@ -89,11 +89,11 @@ class ConvexHessian:
         """The blocks of all vertices, the upper triangle of each. *Shape:* ``(6, B, V)``, extended."""
         like = self.at[0].gradients
         summed = like.new_zeros(6, like.shape[-2], self.energy.n_extended)
-        for part, one, tension in zip(self.energy.parts, self.at, self.tensions, strict=True):
-            if part.term.total:
+        for summand, one, tension in zip(self.energy.parts, self.at, self.tensions, strict=True):
+            if summand.term.total:
                 continue  # of rank one: it couples all vertices, and adds little to each
             along = one.curvature if tension is None else one.curvature - tension
-            for corner, end in zip(part.corners, part.on_corners(one.gradients), strict=True):
+            for corner, end in zip(summand.corners, summand.on_corners(one.gradients), strict=True):
                 blocks = (along * end)[_ROWS] * end[_COLUMNS]
                 if tension is not None:
                     eye = torch.eye(3, dtype=end.dtype, device=end.device)[_ROWS, _COLUMNS]
@@ -119,7 +119,7 @@ def descend(problem: Any, x: Tensor, n_steps: int, n_products: int, taken: list[
     """Steps of a truncated Newton method on all vertices, shortened where the energy would rise.
 
     Each step solves with a convex Hessian by conjugate gradients, preconditioned by its diagonal blocks and cut short:
-    what a modal space leaves to be done is local, and a few iterations see far enough. Every sample takes the same
+    the error that a modal space leaves is local, so a few iterations suffice. Every sample takes the same
     number of both, so that the result is differentiable like any other expression.
 
     Args:
@@ -127,7 +127,8 @@ def descend(problem: Any, x: Tensor, n_steps: int, n_products: int, taken: list[
         x: Where to start. *Shape:* ``(B, V, 3)``.
         n_steps: Newton steps.
         n_products: Iterations of conjugate gradients in each.
-        taken: The steps are added: where they start, the energy there, whole step, length, and what the solver kept.
+        taken: A list to which each step is added: its start, the energy there, the whole step, its length, and what
+            the solver kept.
 
     Returns:
         *Shape:* ``(B, V, 3)``.
@@ -135,7 +136,7 @@ def descend(problem: Any, x: Tensor, n_steps: int, n_products: int, taken: list[
     at = None
     for k in range(n_steps):
         at = problem.at(x) if at is None else at
-        solution, *kept = problem.solved(at, n_products, taken is not None)
+        solution, *kept = problem.newton_direction(at, n_products, taken is not None)
         reached, there = x + solution, None
         if k < n_steps - 1 and plain(reached):  # the whole step is nearly always the one that is taken
             there = problem.at(reached)
@@ -151,7 +152,7 @@ def descend(problem: Any, x: Tensor, n_steps: int, n_products: int, taken: list[
 
 
 def step_length(before: Tensor, slope: Tensor, after: Tensor, largest: Tensor) -> Tensor:
-    """Where the parabola along a step is least, at most 1: a continuous function of the step, unlike a line search.
+    """Length that minimises the parabola along a step, at most 1: continuous in the step, unlike a line search.
 
     Args:
         before: The energy where the step starts. *Shape:* ``(B,)``.
@@ -193,13 +194,13 @@ class SumOfEnergies:
         """*Shape:* ``(B, V, 3)``."""
         each = [one.at(x) for one in self.energies]
         values, gradients, diagonals, products = zip(*each, strict=True)
-        value, gradient, diagonal = (reduce(torch.add, own) for own in (values, gradients, diagonals))
+        value, gradient, diagonal = (reduce(torch.add, summands) for summands in (values, gradients, diagonals))
         return Point(
             value, gradient, diagonal, lambda field: reduce(torch.add, [product(field) for product in products])
         )
 
     @staticmethod
-    def solved(at: Point, n_products: int, keep: bool = False) -> tuple[Tensor]:
+    def newton_direction(at: Point, n_products: int, keep: bool = False) -> tuple[Tensor]:
         """An approximate solution with the Hessian for the opposite of the gradient. *Shape:* ``(B, V, 3)``."""
         inverse = inverse_of_symmetric(at.diagonal.movedim(-1, 0))
 
@@ -268,22 +269,22 @@ class TermsTowards(FreeEnergy):
         self.anchors = None if anchors is None else anchors.movedim(-1, 0)
 
     @classmethod
-    def among(cls, energy: Energy, numbers: Sequence[int], rests: RestShapes) -> "TermsTowards":
+    def of_terms(cls, energy: Energy, numbers: Sequence[int], rests: RestShapes) -> "TermsTowards":
         """Some of the terms of rest shapes, by their numbers."""
-        own = rests._replace(stiffness=[rests.stiffness[i] for i in numbers])
-        return cls(energy, own.reference(energy), rests.anchors)
+        some_rests = rests._replace(stiffness=[rests.stiffness[i] for i in numbers])
+        return cls(energy, some_rests.reference(energy), rests.anchors)
 
-    def _extended(self, x: Tensor) -> Tensor:
+    def _extend(self, x: Tensor) -> Tensor:
         return self.energy.extend(x.movedim(-1, 0), self.anchors)
 
     def value(self, x: Tensor) -> Tensor:
         """*Shape:* ``(B, V, 3) -> (B,)``."""
-        return self.energy.value(self._extended(x), self.reference)
+        return self.energy.value(self._extend(x), self.reference)
 
     def at(self, x: Tensor) -> Point:
         """*Shape:* ``(B, V, 3)``."""
         energy, n = self.energy, x.shape[1]
-        at = energy.linearise(self._extended(x), self.reference)
+        at = energy.linearise(self._extend(x), self.reference)
         hessian = ConvexHessian(energy, at)
 
         def product(field: Tensor) -> Tensor:
@@ -294,8 +295,8 @@ class TermsTowards(FreeEnergy):
         return Point(value, gradient.movedim(0, -1), diagonal.movedim(0, -1), product)
 
 
-Beside = Callable[[slice, Tensor], Sequence[FreeEnergy]]
-"""Makes energies beside that of the terms, for some of the samples, in the dtype of a tensor."""
+ExtraEnergies = Callable[[slice, Tensor], Sequence[FreeEnergy]]
+"""Makes further energies for some of the samples, in the dtype of a tensor."""
 
 
 class FineEnergy(nn.Module):
@@ -303,7 +304,7 @@ class FineEnergy(nn.Module):
 
     Args:
         mesh: The mesh.
-        terms: The terms; those of Eq. 5 come first.
+        terms: The terms; the terms of Eq. 5 come first.
     """
 
     def __init__(self, mesh: Mesh, terms: Sequence[Term]) -> None:
@@ -312,7 +313,7 @@ class FineEnergy(nn.Module):
         self.energy = Energy(mesh, terms)
 
     def relax(
-        self, x: Tensor, rests: RestShapes, stages: Sequence[tuple[int, int]], beside: Beside | None = None
+        self, x: Tensor, rests: RestShapes, stages: Sequence[tuple[int, int]], extra: ExtraEnergies | None = None
     ) -> Tensor:
         """Steps of all vertices, never uphill: stages of :func:`descend` by numbers of steps and products.
 
@@ -321,25 +322,25 @@ class FineEnergy(nn.Module):
         size, parts = chunk_of(x.shape[1], x.device), []
         for i in range(0, len(x), size):
             some = slice(i, i + size)
-            own = x[some]
-            parts.append(self.relax_chunk(own, rests.rows(some), stages, () if beside is None else beside(some, own)))
+            start = x[some]
+            parts.append(self.relax_chunk(start, rests.rows(some), stages, () if extra is None else extra(some, start)))
         return torch.cat(parts)
 
     def relax_chunk(
-        self, x: Tensor, rests: RestShapes, stages: Sequence[tuple[int, int]], beside: Sequence[FreeEnergy]
+        self, x: Tensor, rests: RestShapes, stages: Sequence[tuple[int, int]], extra: Sequence[FreeEnergy]
     ) -> Tensor:
         """:meth:`relax` of samples that fit into the caches, with their own further energies."""
-        own = TermsTowards(self.energy, rests.reference(self.energy, x, relative=True), rests.anchors)
-        return descended(SumOfEnergies([own, *beside]), x, stages)
+        terms = TermsTowards(self.energy, rests.reference(self.energy, x, relative=True), rests.anchors)
+        return descend_in_stages(SumOfEnergies([terms, *extra]), x, stages)
 
     def towards(
-        self, x: Tensor, reference: Reference, n_steps: int, n_products: int, beside: Sequence[FreeEnergy] = ()
+        self, x: Tensor, reference: Reference, n_steps: int, n_products: int, extra: Sequence[FreeEnergy] = ()
     ) -> Tensor:
         """Steps of all vertices towards a reference that is known. *Shape:* ``(B, V, 3)``."""
-        return descend(SumOfEnergies([TermsTowards(self.energy, reference), *beside]), x, n_steps, n_products)
+        return descend(SumOfEnergies([TermsTowards(self.energy, reference), *extra]), x, n_steps, n_products)
 
 
-def descended(problem: Any, x: Tensor, stages: Sequence[tuple[int, int]]) -> Tensor:
+def descend_in_stages(problem: Any, x: Tensor, stages: Sequence[tuple[int, int]]) -> Tensor:
     """:func:`descend` in stages."""
     for n_steps, n_products in stages:
         x = descend(problem, x, n_steps, n_products)

@@ -73,16 +73,16 @@ def kernel_functions() -> KernelFunctions:
         return wp.sqrt(wp.max(wp.dot(x[0], x[0]), tiny_square))
 
     @wp.func
-    def linearised(x: edge):
+    def linearise(x: edge):
         length = measure(x)
         return length, wp.matrix_from_rows((real(1.0) / length) * x[0])
 
     @wp.func
     def weight(x: edge, length: real, mean: real):
-        found = real(0.0)
+        result = real(0.0)
         if length > shortest * mean:
-            found = real(1.0) / length
-        return found
+            result = real(1.0) / length
+        return result
 
     @wp.func
     def across(length: real, slope: real, stiffness: real):
@@ -90,5 +90,5 @@ def kernel_functions() -> KernelFunctions:
         return real(0.5) / length * (slope + wp.sqrt(slope * slope + width * width + tiniest))
 
     return KernelFunctions(
-        "stretch", 1, square(), measure, linearised, weight=weight, uses_mean=True, across=across, even=True
+        "stretch", 1, square(), measure, linearise, weight=weight, uses_mean=True, across=across, even=True
     )

@@ -1,12 +1,12 @@
 r"""Terms of an energy: measures of the elements of a mesh, and their weights.
 
 A term has the energy :math:`\sum_m k_m w_m (q_m - \bar q_m)^2` over its elements ``m``, with a measure ``q`` of each,
-its value at rest, weights ``w`` that depend on the rest shape, and the stiffness ``k``. All that a term must say is
-which elements it sees and what it measures on one of them: derivatives then come from ``torch.func``. The terms of
-Eq. 5 write theirs out. Angles take a smooth periodic function in the place of the square (:class:`PeriodicTerm`).
+its value at rest, weights ``w`` that depend on the rest shape, and the stiffness ``k``. A term defines
+its elements and the measure of one of them; derivatives then come from ``torch.func``. The terms of Eq. 5 have theirs
+in closed form. Angles take a smooth periodic function instead of the square (:class:`PeriodicTerm`).
 
 Kernels of NVIDIA Warp are made from the same functions of one element, written once more for them
-(:class:`KernelFunctions`) beside those for torch, inside functions, as Warp is loaded only where it is used.
+(:class:`KernelFunctions`) next to the torch code, inside functions, as Warp is loaded only where it is used.
 """
 
 import math
@@ -22,7 +22,7 @@ from torch_modal.geometry.vectors import inverse
 
 
 class Mesh:
-    """The vertices that elements may be made of: those of a mesh, their centre, and the anchors of a term.
+    """The vertices that elements may have: the vertices of a mesh, their centre, and the anchors of a term.
 
     Args:
         connectivity: Of the faces.
@@ -64,7 +64,7 @@ class Potential(NamedTuple):
     """The type of the sums over rest shapes."""
     moments: Any
     """Sums over rest shapes are of these: measure, pull -> vector."""
-    merged: Any
+    merge_rests: Any
     """From the sums, and a factor of the pulls, to the record."""
     energy: Any
     """Measure, record -> energy, but for what is left at the record."""
@@ -77,7 +77,7 @@ class Potential(NamedTuple):
     """Numbers of a record."""
     row: Any
     """The type of a vector of them."""
-    packed: Any
+    pack: Any
     """From the record to that."""
 
 
@@ -88,17 +88,17 @@ class KernelFunctions(NamedTuple):
     """
 
     name: str
-    """Of the modules of the kernels."""
+    """Name of the modules of the kernels."""
     n: int
     """Edge vectors of an element."""
     potential: Potential
     measure: Any
     """Edge vectors -> measure."""
-    linearised: Any
+    linearise: Any
     """Edge vectors -> measure, gradient."""
     exact: bool = True
-    """Whether the gradient is written out, so that it can be differentiated."""
-    turned: Any = None
+    """True if the gradient is in closed form, so that it can be differentiated."""
+    hessian_product: Any = None
     """Edge vectors, matrix -> the measure's Hessian times the matrix; from the gradient where it is None."""
     weight: Any = None
     """Weight at rest: edge vectors, measure, mean of the measures; None where torch merges the rest shapes."""
@@ -108,7 +108,7 @@ class KernelFunctions(NamedTuple):
     across: Any = None
     """Stiffness across an element: measure, slope, twice the weight."""
     even: bool = False
-    """Whether an edge may have either sense."""
+    """True if an edge may have either direction."""
 
 
 class Term(nn.Module):
@@ -123,8 +123,8 @@ class Term(nn.Module):
             def measure(self, edge_vectors):
                 return 0.5 * torch.linalg.cross(edge_vectors[0], edge_vectors[1]).norm()
 
-    and is passed as ``tm.Objective(terms=(Area(5.0),))``. Measures are taken at a size of 100, like
-    those of Eq. 5.
+    and is passed as ``tm.Objective(terms=(Area(5.0),))``. Measures are taken at a size of 100, as
+    in Eq. 5.
 
     Args:
         stiffness: ``k``: a number, or a tensor or parameter whose last dimension counts the elements, or is 1, and
@@ -132,9 +132,9 @@ class Term(nn.Module):
     """
 
     total = False
-    """Whether the measures of all elements add up to one, such as a volume."""
+    """True if the measures of all elements add up to one measure, such as a volume."""
     sampled = False
-    """Whether elements name vertices of the caller's mesh, for which a coarse mesh has no counterpart."""
+    """True if elements name vertices of the caller's mesh, for which a coarse mesh has no counterpart."""
     kernel_measure: Any = None
     """The measure as a ``wp.func`` of a matrix of the edge vectors, by row: then kernels compute the term."""
     kernel_gradient: Any = None
@@ -148,7 +148,7 @@ class Term(nn.Module):
         else:
             self.stiffness = stiffness
 
-    # ------------------------------------------------------------------------------------------- what a term must say
+    # ------------------------------------------------------------------------------------------- required of a term
     def elements(self, mesh: Mesh) -> Tensor:
         """The vertices of each element. *Shape:* ``(M, n)``, with n of 2 or more."""
         raise NotImplementedError
@@ -160,7 +160,7 @@ class Term(nn.Module):
         """
         raise NotImplementedError
 
-    # -------------------------------------------------------------------------------------------- what a term may say
+    # ------------------------------------------------------------------------------------------- optional for a term
     @property
     def anchors(self) -> Tensor | None:
         """Points of the caller's coordinates that elements may have as vertices, and that do not move.
@@ -174,7 +174,7 @@ class Term(nn.Module):
         return torch.ones_like(measures)
 
     def at_rest(self, measures: Tensor) -> Tensor:
-        """The measures that cost nothing, from those of a rest shape. *Shape:* ``(..., M) -> (..., M)``."""
+        """The measures with no energy, from the measures of a rest shape. *Shape:* ``(..., M) -> (..., M)``."""
         return measures
 
     def difference(self, measures: Tensor, rest: Tensor) -> Tensor:
@@ -182,7 +182,7 @@ class Term(nn.Module):
         return measures - rest
 
     # ---------------------------------------------------------------- the square of the difference, and its derivatives
-    def merged(self, measures: Tensor, pulls: Tensor, factor: float | Tensor = 1.0) -> tuple[Tensor, Tensor]:
+    def merge_rests(self, measures: Tensor, pulls: Tensor, factor: float | Tensor = 1.0) -> tuple[Tensor, Tensor]:
         """K parabolas as one (Eq. 8).
 
         Weights below zero may outweigh the others: then there is no minimum, and no weight.
@@ -209,7 +209,7 @@ class Term(nn.Module):
 
         Args:
             measures: *Shape:* ``(..., M)``.
-            record: Of :meth:`merged`. *Shape:* ``(..., R, M)``.
+            record: Of :meth:`merge_rests`. *Shape:* ``(..., R, M)``.
 
         Returns:
             *Shape:* ``(..., M)``.
@@ -223,7 +223,7 @@ class Term(nn.Module):
         return 2 * weight * self.difference(measures, value)
 
     def curvatures(self, measures: Tensor, record: Tensor) -> tuple[Tensor, Tensor | None]:
-        """A second derivative that is never negative, and what the true one has beyond it; None where nothing."""
+        """A second derivative that is never negative, and the correction to the true one, None where it is zero."""
         return 2 * record[..., 0, :].expand_as(measures), None
 
     def on_one_branch(self, measures: Tensor, pulls: Tensor) -> Tensor:
@@ -267,7 +267,7 @@ class Term(nn.Module):
         """Gradients of the measures in the edge vectors. *Shape:* ``(n-1, 3, ..., M) -> (n-1, 3, ..., M)``."""
         return self._each(jacrev(self.measure), edge_vectors)
 
-    def linearised(self, edge_vectors: Tensor) -> tuple[Tensor, Tensor]:
+    def measures_and_gradients(self, edge_vectors: Tensor) -> tuple[Tensor, Tensor]:
         """The measures and their gradients; overridden, with these, where both share work.
 
         *Shape:* ``(n-1, 3, ..., M) -> (..., M), (n-1, 3, ..., M)``.
@@ -299,7 +299,7 @@ class Term(nn.Module):
 
 
 class PeriodicTerm(Term):
-    r"""A term whose measures are angles, with a smooth periodic function in the place of the square.
+    r"""A term whose measures are angles, with a smooth periodic function instead of the square.
 
     .. math:: f(d) = 2 (1 - \cos d) + \tfrac{1}{3} (1 - \cos d)^2 = \tfrac{5}{2} - \tfrac{8}{3} \cos d
         + \tfrac{1}{6} \cos 2d = d^2 + O(d^6)
@@ -307,15 +307,15 @@ class PeriodicTerm(Term):
     It is 1.2 % below the square at 60 degrees, 5 % at 90, and has no pull at half a turn, where the square of the
     wrapped difference jumps from one side to the other. It is a trigonometric polynomial of second order, so that its
     weighted sum over K rest angles follows exactly from six numbers, the rows of a record: the weight; cosine and sine
-    of the mean angle; and the sums of the phases along the mean, and of those of twice the angles along and across it.
+    of the mean angle; the sums of the phases along the mean, and of the phases of twice the angles along and across it.
     """
 
-    def merged(self, measures: Tensor, pulls: Tensor, factor: float | Tensor = 1.0) -> tuple[Tensor, Tensor]:
+    def merge_rests(self, measures: Tensor, pulls: Tensor, factor: float | Tensor = 1.0) -> tuple[Tensor, Tensor]:
         """K rest angles by their first two trigonometric moments; arguments as in the base class."""
         c, s = measures.cos(), measures.sin()
-        weight, *sums = ((pulls * part).sum(-2) for part in (torch.ones_like(c), c, s, c * c - s * s, 2 * c * s))
+        weight, *sums = ((pulls * moment).sum(-2) for moment in (torch.ones_like(c), c, s, c * c - s * s, 2 * c * s))
         some = weight > 0
-        weight, x, y, x2, y2 = (torch.where(some, part, 0) for part in (weight, *sums))
+        weight, x, y, x2, y2 = (torch.where(some, moment, 0) for moment in (weight, *sums))
         squared = x * x + y * y
         none = squared <= torch.finfo(squared.dtype).tiny
         size = torch.where(none, 1, squared).sqrt()
@@ -339,14 +339,14 @@ class PeriodicTerm(Term):
         return 8 / 3 * once * sine - 1 / 3 * (along * s2 - across * (1 - v2))
 
     def curvatures(self, measures: Tensor, record: Tensor) -> tuple[Tensor, Tensor]:
-        """The largest second derivative, which is that of the square, and what the true one lacks of it."""
+        """Upper bound of the second derivative, and its correction: the true value is their sum."""
         weight, c, s, once, along, across = record.unbind(-2)
         v, _, v2, s2 = _turns(measures, c, s)
         true = 8 / 3 * once * (1 - v) - 2 / 3 * (along * (1 - v2) + across * s2)
         return 2 * weight.expand_as(measures), true - 2 * weight
 
     def kernel_functions(self, n: int) -> KernelFunctions | None:
-        """As in the base class; kernels know angles by cosine and sine."""
+        """Overrides the base class; kernels represent angles by cosine and sine."""
         if self.kernel_measure is None or not self._has(PeriodicTerm, "energies", "slopes", "curvatures"):
             return None
         return _of_angle(self._name(), n, self.kernel_measure, self.kernel_gradient)
@@ -366,7 +366,7 @@ def periodic_square(difference: Tensor) -> Tensor:
 
 
 def _turns(angle: Tensor, c: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """``1 - cos``, without cancellation, and ``sin`` of angles from one of this phase; those of twice the angles."""
+    """``1 - cos``, without cancellation, and ``sin`` of angles relative to a phase; then of twice the angles."""
     x, y = angle.cos(), angle.sin()
     off_x, off_y, sine = x - c, y - s, c * y - s * x
     versine = 0.5 * (off_x * off_x + off_y * off_y)
@@ -382,7 +382,7 @@ def wrap_angle(angle: Tensor) -> Tensor:
 @cache
 @no_type_check
 def square() -> Potential:
-    """That of :class:`Term`."""
+    """The potential of :class:`Term`."""
     import warp as wp
 
     real, vec3, row = wp.float64, wp.vec3d, wp.vec2d
@@ -397,7 +397,7 @@ def square() -> Potential:
         return pull * vec3(real(1.0), q, q * q)
 
     @wp.func
-    def merged(m: vec3, factor: real):
+    def merge_rests(m: vec3, factor: real):
         to = Square()
         if m[0] > real(0.0):
             to.weight = factor * m[0]
@@ -418,22 +418,22 @@ def square() -> Potential:
 
     @wp.func
     def left(m: vec3, factor: real, to: Square):
-        found = real(0.0)
+        energy_left = real(0.0)
         if m[0] > real(0.0):
-            found = factor * (m[2] - m[1] * to.value)
-        return found
+            energy_left = factor * (m[2] - m[1] * to.value)
+        return energy_left
 
     @wp.func
-    def packed(to: Square):
+    def pack(to: Square):
         return row(to.weight, to.value)
 
-    return Potential(Square, real, vec3, moments, merged, energy, slope, rate, left, 2, row, packed)
+    return Potential(Square, real, vec3, moments, merge_rests, energy, slope, rate, left, 2, row, pack)
 
 
 @cache
 @no_type_check
 def periodic() -> Potential:
-    """That of :class:`PeriodicTerm`, of cosine and sine of the measure."""
+    """The potential of :class:`PeriodicTerm`, of cosine and sine of the measure."""
     import warp as wp
 
     real, vec2 = wp.float64, wp.vec2d
@@ -454,7 +454,7 @@ def periodic() -> Potential:
         return pull * vec5(real(1.0), q[0], q[1], q[0] * q[0] - q[1] * q[1], real(2.0) * q[0] * q[1])
 
     @wp.func
-    def merged(m: vec5, factor: real):
+    def merge_rests(m: vec5, factor: real):
         to = Periodic()
         to.c = real(1.0)
         if m[0] > real(0.0):
@@ -498,10 +498,10 @@ def periodic() -> Potential:
         return real(2.5) * to.weight - third * (real(8.0) * to.once - real(0.5) * to.along)
 
     @wp.func
-    def packed(to: Periodic):
+    def pack(to: Periodic):
         return row(to.weight, to.c, to.s, to.once, to.along, to.across)
 
-    return Potential(Periodic, vec2, vec5, moments, merged, energy, slope, rate, left, 6, row, packed)
+    return Potential(Periodic, vec2, vec5, moments, merge_rests, energy, slope, rate, left, 6, row, pack)
 
 
 @cache
@@ -513,16 +513,16 @@ def _of_measure(name: str, n: int, potential: Potential, measure: Any, gradient:
     if gradient is None:
 
         @wp.func
-        def linearised(e: wp.types.matrix(shape=(n, 3), dtype=wp.float64)):
+        def linearise(e: wp.types.matrix(shape=(n, 3), dtype=wp.float64)):
             return measure(e), wp.grad(measure)(e)
 
     else:
 
         @wp.func
-        def linearised(e: wp.types.matrix(shape=(n, 3), dtype=wp.float64)):
+        def linearise(e: wp.types.matrix(shape=(n, 3), dtype=wp.float64)):
             return measure(e), gradient(e)
 
-    return KernelFunctions(name, n, potential, measure, linearised, gradient is not None)
+    return KernelFunctions(name, n, potential, measure, linearise, gradient is not None)
 
 
 @cache
@@ -531,7 +531,7 @@ def _of_angle(name: str, n: int, measure: Any, gradient: Any) -> KernelFunctions
     """Functions of an angle, by its cosine and sine."""
     import warp as wp
 
-    whole = _of_measure(name, n, periodic(), measure, gradient).linearised
+    whole = _of_measure(name, n, periodic(), measure, gradient).linearise
 
     @wp.func
     def phase(e: wp.types.matrix(shape=(n, 3), dtype=wp.float64)):
@@ -539,8 +539,8 @@ def _of_angle(name: str, n: int, measure: Any, gradient: Any) -> KernelFunctions
         return wp.vec2d(wp.cos(angle), wp.sin(angle))
 
     @wp.func
-    def linearised(e: wp.types.matrix(shape=(n, 3), dtype=wp.float64)):
-        angle, found = whole(e)
-        return wp.vec2d(wp.cos(angle), wp.sin(angle)), found
+    def linearise(e: wp.types.matrix(shape=(n, 3), dtype=wp.float64)):
+        angle, gradient_of_angle = whole(e)
+        return wp.vec2d(wp.cos(angle), wp.sin(angle)), gradient_of_angle
 
-    return KernelFunctions(name, n, periodic(), phase, linearised, gradient is not None)
+    return KernelFunctions(name, n, periodic(), phase, linearise, gradient is not None)

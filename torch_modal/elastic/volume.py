@@ -86,7 +86,7 @@ def kernel_functions() -> KernelFunctions:
         return x[0, 0]
 
     @wp.func
-    def linearised(x: edge):
+    def linearise(x: edge):
         return x[0, 0], wp.matrix_from_rows(wp.vec3d(real(1.0), real(0.0), real(0.0)))
 
     @wp.func
@@ -94,7 +94,7 @@ def kernel_functions() -> KernelFunctions:
         size = wp.max(wp.abs(volume), least * wp.pow(x[0, 1], real(1.5)))
         return real(1.0) / (size * size)
 
-    return KernelFunctions("volume", 1, square(), measure, linearised, weight=weight)
+    return KernelFunctions("volume", 1, square(), measure, linearise, weight=weight)
 
 
 @cache
@@ -111,18 +111,18 @@ def kernels() -> SimpleNamespace:
     @wp.func
     def middle_of(x: wp.array[vec3], v: int, centre: wp.array[vec3], s: int, first: int):
         """The centre; any vertex where the surface is closed."""
-        found = x[place(v, first)]
+        result = x[place(v, first)]
         if centre:
-            found = centre[s]
-        return found
+            result = centre[s]
+        return result
 
     @wp.func
     def corner(x: wp.array[vec3], middle: vec3, v: int, last: int):
         """The last corner of a face: a vertex, or the middle."""
-        found = middle
+        result = middle
         if last >= 0:
-            found = x[place(v, last)]
-        return found
+            result = x[place(v, last)]
+        return result
 
     @wp.func
     def enclosed(face: wp.vec3i, v: int, x: wp.array[vec3], middle: vec3, normal: wp.array[vec3]):
@@ -131,18 +131,18 @@ def kernels() -> SimpleNamespace:
         The faces around a vertex close, so that each gives a sixth of its normal to its corners.
         """
         p = x[place(v, face[0])]
-        found = sixth * wp.cross(x[place(v, face[1])] - p, corner(x, middle, v, face[2]) - p)
+        result = sixth * wp.cross(x[place(v, face[1])] - p, corner(x, middle, v, face[2]) - p)
         if normal:
-            wp.atomic_add(normal, place(v, face[0]), found)
-            wp.atomic_add(normal, place(v, face[1]), found)
+            wp.atomic_add(normal, place(v, face[0]), result)
+            wp.atomic_add(normal, place(v, face[1]), result)
             if face[2] >= 0:
-                wp.atomic_add(normal, place(v, face[2]), found)
-        return wp.dot(p - middle, found)
+                wp.atomic_add(normal, place(v, face[2]), result)
+        return wp.dot(p - middle, result)
 
     @wp.kernel(module=module, enable_backward=False)
     def sizes(
         faces: wp.array[wp.vec3i], n_vertices: int, x: wp.array[vec3], centre: wp.array[vec3],
-        found: wp.array[vec3], area: int, normal: wp.array[vec3], threads: int,
+        result: wp.array[vec3], area: int, normal: wp.array[vec3], threads: int,
     ):  # fmt: skip
         """The volume, and the area if wanted, of each shape in the second of two; and the volume's gradient."""
         i = wp.tid()
@@ -158,7 +158,7 @@ def kernels() -> SimpleNamespace:
                 p = x[place(v, face[0])]
                 q = x[place(v, face[1])]
                 surface += half * length_of(wp.cross(q - p, x[place(v, face[2])] - p))
-        wp.atomic_add(found, 2 * s + 1, vec3(inside, surface, real(0.0)))
+        wp.atomic_add(result, 2 * s + 1, vec3(inside, surface, real(0.0)))
 
     @wp.func
     def area_of(p: vec3, q: vec3, r: vec3, factor: real):
@@ -229,13 +229,13 @@ def kernels() -> SimpleNamespace:
             q = sixth * moment[s] * x[place(v, face[1])]
             r = sixth * moment[s] * corner(x, middle, v, faces[place(k, 0)][2])
             for b in range(n_blocks):
-                found = wp.skew(r - q) @ columns_of(columns, face[0], n_blocks, b)
-                found += wp.skew(p - r) @ columns_of(columns, face[1], n_blocks, b)
-                found += wp.skew(q - p) @ columns_of(columns, face[2], n_blocks, b)
+                result = wp.skew(r - q) @ columns_of(columns, face[0], n_blocks, b)
+                result += wp.skew(p - r) @ columns_of(columns, face[1], n_blocks, b)
+                result += wp.skew(q - p) @ columns_of(columns, face[2], n_blocks, b)
                 for j in range(3):
                     to = place(3 * n_blocks * (s * (n_vertices + 1) + face[j]), b)
                     for a in range(3):
-                        wp.atomic_add(out, place(to, a * n_blocks), found[a])
+                        wp.atomic_add(out, place(to, a * n_blocks), result[a])
 
     return SimpleNamespace(
         module=module, sizes=sizes, sizes_back=sizes_back, curved=curved, middle_of=middle_of, enclosed=enclosed

@@ -46,4 +46,4 @@ def bodies(shapes: FloatArray, mesh: Connectivity) -> list[tuple[Any, Connectivi
         return [(slice(None), mesh)]
     body[body < 0] = body[body >= 0][cKDTree(shapes[0, body >= 0]).query(shapes[0, body < 0])[1]]
     each = [(np.flatnonzero(body == k), mesh.faces[body[mesh.faces[:, 0]] == k]) for k in range(body.max() + 1)]
-    return [(torch.from_numpy(own), Connectivity(np.searchsorted(own, faces), len(own))) for own, faces in each]
+    return [(torch.from_numpy(rows), Connectivity(np.searchsorted(rows, faces), len(rows))) for rows, faces in each]

@@ -117,10 +117,10 @@ def _principal_axes(second: FloatArray) -> FloatArray:
 
 def _nearest_axes(span: FloatArray) -> FloatArray:
     """Orthonormal basis of the same span, close to the caller's axes. *Shape:* ``(n, 3) -> (n, 3)``."""
-    projector, found = span.T @ span, []
+    projector, basis = span.T @ span, []
     for _ in range(len(span)):
         # Uneven weights break ties.
         best = int((np.linalg.norm(projector, axis=0) * [1.0, 0.99, 0.98]).argmax())
-        found.append(projector[:, best] / np.linalg.norm(projector[:, best]))
-        projector = projector - np.outer(found[-1], found[-1] @ projector)
-    return np.array(found)
+        basis.append(projector[:, best] / np.linalg.norm(projector[:, best]))
+        projector = projector - np.outer(basis[-1], basis[-1] @ projector)
+    return np.array(basis)

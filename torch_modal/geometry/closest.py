@@ -23,25 +23,25 @@ def leaves(faces: IntArray, shapes: FloatArray) -> IntArray:
     first_nodes = [1 << k for k in range((n - 1).bit_length())]  # of each inner level
     sizes = np.ones(2 * n, np.int64)
     for start in reversed(first_nodes):
-        own = np.arange(start, min(2 * start, n))
-        sizes[own] = sizes[2 * own] + sizes[2 * own + 1]
+        level = np.arange(start, min(2 * start, n))
+        sizes[level] = sizes[2 * level] + sizes[2 * level + 1]
     order, nodes = np.arange(n), np.ones(n, np.int64)
     for start in first_nodes:
         # Finished leaves come last.
-        own = np.arange(start, min(2 * start, n))
-        size = sizes[own]
+        level = np.arange(start, min(2 * start, n))
+        size = sizes[level]
         firsts, m = np.cumsum(size) - size, int(size.sum())
         inner = points[order[:m]]
         low = np.minimum.reduceat(inner, firsts)
         extent = np.maximum.reduceat(inner, firsts) - low
-        axis, node = extent.argmax(1), np.repeat(np.arange(len(own)), size)
-        longest = np.maximum(extent[np.arange(len(own)), axis], 1e-300)
+        axis, node = extent.argmax(1), np.repeat(np.arange(len(level)), size)
+        longest = np.maximum(extent[np.arange(len(level)), axis], 1e-300)
         share = (inner[np.arange(m), axis[node]] - low[node, axis[node]]) / longest[node]
         order[:m] = order[:m][np.argsort(2 * node + share)]
-        nodes[:m] = np.repeat(np.arange(2 * own[0], 2 * own[-1] + 2), sizes[2 * own[0] : 2 * own[-1] + 2])
-    found = np.empty(n, np.int64)
-    found[nodes - n] = order
-    return found
+        nodes[:m] = np.repeat(np.arange(2 * level[0], 2 * level[-1] + 2), sizes[2 * level[0] : 2 * level[-1] + 2])
+    order_of_leaves = np.empty(n, np.int64)
+    order_of_leaves[nodes - n] = order
+    return order_of_leaves
 
 
 class ClosestFaces:
@@ -57,9 +57,9 @@ class ClosestFaces:
         self._low[n:], self._high[n:] = ordered.min(1), ordered.max(1)
         first = n
         while first > 1:  # the nodes of first to 2 first - 1 are done; their parents are next
-            own = np.arange((first + 1) // 2, first)
-            self._low[own] = np.minimum(self._low[2 * own], self._low[2 * own + 1])
-            self._high[own] = np.maximum(self._high[2 * own], self._high[2 * own + 1])
+            parents = np.arange((first + 1) // 2, first)
+            self._low[parents] = np.minimum(self._low[2 * parents], self._low[2 * parents + 1])
+            self._high[parents] = np.maximum(self._high[2 * parents], self._high[2 * parents + 1])
             first = (first + 1) // 2
 
     def __call__(self, points: FloatArray) -> IntArray:
@@ -73,12 +73,12 @@ class ClosestFaces:
             gap = np.maximum(np.maximum(self._low[node] - points[row], points[row] - self._high[node]), 0)
             near = dot(gap, gap) < nearest[row] ** 2
             row, node = row[near], node[near]
-            at, found = row[node >= n], self._leaves[node[node >= n] - n]
-            distance = closest_on_triangles(points[at], self.corners[found])[1]
+            at, candidates = row[node >= n], self._leaves[node[node >= n] - n]
+            distance = closest_on_triangles(points[at], self.corners[candidates])[1]
             nearer = distance < nearest[at]
             np.minimum.at(nearest, at, distance)
             nearer &= distance == nearest[at]
-            face[at[nearer]] = found[nearer]
+            face[at[nearer]] = candidates[nearer]
             row, node = np.repeat(row[node < n], 2), (2 * node[node < n, None] + np.arange(2)).reshape(-1)
             left += [(row[i : i + CHUNK], node[i : i + CHUNK]) for i in range(0, len(row), CHUNK)]
         return face
@@ -101,8 +101,8 @@ def closest_on_triangles(points: FloatArray, corners: FloatArray) -> tuple[Float
     # Otherwise it is on a side: the nearest of three.
     zero, third = np.zeros_like(v), second - first
     on_first, on_second, on_third = (
-        np.clip(part / np.maximum(whole, tiny), 0, 1)
-        for part, whole in ((along, ff), (across, ss), (dot(third, to_point - first), dot(third, third)))
+        np.clip(numerator / np.maximum(whole, tiny), 0, 1)
+        for numerator, whole in ((along, ff), (across, ss), (dot(third, to_point - first), dot(third, third)))
     )
     pairs = (on_first, zero), (zero, on_second), (1 - on_third, on_third)
     sides = np.stack([np.stack(pair, -1) for pair in pairs], -2)  # (..., 3, 2)
@@ -115,5 +115,5 @@ def closest_on_triangles(points: FloatArray, corners: FloatArray) -> tuple[Float
 
 def dot(a: FloatArray, b: FloatArray) -> FloatArray:
     """Inner products, faster than sums along an axis of length three. *Shape:* ``(..., 3)``."""
-    found: FloatArray = np.einsum("...i,...i->...", a, b)
-    return found
+    products: FloatArray = np.einsum("...i,...i->...", a, b)
+    return products

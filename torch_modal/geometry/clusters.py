@@ -61,8 +61,8 @@ class Clusters(nn.Module):
         followed = mean(self._between(pick(roots, self.ancestors[0]), roots), weights)
         for ancestors in self.ancestors:
             followed = product(pick(followed, ancestors), followed)
-        own = mean(self._between(pick(roots, self.cluster), turns), weights)
-        return product(pick(followed, self.cluster), own)
+        relative = mean(self._between(pick(roots, self.cluster), turns), weights)
+        return product(pick(followed, self.cluster), relative)
 
     @staticmethod
     def _between(start: Tensor, end: Tensor) -> Tensor:
@@ -99,12 +99,12 @@ def _clusters(turns: FloatArray, middles: IntArray, parents: IntArray) -> tuple[
     roots: list[int] = []
     above: list[int] = []
     for f in order:
-        own = -1 if before[f] == n else cluster[before[f]]
-        if own < 0 or _half_spread(turns[f], turns[roots[own]]) > WIDEST / 2:
-            above.append(own)
-            own = len(roots)
+        cluster_of_f = -1 if before[f] == n else cluster[before[f]]
+        if cluster_of_f < 0 or _half_spread(turns[f], turns[roots[cluster_of_f]]) > WIDEST / 2:
+            above.append(cluster_of_f)
+            cluster_of_f = len(roots)
             roots.append(f)
-        cluster[f] = own
+        cluster[f] = cluster_of_f
     parent = np.array(above)
     return cluster, np.array(roots, dtype=np.int64), np.where(parent < 0, len(roots), parent)
 

@@ -165,8 +165,8 @@ def double_areas(vertices: FloatArray, faces: IntArray) -> FloatArray:
     """Twice the area of each face. *Shape:* ``(F,)``."""
     a, b, c = (np.stack([x[corner] for x in vertices.T]) for corner in faces.T)
     (ux, uy, uz), (vx, vy, vz) = b - a, c - a
-    found: FloatArray = np.sqrt((uy * vz - uz * vy) ** 2 + (uz * vx - ux * vz) ** 2 + (ux * vy - uy * vx) ** 2)
-    return found
+    areas: FloatArray = np.sqrt((uy * vz - uz * vy) ** 2 + (uz * vx - ux * vz) ** 2 + (ux * vy - uy * vx) ** 2)
+    return areas
 
 
 def vertex_areas(vertices: FloatArray, faces: IntArray) -> FloatArray:
@@ -181,13 +181,13 @@ def farthest_apart(graph: sparse.csr_matrix, among: IntArray, n: int) -> tuple[I
     Each is the one farthest from those before; the first is the farthest from some vertex. *Shape:* ``(V, V), (m,) ->
     (k,), (k, V)``.
     """
-    found: list[int] = []
+    chosen: list[int] = []
     nearest, rows = dijkstra(graph, indices=among[0]), []
-    while len(found) < n:
+    while len(chosen) < n:
         reachable = np.where(np.isfinite(nearest[among]), nearest[among], 0)
-        if found and not reachable.max() > 0:
+        if chosen and not reachable.max() > 0:
             break
-        found.append(int(among[reachable.argmax()]))
-        rows.append(dijkstra(graph, indices=found[-1]))
+        chosen.append(int(among[reachable.argmax()]))
+        rows.append(dijkstra(graph, indices=chosen[-1]))
         nearest = np.min(rows, axis=0)
-    return np.array(found), np.stack(rows)
+    return np.array(chosen), np.stack(rows)

@@ -26,7 +26,8 @@ RINGS = 2
 FAR = 0.06
 """Part of the diagonal, along the surface; nearer crossings are folds, not two parts that meet."""
 _OFFSET = 1e-4
-"""Of the diagonal, outwards: where the winding number of a vertex is taken. On the surface itself it is a half."""
+"""Offset along the normal, over the diagonal, at which winding numbers of vertices are taken: on the surface they are
+1/2."""
 
 
 def require_contact() -> None:
@@ -57,7 +58,7 @@ class Crossings:
         search: Callable[[FloatArray], IntArray] | None = None,
     ) -> None:
         self.mesh, self.known = mesh, known
-        self._search = search or self._crossing
+        self._search = search or self._search_boxes
         self.like = known[0] if like is None else like
         used = self.like[np.unique(mesh.faces)]
         self.diagonal = float(np.linalg.norm(np.ptp(used, axis=0)))
@@ -116,7 +117,7 @@ class Crossings:
         for x, pairs in zip(self.known, self.pairs_of_known, strict=True):
             # One closed piece that does not cross itself has nothing inside.
             if len(pairs) or not one_piece:
-                inside |= self.winds(Surface(x, self.mesh), np.ones(len(x), dtype=bool))
+                inside |= self.encloses(Surface(x, self.mesh), np.ones(len(x), dtype=bool))
         return inside
 
     # ----------------------------------------------------------------------------------------------------- of one shape
@@ -131,29 +132,29 @@ class Crossings:
         pairs = pairs[triangles_cross(one, other)]
         return pairs[np.lexsort(pairs.T[::-1])]
 
-    def _crossing(self, x: FloatArray) -> IntArray:
+    def _search_boxes(self, x: FloatArray) -> IntArray:
         tree = extras.require("ipctk", "contact", "contact").LBVH()
         faces = np.asfortranarray(self.mesh.faces.astype(np.int32))
         # Scaled and centred: the library's boxes are of single precision.
         centred = np.asfortranarray((x - self.like.mean(0)) / self.diagonal)
-        # Without the edges: nobody asks for their boxes.
+        # Without the edges, whose boxes are not needed.
         tree.build(centred, np.zeros((0, 2), np.int32, order="F"), faces, 1e-6)
-        found = map(attrgetter("face0_id", "face1_id"), tree.detect_face_face_candidates())
-        candidates = np.fromiter(chain.from_iterable(found), np.int64).reshape(-1, 2)
+        faces_of_pairs = map(attrgetter("face0_id", "face1_id"), tree.detect_face_face_candidates())
+        candidates = np.fromiter(chain.from_iterable(faces_of_pairs), np.int64).reshape(-1, 2)
         corners = self.mesh.faces[candidates]
         candidates = candidates[~(corners[:, 0, :, None] == corners[:, 1, None, :]).any((1, 2))]
         return np.unique(candidates, axis=0)
 
     def far_pairs(self, x: FloatArray) -> IntArray:
-        """Those of :meth:`pairs` that are far, by :meth:`is_far`. *Shape:* ``(V, 3) -> (P, 2)``."""
+        """The :meth:`pairs` that are far, by :meth:`is_far`. *Shape:* ``(V, 3) -> (P, 2)``."""
         pairs = self.pairs(x)
         return pairs[self.is_far(pairs)]
 
     def reach(self, x: FloatArray, pairs: IntArray) -> float:
         """Largest reach of triangles of given pairs through each other, along a normal. *Shape:* ``(P, 2)``."""
         surface, least = Surface(x, self.mesh), np.full(len(pairs), np.inf)
-        for own, other in (pairs.T, pairs.T[::-1]):
-            arms = x[self.mesh.faces[own]] - x[self.mesh.faces[other, :1]]
+        for moving, other in (pairs.T, pairs.T[::-1]):
+            arms = x[self.mesh.faces[moving]] - x[self.mesh.faces[other, :1]]
             height = dot(arms, surface.face_normals[other][:, None])
             least = np.minimum(least, np.minimum(height.max(1), -height.min(1)))
         return float(least.max(initial=0.0))
@@ -175,30 +176,30 @@ class Crossings:
             at = np.flatnonzero(far)
             far[at] = np.asarray(self._around_known[pairs[at, 0], pairs[at, 1]]).reshape(-1) == 0
         one, other = self.mesh.faces[pairs[far]].transpose(1, 0, 2)
-        far[far] = np.all([self.separated(corner, other) for corner in one.T], axis=0)
+        far[far] = np.all([self.are_far_apart(corner, other) for corner in one.T], axis=0)
         return far
 
-    def separated(self, vertices: IntArray, faces: IntArray) -> BoolArray:
+    def are_far_apart(self, vertices: IntArray, faces: IntArray) -> BoolArray:
         """True where a vertex and a face are more than :data:`FAR` apart on the surface. *Shape:* ``(n,), (n, 3)``."""
-        own, which = np.unique(vertices, return_inverse=True)
-        new = [v for v in own.tolist() if v not in self._near]
-        for part in (new[i : i + 256] for i in range(0, len(new), 256)):
-            reached = dijkstra(self.lengths, indices=part, limit=FAR * self.diagonal)
-            self._near.update((v, np.flatnonzero(np.isfinite(row))) for v, row in zip(part, reached, strict=True))
-        if not len(own):
+        sources, which = np.unique(vertices, return_inverse=True)
+        new = [v for v in sources.tolist() if v not in self._near]
+        for some in (new[i : i + 256] for i in range(0, len(new), 256)):
+            reached = dijkstra(self.lengths, indices=some, limit=FAR * self.diagonal)
+            self._near.update((v, np.flatnonzero(np.isfinite(row))) for v, row in zip(some, reached, strict=True))
+        if not len(sources):
             return np.ones(0, dtype=bool)
         n = self.mesh.n_vertices
         # Sorted, as they are put together.
-        codes = np.concatenate([k * n + self._near[v] for k, v in enumerate(own.tolist())])
+        codes = np.concatenate([k * n + self._near[v] for k, v in enumerate(sources.tolist())])
         wanted = which.reshape(-1, 1) * n + faces
-        found = codes[np.minimum(np.searchsorted(codes, wanted), len(codes) - 1)] == wanted
-        return ~found.any(1)  # type: ignore[no-any-return]
+        is_near = codes[np.minimum(np.searchsorted(codes, wanted), len(codes) - 1)] == wanted
+        return ~is_near.any(1)  # type: ignore[no-any-return]
 
-    def within(self, vertices: BoolArray, part: float) -> BoolArray:
+    def within(self, vertices: BoolArray, distance: float) -> BoolArray:
         """Vertices within a part of the diagonal of given ones, along the surface. *Shape:* ``(V,) -> (V,)``."""
         if not vertices.any():
             return vertices
-        limit = part * self.diagonal
+        limit = distance * self.diagonal
         reached = dijkstra(self.lengths, indices=np.flatnonzero(vertices), min_only=True, limit=limit)
         return np.asarray(np.isfinite(reached))
 
@@ -210,31 +211,31 @@ class Crossings:
         """
         corners = np.zeros(self.mesh.n_vertices, dtype=bool)
         corners[self.mesh.faces[pairs.reshape(-1)]] = True
-        inside = self.winds(Surface(x, self.mesh), np.ones(len(x), dtype=bool) if len(pairs) else corners)
-        return self.hanging(inside & ~self.known_inside if len(self.known) else inside, corners)
+        inside = self.encloses(Surface(x, self.mesh), np.ones(len(x), dtype=bool) if len(pairs) else corners)
+        return self.connected_to(inside & ~self.known_inside if len(self.known) else inside, corners)
 
-    def winds(self, surface: Surface, asked: BoolArray) -> BoolArray:
+    def encloses(self, surface: Surface, asked: BoolArray) -> BoolArray:
         """Around which of some vertices a shape winds: around a point just outside. *Shape:* ``(V,) -> (V,)``."""
-        own, inside = np.flatnonzero(asked), np.zeros(len(asked), dtype=bool)
-        if len(own):
+        queried, inside = np.flatnonzero(asked), np.zeros(len(asked), dtype=bool)
+        if len(queried):
             x, faces = surface.vertices, self.mesh.faces
-            points = x[own] + _OFFSET * self.diagonal * surface.vertex_normals[own]
+            points = x[queried] + _OFFSET * self.diagonal * surface.vertex_normals[queried]
             # About 1 inside, about 0 outside.
             igl = extras.require("igl", "contact", "contact")
             number = igl.fast_winding_number(*(np.ascontiguousarray(a) for a in (x, faces, points)))
             is_inside_out = signed_volume(x - x.mean(0), faces) < 0
-            inside[own] = (-number if is_inside_out else number) > 0.5
+            inside[queried] = (-number if is_inside_out else number) > 0.5
         return inside
 
-    def hanging(self, vertices: BoolArray, seeds: BoolArray) -> BoolArray:
+    def connected_to(self, vertices: BoolArray, seeds: BoolArray) -> BoolArray:
         """Vertices that hang together with others, or with the ring around them. *Shape:* ``(V,), (V,) -> (V,)``."""
-        own, kept = np.flatnonzero(vertices), np.zeros(len(vertices), dtype=bool)
-        if len(own) and seeds.any():
-            label = connected_components(self.adjacency[own][:, own], directed=False)[1]
-            kept[own[np.isin(label, np.unique(label[self.grown(np.flatnonzero(seeds))[own]]))]] = True
+        members, kept = np.flatnonzero(vertices), np.zeros(len(vertices), dtype=bool)
+        if len(members) and seeds.any():
+            label = connected_components(self.adjacency[members][:, members], directed=False)[1]
+            kept[members[np.isin(label, np.unique(label[self.grow(np.flatnonzero(seeds))[members]]))]] = True
         return kept
 
-    def grown(self, vertices: IntArray, rings: int = 1) -> BoolArray:
+    def grow(self, vertices: IntArray, rings: int = 1) -> BoolArray:
         """A set of vertices and the rings around it. *Shape:* ``(n,) -> (V,)``."""
         chosen = np.zeros(self.mesh.n_vertices, dtype=bool)
         chosen[vertices] = True
@@ -245,6 +246,6 @@ class Crossings:
 
 def _ones(matrix: Any) -> sparse.csr_matrix:
     """The pattern of a matrix, with ones."""
-    found = sparse.csr_matrix(matrix, copy=True)
-    found.data[:] = 1.0
-    return found
+    pattern = sparse.csr_matrix(matrix, copy=True)
+    pattern.data[:] = 1.0
+    return pattern

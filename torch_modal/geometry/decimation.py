@@ -16,7 +16,7 @@ _NOT_THREAD_SAFE = threading.Lock()
 _AGGRESSIVENESS = 7.0
 
 # Where this many times the wanted faces are left, the vertices are shifted a little, and the collapses start anew: in
-# exactly flat parts that lie obliquely, the optimal positions are those of rounding errors, and nothing collapses.
+# exactly flat parts that lie obliquely, the optimal positions are rounding errors, and nothing collapses.
 _STUCK = 1.5
 _SHIFT = 1e-5 * CANONICAL_SIZE
 
@@ -38,17 +38,17 @@ def decimate(vertices: FloatArray, faces: IntArray, n_faces: int) -> tuple[Float
     order, sorted_faces = in_order(points, faces)
     sorted_points, sorted_faces = points[order], sorted_faces.astype(np.int32)
 
-    def simplified(points: FloatArray) -> tuple[FloatArray, IntArray, IntArray]:
+    def simplify(points: FloatArray) -> tuple[FloatArray, IntArray, IntArray]:
         with _NOT_THREAD_SAFE:
-            found: tuple[FloatArray, IntArray, IntArray] = fast_simplification.simplify(
+            result: tuple[FloatArray, IntArray, IntArray] = fast_simplification.simplify(
                 points, sorted_faces, target_count=n_faces, agg=_AGGRESSIVENESS, return_collapses=True
             )
-        return found
+        return result
 
-    points, triangles, collapses = simplified(sorted_points)
+    points, triangles, collapses = simplify(sorted_points)
     if len(triangles) > _STUCK * n_faces:
         shifts = _SHIFT * np.random.default_rng(0).standard_normal(sorted_points.shape)
-        shifted = simplified(sorted_points + shifts)
+        shifted = simplify(sorted_points + shifts)
         if len(shifted[1]) <= _STUCK * n_faces:
             points, triangles, collapses = shifted
     positions = points.astype(np.float64) @ axes / scale + centre

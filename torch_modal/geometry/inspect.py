@@ -99,7 +99,7 @@ def is_flat(points: FloatArray) -> bool:
 
 
 def open_part(points: FloatArray, mesh: Connectivity) -> float:
-    """Area of round holes as long as all boundaries, as a part of that of the surface. *Shape:* ``(V, 3)``."""
+    """Area of round holes as long as all boundaries, relative to the area of the surface. *Shape:* ``(V, 3)``."""
     start, end = points[mesh.boundary_edges.T]
     length = np.linalg.norm(end - start, axis=1).sum()
     return float(length**2 / (2 * np.pi * double_areas(points, mesh.faces).sum()))

@@ -13,8 +13,8 @@ from torch_modal.errors import MeshWarning
 from torch_modal.geometry.clusters import Clusters, beyond_a_turn
 from torch_modal.geometry.connectivity import Connectivity, spanning_forest
 from torch_modal.geometry.poisson import Poisson
-from torch_modal.geometry.rotations import agreeing, arc, conjugate, mean, product, quaternion, rotate, turned
-from torch_modal.geometry.triangle_frames import Frames, Sides, doubled_areas, edge_means, frames_of, mapped, stretched
+from torch_modal.geometry.rotations import arc, conjugate, mean, product, quaternion, rotate, rotate_by, signs_of_mean
+from torch_modal.geometry.triangle_frames import Frames, Sides, doubled_areas, edge_means, frames_of, stretch, transform
 from torch_modal.geometry.vectors import pick
 
 # The tree along which turns are compared avoids slivers, whose normals mean little: one with an altitude of this part
@@ -42,9 +42,9 @@ class Trajectory(NamedTuple):
     step: Tensor
     """To the shape at 1, of :meth:`LocalRotations.step`. *Shape:* ``(6, P, F)``."""
     first: Tensor
-    """How far the velocity at the start is from the step. *Shape:* ``(6, P, F)``."""
+    """Difference of the velocity at the start from the step. *Shape:* ``(6, P, F)``."""
     last: Tensor
-    """How far that at the end is. *Shape:* ``(6, P, F)``."""
+    """Difference of the velocity at the end from the step. *Shape:* ``(6, P, F)``."""
 
 
 class LocalRotations(nn.Module):
@@ -59,8 +59,8 @@ class LocalRotations(nn.Module):
 
     Args:
         mesh: The connectivity.
-        references: Shapes near the key-frames, two or more: the tree is that of the turns between all of them, and
-            avoids what is a sliver in any. *Shape:* ``(K, V, 3)``.
+        references: Shapes near the key-frames, two or more. The tree follows from the rotations between all of them,
+            and avoids triangles that are slivers in any. *Shape:* ``(K, V, 3)``.
     """
 
     reference: Tensor
@@ -76,7 +76,7 @@ class LocalRotations(nn.Module):
         self.register_buffer("faces", torch.tensor(mesh.faces), persistent=False)
         every = [frames_of(x[None], self.faces) for x in references]
         slenderness = reduce(torch.minimum, [x.slenderness for x in every]).squeeze(0)
-        parents, piece = self._tree(_turns_from_first(every), slenderness, mesh)
+        parents, piece = self._tree(_quaternions_from_first(every), slenderness, mesh)
         ancestors = [parents]
         while 2 ** len(ancestors) < len(parents):
             ancestors.append(ancestors[-1][ancestors[-1]])
@@ -84,7 +84,7 @@ class LocalRotations(nn.Module):
         self.register_buffer("side_signs", torch.tensor(mesh.signs).to(references), persistent=False)
         #: The first reference, from which rotations of more than two shapes are measured. *Shape:* ``(1, V, 3)``.
         self.register_buffer("reference", references[:1].clone(), persistent=False)
-        #: Twice the sums of those of the references. *Shape:* ``(F,)``.
+        #: Twice the summed areas of the triangles in the references. *Shape:* ``(F,)``.
         self.register_buffer("areas", torch.cat([x.doubled_areas for x in every]).sum(0), persistent=False)
         #: By 1, 2, 4, ... generations, as many as any tree needs. *Shape:* ``(J, F)``.
         self.register_buffer("ancestors", torch.stack(ancestors), persistent=False)
@@ -96,7 +96,7 @@ class LocalRotations(nn.Module):
         self._warn_of_tears(wound[0], mesh)
 
     def _warn_of_tears(self, turns: Tensor, mesh: Connectivity) -> None:
-        """Say where neighbours are a full turn apart whatever the tree. *Shape:* ``(4, K, F)``."""
+        """Warn where neighbours are a full turn apart with any tree. *Shape:* ``(4, K, F)``."""
         one, other = torch.tensor(mesh.face_neighbours).unbind(1)
         turns = turns * LocalRotations.sign(self, turns.movedim(0, -1), self.areas.expand(turns.shape[1], -1))
         torn = ((pick(turns, one) * pick(turns, other)).sum(0) < -cos(ALIKE / 2)).any(0)
@@ -123,7 +123,7 @@ class LocalRotations(nn.Module):
     def forward(self, shapes: Tensor, weights: Tensor) -> Tensor:
         """Edge vectors of the weighted mean of K shapes, components first.
 
-        The rotation of a triangle is the mean of those of the shapes, of two the geodesic; its stretch is the weighted
+        The rotation of a triangle is the weighted mean of its rotations in the shapes, and its stretch the weighted
         sum. An edge takes the mean of its triangles by their areas in the references.
 
         Args:
@@ -136,26 +136,26 @@ class LocalRotations(nn.Module):
         """
         # From one of two shapes: the way from a third to a triangle that collapses in one has no bounded gradient.
         start = frames_of(shapes[:, 0] if shapes.shape[1] == 2 else self.reference, self.faces)
-        own = Frames(*(x.unflatten(-2, weights.shape) for x in frames_of(shapes.flatten(0, 1), self.faces)))
-        turns = _turn_between(Frames(*(x[..., None, :] for x in start)), own)
+        frames = Frames(*(x.unflatten(-2, weights.shape) for x in frames_of(shapes.flatten(0, 1), self.faces)))
+        turns = _quaternion_between(Frames(*(x[..., None, :] for x in start)), frames)
         if self.clusters is None:
-            signs = self.sign(turns.detach().flatten(1, 2).movedim(0, -1), own.doubled_areas.detach().flatten(0, 1))
+            signs = self.sign(turns.detach().flatten(1, 2).movedim(0, -1), frames.doubled_areas.detach().flatten(0, 1))
             # A triangle that is a point has no frame and a quaternion of 0.5: with the other sign it would make a whole
             # turn, whose axis has no derivative.
             signs = torch.where(turns.detach().square().sum(0) < 0.5, 1.0, signs.view(turns.shape[1:]))
             turns = signs * turns
-            turn = mean(self._agreeing(turns.detach(), weights.detach()) * turns, weights[..., None])
+            turn = mean(self._agree(turns.detach(), weights.detach()) * turns, weights[..., None])
         else:
             turn = self.clusters(turns, weights[..., None])
-        xx, xy, yy = ((weights[..., None] * x).sum(-2) for x in own[3:])
-        first, second = (rotate(turn, start.world(*side)) for side in mapped(xx, xy, xy, yy))
+        xx, xy, yy = ((weights[..., None] * x).sum(-2) for x in frames[3:])
+        first, second = (rotate(turn, start.world(*side)) for side in transform(xx, xy, xy, yy))
         return self._edges((first, second), self.areas.expand(len(weights), -1))
 
     def pulls(self, shapes: Tensor, weights: Tensor, poisson: Poisson) -> Tensor:
         """:meth:`Poisson.pulls` of these edge vectors. *Shape:* ``(B, K, V, 3), (B, K) -> (B, V, 3)``."""
         return poisson.pulls(self(shapes, weights))
 
-    def _agreeing(self, turns: Tensor, weights: Tensor) -> Tensor:
+    def _agree(self, turns: Tensor, weights: Tensor) -> Tensor:
         """Signs for the pieces of K shapes, with which they turn the short way from each other.
 
         *Shape:* ``(4, B, K, F), (B, K) -> (B, K, F)``.
@@ -163,12 +163,12 @@ class LocalRotations(nn.Module):
         zero = weights.new_zeros(*weights.shape, self.n_pieces)
         rows = (self.areas * (turns * turn[..., None, :]).sum(0) for turn in turns.unbind(2))
         products = torch.stack([zero.index_add(-1, self.piece, row) for row in rows], -1).movedim(2, 1)
-        return pick(agreeing(products, weights[:, None]).mT, self.piece)
+        return pick(signs_of_mean(products, weights[:, None]).mT, self.piece)
 
     def wound(self, every: Sequence[Frames]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Arguments of :class:`Clusters`, between shapes."""
         areas = torch.cat([x.doubled_areas for x in every]).sum(0)
-        return _turns_from_first(every), areas, self.ancestors, self.piece
+        return _quaternions_from_first(every), areas, self.ancestors, self.piece
 
     def step(self, a: Frames, b: Frames) -> Tensor:
         """The step of each triangle from one shape to another.
@@ -177,14 +177,14 @@ class LocalRotations(nn.Module):
         entries of the stretch. *Shape:* ``(6, B, F)``.
         """
         growth = [y - x for x, y in zip(a[3:], b[3:], strict=True)]
-        return torch.stack([*a.coordinates(2 * arc(self._signed(a, b))), *growth])
+        return torch.stack([*a.coordinates(2 * arc(self._signed_quaternions(a, b))), *growth])
 
     def along(self, trajectory: Trajectory, which: Tensor, t: Tensor) -> Tensor:
         """Edge vectors of shapes on the trajectories of P pairs; of each the pair and the time are given.
 
         *Shape:* ``(B,), (B,) -> (3, B, E)``.
         """
-        return self.bent_along(Trajectory._make(part.index_select(-2, which) for part in trajectory), t)
+        return self.bent_along(Trajectory._make(values.index_select(-2, which) for values in trajectory), t)
 
     def bent_along(self, trajectory: Trajectory, t: Tensor, bending: Tensor | None = None) -> Tensor:
         """Edge vectors of shapes on trajectories, whose triangles may be strained and turned beforehand.
@@ -200,13 +200,13 @@ class LocalRotations(nn.Module):
 
         def placed(x: Tensor, y: Tensor) -> Tensor:
             side = torch.stack([x, y, flat])
-            side = side if bending is None else turned(bending[:3], side)
-            x, y, z = turned(straight[:3], turned(bent[:3], side))
+            side = side if bending is None else rotate_by(bending[:3], side)
+            x, y, z = rotate_by(straight[:3], rotate_by(bent[:3], side))
             return x * trajectory.e1 + y * trajectory.e2 + z * trajectory.normal
 
         # At a key-frame, the intervals on both sides weigh alike: velocities of edges are continuous.
         areas = torch.lerp(doubled_areas(*trajectory.size), doubled_areas(*(trajectory.size + trajectory.step[3:])), u)
-        first, second = mapped(xx, xy, xy, yy) if bending is None else stretched(bending[3:], xx, xy, yy)
+        first, second = transform(xx, xy, xy, yy) if bending is None else stretch(bending[3:], xx, xy, yy)
         return self._edges((placed(*first), placed(*second)), areas)
 
     def _edges(self, wanted: Sides, areas: Tensor) -> Tensor:
@@ -215,11 +215,11 @@ class LocalRotations(nn.Module):
 
     def turns(self, first: Tensor, second: Tensor) -> Tensor:
         """Quaternions of triangles, whose signs tell the way round. *Shape:* ``(B, V, 3), (B, V, 3) -> (4, B, F)``."""
-        return self._signed(frames_of(first, self.faces), frames_of(second, self.faces))
+        return self._signed_quaternions(frames_of(first, self.faces), frames_of(second, self.faces))
 
-    def _signed(self, a: Frames, b: Frames) -> Tensor:
+    def _signed_quaternions(self, a: Frames, b: Frames) -> Tensor:
         """Quaternions between frames, whose signs tell the way round. *Shape:* ``(4, B, F)``."""
-        quaternions = _turn_between(a, b)
+        quaternions = _quaternion_between(a, b)
         areas = (a.doubled_areas + b.doubled_areas).detach()
         return self.sign(quaternions.detach().movedim(0, -1), areas) * quaternions
 
@@ -241,11 +241,11 @@ def weights_per_length(mesh: Connectivity, references: Tensor) -> Tensor:
     return 1 / lengths.clamp_min(SHORTEST * lengths.mean())
 
 
-def _turns_from_first(every: Sequence[Frames]) -> Tensor:
+def _quaternions_from_first(every: Sequence[Frames]) -> Tensor:
     """Quaternions of the rotations from the first shape to each. *Shape:* ``(4, K, F)``."""
-    return torch.cat([_turn_between(every[0], x) for x in every], 1)
+    return torch.cat([_quaternion_between(every[0], x) for x in every], 1)
 
 
-def _turn_between(a: Frames, b: Frames) -> Tensor:
+def _quaternion_between(a: Frames, b: Frames) -> Tensor:
     """Quaternions of the rotations between the frames of triangles. *Shape:* ``(4, B, F)``."""
     return quaternion(b.e1[:, None] * a.e1 + b.e2[:, None] * a.e2 + b.normal[:, None] * a.normal)

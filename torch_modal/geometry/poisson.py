@@ -83,9 +83,9 @@ class Poisson(nn.Module):
 
     def or_near(self, pulls: Tensor, near: Tensor) -> Tensor:
         """:meth:`forward`, and the shape nearby where that is not finite. *Shape:* ``(B, V, 3), (B, V, 3)``."""
-        found = self(pulls, near)
-        finite = found.detach().sum((1, 2)).isfinite()
-        return found if plain(finite) and finite.all() else torch.where(finite[:, None, None], found, near)
+        solved = self(pulls, near)
+        finite = solved.detach().sum((1, 2)).isfinite()
+        return solved if plain(finite) and finite.all() else torch.where(finite[:, None, None], solved, near)
 
     def pulls(self, wanted: Tensor) -> Tensor:
         """Right-hand side of the system of target edge vectors. *Shape:* ``(3, ..., E) -> (..., V, 3)``."""
@@ -175,7 +175,7 @@ class Reconstruction(nn.Module):
 def _nearest(points: FloatArray, piece: FloatArray) -> IntArray:
     """Indices of a few points nearest to a piece."""
     count = min(_N_ANCHORS, len(points))
-    distances, found = KDTree(points).query(piece, k=min(count, 4))
-    order = np.ravel(found)[np.argsort(np.ravel(distances), kind="stable")]
+    distances, indices = KDTree(points).query(piece, k=min(count, 4))
+    order = np.ravel(indices)[np.argsort(np.ravel(distances), kind="stable")]
     _, first = np.unique(order, return_index=True)
     return order[np.sort(first)][:count]

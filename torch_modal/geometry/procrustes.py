@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from torch_modal.geometry.rigid import best_rotation
-from torch_modal.geometry.rotations import agreeing, matrix, mean, quaternion
+from torch_modal.geometry.rotations import matrix, mean, quaternion, signs_of_mean
 
 # Rounds in which more than two shapes are turned on to their mean, and the last of them, which have derivatives: of
 # the poses of a gallop, each leaves a tenth.
@@ -37,6 +37,6 @@ def mean_pose(to_reference: Tensor, among: Tensor, weights: Tensor) -> tuple[Ten
         turns = torch.cat([torch.eye(3).to(among).expand(len(among), 1, 3, 3), best_rotation(among[:, 0, 1:])], 1)
     turns = best_rotation((pulls * to_reference @ turns.mT).sum(1))[:, None] @ turns
     poses = quaternion(turns.mT.movedim((-2, -1), (0, 1)))  # (4, B, K)
-    signs = agreeing(torch.einsum("ibk,ibl->bkl", poses, poses).detach(), weights.detach())
+    signs = signs_of_mean(torch.einsum("ibk,ibl->bkl", poses, poses).detach(), weights.detach())
     pose = mean((signs * poses)[..., None], weights[..., None]).squeeze(-1)
     return turns, matrix(pose).movedim(-1, 0)

@@ -106,7 +106,7 @@ def best_fit(x: Tensor, y: Tensor, weights: Tensor | None = None) -> RigidMotion
 def blend(x: Tensor, y: Tensor, t: Tensor, weights: Tensor) -> Tensor:
     """Interpolate two shapes, at 0 and 1: linear in the shape, geodesic in the rigid motion.
 
-    Weights are those of the vertices in the alignment. *Shape:* ``(..., V, 3), (..., V, 3), (...,), (V,)``.
+    The weights of the vertices are for the alignment. *Shape:* ``(..., V, 3), (..., V, 3), (...,), (V,)``.
     """
     back = best_fit(y, x, weights)
     return back.inverse().fraction(t).apply(torch.lerp(x, back.apply(y), t[..., None, None]))

@@ -57,7 +57,7 @@ def log(rotation: Tensor) -> Tensor:
     At half a turn both directions are equally short: the axis on the side of :data:`HALF_TURN_SIDE` is chosen.
     """
     q = quaternion(rotation.movedim((-2, -1), (0, 1)))
-    side = sum(factor * part for factor, part in zip(HALF_TURN_SIDE, q[1:], strict=True))
+    side = sum(factor * entry for factor, entry in zip(HALF_TURN_SIDE, q[1:], strict=True))
     half_turn = q[0].abs() <= HALF_TURN * torch.finfo(q.dtype).eps
     q = torch.where(torch.where(half_turn, side, q[0]) < 0, -q, q)
     return 2 * arc(q).movedim(0, -1)
@@ -80,12 +80,12 @@ def matrix(q: Tensor) -> Tensor:
     return _linear(_MATRIX, q[:, None] * q)
 
 
-def _linear(table: FloatArray, given: Tensor) -> Tensor:
+def _linear(table: FloatArray, x: Tensor) -> Tensor:
     """The identity plus a linear function of matrices. *Shape:* ``(m, m, n, n), (n, n, ...) -> (m, m, ...)``."""
     m, n = len(table), table.shape[-1]
-    own = torch.as_tensor(table.reshape(m * m, n * n), dtype=given.dtype, device=given.device)
-    eye = torch.eye(m, dtype=given.dtype, device=given.device).view(m, m, *[1] * (given.dim() - 2))
-    return torch.tensordot(own, given.flatten(0, 1), 1).unflatten(0, (m, m)) + eye
+    matrix_of_table = torch.as_tensor(table.reshape(m * m, n * n), dtype=x.dtype, device=x.device)
+    eye = torch.eye(m, dtype=x.dtype, device=x.device).view(m, m, *[1] * (x.dim() - 2))
+    return torch.tensordot(matrix_of_table, x.flatten(0, 1), 1).unflatten(0, (m, m)) + eye
 
 
 def product(p: Tensor, q: Tensor) -> Tensor:
@@ -105,7 +105,7 @@ def rotate(q: Tensor, v: Tensor) -> Tensor:
     return v + q[0] * twice + cross(q[1:], twice)
 
 
-def turned(turn: Tensor, v: Tensor) -> Tensor:
+def rotate_by(turn: Tensor, v: Tensor) -> Tensor:
     """Vectors rotated by rotation vectors. *Shape:* ``(3, ...), (3, ...) -> (3, ...)``."""
     return rotate(about(0.5 * turn), v)
 
@@ -137,24 +137,26 @@ def mean(rotations: Tensor, weights: Tensor) -> Tensor:
     """Weighted mean of K rotations, where the weighted sum of their relative logarithms vanishes.
 
     Of two rotations it is the point on the geodesic between them. Of more it has first derivatives only. Quaternions
-    have the signs of :func:`agreeing`, weights the sum one. *Shape:* ``(4, ..., K, F), (..., K, 1) -> (4, ..., F)``.
+    have the signs of :func:`signs_of_mean`; weights add up to one.
+
+    *Shape:* ``(4, ..., K, F), (..., K, 1) -> (4, ..., F)``.
     """
     if rotations.shape[-2] == 2:
         first, second = rotations.unbind(-2)
         cosine = (first * second).sum(0, keepdim=True)
         # Quaternions are points of a sphere, where the arc from the first to the second is half as long as the angle.
-        part = about(weights[..., 1, :] * arc(torch.cat([cosine, second - cosine * first])))
-        return part[:1] * first + part[1:]
+        arc_to_mean = about(weights[..., 1, :] * arc(torch.cat([cosine, second - cosine * first])))
+        return arc_to_mean[:1] * first + arc_to_mean[1:]
     with torch.no_grad():
-        found = (weights * rotations).sum(-2)
-        found = found / found.square().sum(0).sqrt().clamp_min(torch.finfo(found.dtype).tiny)
+        estimate = (weights * rotations).sum(-2)
+        estimate = estimate / estimate.square().sum(0).sqrt().clamp_min(torch.finfo(estimate.dtype).tiny)
         for _ in range(MEAN_STEPS):
-            found = _mean_step(found, rotations, weights)
-    return _mean_step(found.detach(), rotations, weights)  # forward mode goes through no_grad
+            estimate = _mean_step(estimate, rotations, weights)
+    return _mean_step(estimate.detach(), rotations, weights)  # forward mode goes through no_grad
 
 
 @torch.no_grad()
-def agreeing(products: Tensor, weights: Tensor) -> Tensor:
+def signs_of_mean(products: Tensor, weights: Tensor) -> Tensor:
     r"""Signs with which K quaternions, or fields of them, are near their chordal mean (Markley et al. 2007).
 
     The mean is the dominant eigenvector of :math:`\sum_k w_k q_k q_k^T`: it is continuous in the weights and does not
@@ -168,9 +170,9 @@ def agreeing(products: Tensor, weights: Tensor) -> Tensor:
     return torch.where((products @ (roots * dominant)[..., None]).squeeze(-1) < 0, -1.0, 1.0).to(products)
 
 
-def _mean_step(found: Tensor, rotations: Tensor, weights: Tensor) -> Tensor:
-    """Newton step for half the weighted sum of squared angles; at the mean, its derivatives are those of the mean."""
-    relative = product(conjugate(found)[..., None, :], rotations)
+def _mean_step(estimate: Tensor, rotations: Tensor, weights: Tensor) -> Tensor:
+    """Newton step for half the weighted sum of squared angles; at the mean, it has the derivatives of the mean."""
+    relative = product(conjugate(estimate)[..., None, :], rotations)
     arcs = arc(relative)
     downhill = (weights * arcs).sum(-2)
     with torch.no_grad():
@@ -188,8 +190,8 @@ def _mean_step(found: Tensor, rotations: Tensor, weights: Tensor) -> Tensor:
         hessian = torch.where(across < SMALLEST_CURVATURE, eye, along + eye * across)
     a, b, c = hessian.detach()
     cofactors = cross(b, c), cross(c, a), cross(a, b)
-    step = sum(x * part for x, part in zip(downhill, cofactors, strict=True)) / (a * cofactors[0]).sum(0)
-    return product(found, about(step))
+    step = sum(x * cofactor for x, cofactor in zip(downhill, cofactors, strict=True)) / (a * cofactors[0]).sum(0)
+    return product(estimate, about(step))
 
 
 def _series(factors: list[float], x: Tensor) -> Tensor:

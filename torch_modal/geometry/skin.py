@@ -48,8 +48,8 @@ class Skin:
             Transforms at rest in the coordinates of the shapes, quaternions, and translations relative to the root, in
             double precision on the CPU. *Shape:* ``(1 + J, 4, 4), (4, T, 1 + J), (T, 1 + J, 3)``.
         """
-        given = self.weights, self.rest, self.transforms, self.shapes()
-        weights, rest, transforms, shapes = (array.double().cpu() for array in given)
+        arrays = self.weights, self.rest, self.transforms, self.shapes()
+        weights, rest, transforms, shapes = (array.double().cpu() for array in arrays)
         centred, here = shapes - shapes.mean(1, keepdim=True), rest - rest.mean(0)
         fits = centred.mT @ here / here.square().sum()
         steps, turns = best_rotation(centred[1:].mT @ centred[:-1]), [best_rotation(fits[0])]

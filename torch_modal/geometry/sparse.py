@@ -62,7 +62,7 @@ class SparseSolver:
     def __init__(self, matrix: sparse.spmatrix, free: IntArray | None = None) -> None:
         self.n = matrix.shape[0]
         self.fixed = np.zeros(0, dtype=np.int64) if free is None else np.setdiff1d(np.arange(self.n), free)
-        # Rows of the identity in the place of the others: no right side has to be gathered, and no solution scattered.
+        # Fixed unknowns have rows of the identity: no right side has to be gathered, and no solution scattered.
         kept = np.ones(self.n)
         kept[self.fixed] = 0
         self._inner = sparse.csr_matrix(sparse.diags(kept) @ matrix @ sparse.diags(kept) + sparse.diags(1 - kept))
@@ -89,7 +89,7 @@ class SparseSolver:
             if device not in self._solves:
                 _SOLVERS.add(self)
                 self._solves[device] = _superlu(self._inner) if cholespy is None else _cholesky(self._inner, device)
-        solved = [self._solves[device](part.contiguous()) for part in columns.flatten(1).split(MOST_COLUMNS, 1)]
+        solved = [self._solves[device](block.contiguous()) for block in columns.flatten(1).split(MOST_COLUMNS, 1)]
         out = solved[0] if len(solved) == 1 else torch.cat(solved, 1)
         out.index_fill_(0, torch.from_numpy(self.fixed).to(device), 0)
         return out.view(columns.shape).movedim(0, -2).to(right).contiguous()
@@ -123,8 +123,8 @@ def _superlu(matrix: sparse.csr_matrix) -> Solve:
 
 
 def _cholesky(matrix: sparse.csr_matrix, device: torch.device) -> Solve:
-    whole = [torch.from_numpy(part.astype(np.int32)) for part in (matrix.indptr, matrix.indices)]
-    entries = [part.to(device) for part in (*whole, torch.from_numpy(matrix.data.astype(np.float64)))]
+    whole = [torch.from_numpy(array.astype(np.int32)) for array in (matrix.indptr, matrix.indices)]
+    entries = [array.to(device) for array in (*whole, torch.from_numpy(matrix.data.astype(np.float64)))]
     # CSR is copied; CSC would be sorted and freed in place.
     solver = cholespy.CholeskySolverD(matrix.shape[0], *entries, cholespy.MatrixType.CSR)
 
@@ -168,12 +168,12 @@ def solve_exported(edges: Tensor, weights: Tensor, free: Tensor, right: Tensor) 
 
     Unknowns that are not free are zero. *Shape:* ``(E, 2), (E,), (n,), (..., V, m) -> (..., V, m)``.
     """
-    given = [x.detach().cpu().numpy() for x in (edges, weights.double(), free)]
+    arrays = [x.detach().cpu().numpy() for x in (edges, weights.double(), free)]
 
     def make() -> SparseSolver:
-        return SparseSolver(graph_laplacian(given[0], given[1], right.shape[-2]), given[2].copy())
+        return SparseSolver(graph_laplacian(arrays[0], arrays[1], right.shape[-2]), arrays[2].copy())
 
-    return _EXPORTED.get(tuple(x.tobytes() for x in given), make)(right)
+    return _EXPORTED.get(tuple(x.tobytes() for x in arrays), make)(right)
 
 
 @solve_exported.register_fake
@@ -185,8 +185,8 @@ def _save(ctx: Any, inputs: tuple[Tensor, ...], output: Tensor) -> None:
     ctx.save_for_backward(*inputs[:3])
 
 
-def _transposed(ctx: Any, grad: Tensor) -> tuple[None, None, None, Tensor]:
+def _backward(ctx: Any, grad: Tensor) -> tuple[None, None, None, Tensor]:
     return None, None, None, solve_exported(*ctx.saved_tensors, grad)
 
 
-solve_exported.register_autograd(_transposed, setup_context=_save)
+solve_exported.register_autograd(_backward, setup_context=_save)

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torch_modal.geometry.rotations import SMALL, arc, product, turned
+from torch_modal.geometry.rotations import SMALL, arc, product, rotate_by
 from torch_modal.geometry.vectors import cross, inverse, norm, pick, tiny
 
 # Smallest area relative to the squared sides; below, the normal is rounding, and divisions amplify noise.
@@ -62,7 +62,7 @@ class Frames(NamedTuple):
     @property
     def slenderness(self) -> Tensor:
         """Altitude over longest side. *Shape:* ``(B, F)``."""
-        (a, b), (c, d) = mapped(self.xx, self.xy, self.xy, self.yy)
+        (a, b), (c, d) = transform(self.xx, self.xy, self.xy, self.yy)
         return self.doubled_areas / torch.stack([x * x + y * y for x, y in ((a, b), (c, d), (c - a, d - b))]).amax(0)
 
 
@@ -72,9 +72,9 @@ def sides(x: Tensor, faces: Tensor) -> Sides:
     return first - origin, second - origin
 
 
-def frames(given: Sides) -> Frames:
+def frames(triangle_sides: Sides) -> Frames:
     """The frame of each triangle; the normal of one without area is arbitrary and a constant, all is finite."""
-    first, second = given
+    first, second = triangle_sides
     one, other = first, (second - 0.5 * first) / HEIGHT  # the images of orthonormal axes
     xx, xy, yy = _dot(one, one), _dot(one, other), _dot(other, other)
     point, total = xx + yy <= tiny(one), (xx + yy).clamp_min(tiny(one))
@@ -99,8 +99,8 @@ def doubled_areas(xx: Tensor, xy: Tensor, yy: Tensor) -> Tensor:
     return HEIGHT * (xx * yy - xy * xy)
 
 
-def mapped(xx: Tensor, xy: Tensor, yx: Tensor, yy: Tensor) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
-    """Both sides, in their plane, of equilateral triangles after a linear map. *Shape of each:* ``(B, F)``."""
+def transform(xx: Tensor, xy: Tensor, yx: Tensor, yy: Tensor) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
+    """Two sides, in their plane, of equilateral triangles after a linear map. *Shape of each:* ``(B, F)``."""
     return (xx, yx), (0.5 * xx + HEIGHT * xy, 0.5 * yx + HEIGHT * yy)
 
 
@@ -146,14 +146,12 @@ def bend(displaced: Sides, reference: Frames) -> tuple[Tensor, Tensor]:
     return turn, torch.stack([x_x, 0.5 * (x_y + y_x), y_y])
 
 
-def stretched(
-    strain: Tensor, xx: Tensor, xy: Tensor, yy: Tensor
-) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
-    """Both sides, in their plane, after a stretch and the exponential of a strain. *Shape:* ``(3, B, F), (B, F)``."""
-    return mapped(*_product(_exponential(*strain), (xx, xy, yy)))
+def stretch(strain: Tensor, xx: Tensor, xy: Tensor, yy: Tensor) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
+    """Two sides, in their plane, after a stretch and the exponential of a strain. *Shape:* ``(3, B, F), (B, F)``."""
+    return transform(*_product(_exponential(*strain), (xx, xy, yy)))
 
 
-def bent_sides(turn: Tensor, strain: Tensor, own: Frames) -> Sides:
+def bent_sides(turn: Tensor, strain: Tensor, reference: Frames) -> Sides:
     """Sides after a bend: stretched in their plane, then turned by the finite rotation of the same axis and angle.
 
     The stretch is the exponential of the strain: shear keeps the area, and no triangle inverts.
@@ -161,24 +159,24 @@ def bent_sides(turn: Tensor, strain: Tensor, own: Frames) -> Sides:
     Args:
         turn: Axis times angle, in the coordinates of the shape. *Shape:* ``(3, B, F)``.
         strain: Its entries ``xx, xy, yy`` in the frames. *Shape:* ``(3, B, F)``.
-        own: Frames of the undeformed shape.
+        reference: Frames of the undeformed shape.
     """
-    first, second = stretched(strain, *own[3:])
-    return turned(turn, own.world(*first)), turned(turn, own.world(*second))
+    first, second = stretch(strain, *reference[3:])
+    return rotate_by(turn, reference.world(*first)), rotate_by(turn, reference.world(*second))
 
 
-def bending_between(own: Frames, other: Frames, turns: Tensor) -> tuple[Tensor, Tensor]:
+def bending_between(reference: Frames, other: Frames, turns: Tensor) -> tuple[Tensor, Tensor]:
     """Rotation and strain from one shape to another: :func:`bent_sides` of it are the sides of the other.
 
     Args:
-        own: Frames of the shape that bends.
+        reference: Frames of the shape that bends.
         other: Frames of the other.
         turns: Quaternions from the first frames to the others; their signs tell the way round. *Shape:* ``(4, B, F)``.
     """
-    cos, sin, *stretch = _polar(own, other)
+    cos, sin, *entries = _polar(reference, other)
     half = 0.5 * torch.atan2(sin, cos)
-    turn = 2 * arc(product(turns, torch.cat([half.cos()[None], half.sin() * own.normal])))
-    return turn, torch.stack(_logarithm(*stretch))
+    turn = 2 * arc(product(turns, torch.cat([half.cos()[None], half.sin() * reference.normal])))
+    return turn, torch.stack(_logarithm(*entries))
 
 
 def mirrored_sides(centre: Frames, other: Frames) -> Sides:
@@ -196,7 +194,7 @@ def mirrored_sides(centre: Frames, other: Frames) -> Sides:
         p, q, r = other.coordinates(centre.world(x, y))
         return centre.world(cos * p + sin * q, cos * q - sin * p) + r * centre.normal
 
-    first, second = mapped(*_product((g_xx, g_xy, g_yy), centre[3:]))
+    first, second = transform(*_product((g_xx, g_xy, g_yy), centre[3:]))
     return turned_back(*first), turned_back(*second)
 
 
@@ -205,18 +203,22 @@ def _dot(a: Tensor, b: Tensor) -> Tensor:
     return (a * b).sum(0)
 
 
-def _polar(own: Frames, other: Frames) -> tuple[Tensor, ...]:
+def _polar(reference: Frames, other: Frames) -> tuple[Tensor, ...]:
     """The map of a triangle's plane to another's: cosine and sine of a rotation after a stretch, by entries."""
-    xx, xy, yx, yy = _product(other[3:], _inverse(own))
+    xx, xy, yx, yy = _product(other[3:], _inverse(reference))
     trace = torch.hypot(xx + yy, yx - xy)  # of the stretch; never 0, as both determinants are above 0
     cos, sin = (xx + yy) / trace, (yx - xy) / trace
     return cos, sin, cos * xx + sin * yx, cos * xy + sin * yy, cos * yy - sin * xy
 
 
-def _inverse(own: Frames) -> tuple[Tensor, Tensor, Tensor]:
+def _inverse(frame: Frames) -> tuple[Tensor, Tensor, Tensor]:
     """The inverse of the stretch, by entries. *Shape of each:* ``(B, F)``."""
-    determinant = own.xx * own.yy - own.xy * own.xy
-    return own.yy / determinant, -own.xy / determinant, own.xx / determinant
+    determinant = frame.xx * frame.yy - frame.xy * frame.xy
+    return (
+        frame.yy / determinant,
+        -frame.xy / determinant,
+        frame.xx / determinant,
+    )
 
 
 def _product(a: tuple[Tensor, ...], b: tuple[Tensor, ...]) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -26,7 +26,7 @@ class Pose(NamedTuple):
     rotation: Tensor
     """*Shape:* ``(B, 3, 3)``."""
     centre: Tensor
-    """Of the origin of the frame. *Shape:* ``(B, 3)``."""
+    """The origin of the frame. *Shape:* ``(B, 3)``."""
 
 
 class KeyframeAlignment(nn.Module):
@@ -94,13 +94,13 @@ class KeyframeAlignment(nn.Module):
         """
         weights, known = torch.where(weights.isfinite(), weights, 1 / weights.shape[1]), weights.isfinite()
         x, usable = self.checked(keyframes.mT.contiguous())
-        turned, pose = self._aligned(x, weights)
+        turned, pose = self._align(x, weights)
         shapes = turned.mT.contiguous()
         usable = usable & ~self.mirrored(shapes.detach(), weights)
         return shapes, pose, ((usable | (weights == 0)) & known).all(1)
 
     def checked(self, keyframes: Tensor) -> tuple[Tensor, Tensor]:
-        """Key-frames that are finite and have a size, the reference in the place of others; which those are.
+        """Replace key-frames that are not finite or have no size by the reference; True for those that are kept.
 
         *Shape:* ``(B, K, 3, V) -> (B, K, 3, V), (B, K)``.
         """
@@ -112,7 +112,7 @@ class KeyframeAlignment(nn.Module):
             return keyframes, usable
         return torch.where(usable[..., None, None], keyframes, self.reference.mT / self.scale), usable
 
-    def _aligned(self, keyframes: Tensor, weights: Tensor) -> tuple[Tensor, Pose]:
+    def _align(self, keyframes: Tensor, weights: Tensor) -> tuple[Tensor, Pose]:
         """Key-frames turned on to their weighted mean, and this to the reference. *Shape:* ``(B, K, 3, V)``."""
         centres = keyframes @ self.weights
         centred = (keyframes - centres[..., None]) * self.scale
@@ -139,11 +139,11 @@ class KeyframeAlignment(nn.Module):
         if plain(turned) and not turned.any():
             return turned
         first = shapes.take_along_dim(heaviest[..., None, None], 1).expand_as(shapes)
-        own, of = first.flatten(0, 1), shapes.flatten(0, 1)
-        return turned & looks_mirrored(own, of, self.faces.long()).view_as(turned)
+        heaviest_shapes, others = first.flatten(0, 1), shapes.flatten(0, 1)
+        return turned & looks_mirrored(heaviest_shapes, others, self.faces.long()).view_as(turned)
 
     def _warn_of_size(self, sizes: Tensor) -> None:
-        """Say, once for a layer, that key-frames and bases seem to be in different units."""
+        """Warn, once for each layer, that key-frames and bases seem to be in different units."""
         if self.size_warned or not plain(sizes):
             return
         ratios = sizes / self.extent
@@ -155,7 +155,7 @@ class KeyframeAlignment(nn.Module):
         self.size_warned = True
         warnings.warn(
             f"key-frames are {float(ratios[other][0]):.3g} times as large as the shapes that the bases were made from; "
-            "Eq. 5 depends on the size, so that the in-betweens differ from those of bases in the same units: "
+            "Eq. 5 depends on the size, so that the in-betweens differ from in-betweens of bases in the same units: "
             "scale the key-frames, or make the bases from them",
             MeshWarning,
             stacklevel=2,

@@ -10,7 +10,7 @@ from torch_modal.geometry.local_rotations import weights_per_length
 class RotationBlend(nn.Module):
     r"""Vertices of :math:`\min_x \sum_e |e(x) - \bar e|^2 / l_e`, with edges from :class:`LocalRotations`.
 
-    The weights are those of references, so that one factorisation serves all shapes. Each piece of the surface keeps
+    The weights follow from the references, so that one factorisation serves all shapes. Each piece of the surface keeps
     the centroid of linear interpolation; vertices that no face uses are pieces of their own.
 
     Args:

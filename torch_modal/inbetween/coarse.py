@@ -15,15 +15,15 @@ from torch_modal.geometry.vectors import inverse
 from torch_modal.modes.coarsening import Coarsening, coarsen
 
 ENOUGH_FACES = 1000
-"""Up to so many are tried; coarse meshes of more are not checked."""
+"""Number of faces from which on coarse meshes are not checked."""
 MORE = 1.5
-"""As many times the faces are tried next."""
+"""Factor of the number of faces for the next trial."""
 
 MOST_SPREAD = 40.0
 """Largest over smallest ratio of coarse to fine stiffness that is accepted. Of bodies without thin limbs 300 faces have
 5 to 37; where results were wrong, they had 60 to 5,000."""
 MOST_EDGES = 100_000
-"""Of more, the stiffness is estimated from one in so many."""
+"""Number of edges above which the stiffness is estimated from a sample of them."""
 NO_STIFFNESS = 1e-6
 """Relative stiffness below which directions are not compared: those in which loose pieces move rigidly."""
 
@@ -47,7 +47,7 @@ class CoarseMesh(nn.Module):
 
     def __init__(self, shapes: Tensor, whole: Mesh, n_faces: int, weights: Tensor, modes: Sequence[Tensor]) -> None:
         super().__init__()
-        coarsening = resolving(shapes, whole, n_faces, modes)
+        coarsening = coarsen_until_resolved(shapes, whole, n_faces, modes)
         clusters = torch.from_numpy(coarsening.clusters).clamp_min(0)
         member = torch.from_numpy(coarsening.clusters >= 0).double()
         per_cluster = torch.zeros(coarsening.n_vertices, dtype=torch.float64)
@@ -83,10 +83,10 @@ class CoarseMesh(nn.Module):
         return linear_map(means, of_members, x)
 
 
-def resolving(shapes: Tensor, whole: Mesh, n_faces: int, modes: Sequence[Tensor]) -> Coarsening:
+def coarsen_until_resolved(shapes: Tensor, whole: Mesh, n_faces: int, modes: Sequence[Tensor]) -> Coarsening:
     """A coarse mesh of so many faces, or of more, where those do not resolve the modes.
 
-    A flat shape does not tell where the other one bends: the collapses are then those of the other, and there are
+    A flat shape does not show where the other one bends: the collapses then follow the other, and there are
     ``ENOUGH_FACES`` or more.
 
     Arguments as for :class:`CoarseMesh`.
@@ -98,23 +98,23 @@ def resolving(shapes: Tensor, whole: Mesh, n_faces: int, modes: Sequence[Tensor]
     curved = [i for i, one in enumerate(flat) if not one] or [0]
     n_faces = max(n_faces, enough) if any(flat) else n_faces
     known: dict[int, IntArray] = {}
-    found = coarsen(points, faces, n_faces, curved, known)
+    coarsening = coarsen(points, faces, n_faces, curved, known)
     if n_faces >= enough:
-        return found
+        return coarsening
     ends = [(x, y) for x, y in zip(shapes, modes, strict=False) if len(y)]
-    fine = [stretching(whole, *end) for end in ends]
+    fine = [stretching_hessian(whole, *end) for end in ends]
     while n_faces < enough:
-        mesh = Mesh(Connectivity(found.faces, found.n_vertices))
-        coarse = [[torch.from_numpy(found.restrict(part.numpy())) for part in end] for end in ends]
+        mesh = Mesh(Connectivity(coarsening.faces, coarsening.n_vertices))
+        coarse = [[torch.from_numpy(coarsening.restrict(field.numpy())) for field in end] for end in ends]
         pairs = zip(fine, coarse, strict=True)
-        if all(spread(own, stretching(mesh, x, moves)) <= MOST_SPREAD for own, (x, moves) in pairs):
+        if all(spread(hessian, stretching_hessian(mesh, x, moves)) <= MOST_SPREAD for hessian, (x, moves) in pairs):
             break
         n_faces = min(round(MORE * n_faces), ENOUGH_FACES)
-        found = coarsen(points, faces, n_faces, curved, known)
-    return found
+        coarsening = coarsen(points, faces, n_faces, curved, known)
+    return coarsening
 
 
-def stretching(mesh: Mesh, x: Tensor, modes: Tensor) -> Tensor:
+def stretching_hessian(mesh: Mesh, x: Tensor, modes: Tensor) -> Tensor:
     """Hessian of the stretching energy in the amplitudes of modes, with the shape at rest, from some of many edges.
 
     Bending is left out: it is a small part of the stiffness of closed thin limbs, and three times the work.

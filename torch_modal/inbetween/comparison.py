@@ -1,4 +1,4 @@
-"""In-betweens compared with the shapes that they start from, so that none is returned that is worse.
+"""In-betweens compared with the shapes that they start from: a worse shape is blended into its start.
 
 A minimisation on a coarse mesh, in a space of modes, can end in a shape that is wrong on the fine mesh: modes of loose
 pieces, limbs that the coarse mesh does not see. The energy of Eq. 5 cannot judge that, because a few degenerate faces
@@ -50,51 +50,51 @@ def no_worse(
         return x, solution._replace(distortion_ratio=solution.energy, start_weights=x.new_zeros(0, len(starts)))
     shapes = [x, *starts]
     with torch.no_grad():
-        found = distortion(shapes, rests)
-    numbers = plain(found)
-    # Added to the distortions of the starts: where nobody sees a strain, nothing is worse.
+        distortions = distortion(shapes, rests)
+    numbers = plain(distortions)
+    # Added to the distortions of the starts: invisible strains make no shape worse.
     slight = distortion.slight(rests.stiffness, x)
-    ratio = (found[0] / (found[1:] + slight)).amax(0)
-    solution = solution._replace(distortion_ratio=ratio, start_weights=found.new_zeros(len(x), len(starts)))
+    ratio = (distortions[0] / (distortions[1:] + slight)).amax(0)
+    solution = solution._replace(distortion_ratio=ratio, start_weights=distortions.new_zeros(len(x), len(starts)))
     if numbers and bool((ratio <= _least(slack)).all()):
         return x, solution
     if torch.is_grad_enabled():
-        parts = _part(found[0], found[1:] + slight, slack)
+        parts = _blend_weight(distortions[0], distortions[1:] + slight, slack)
         # To first order, the shapes depend on the distortions where they are blended.
         if not numbers or bool(((parts > 0) & (parts < 1)).any()):
-            found = distortion(shapes, rests)
-    x, replaced, weights = blended(x, starts, found, slight, slack)
+            distortions = distortion(shapes, rests)
+    x, replaced, weights = blend_by_distortion(x, starts, distortions, slight, slack)
     status = torch.where(replaced & (solution.status != Status.INVALID), Status.FELL_BACK, solution.status)
     return x, solution._replace(status=status, start_weights=weights.detach())
 
 
-def blended(
+def blend_by_distortion(
     x: Tensor, starts: Sequence[Tensor], distortion: Tensor, slight: Tensor, slack: float = SLACK
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Shapes, blended into their starts by the distortions of all, where a start has replaced one, and their weights.
 
     *Shape:* ``(B, V, 3), (1 + S, B), (B,) -> (B, V, 3), (B,), (B, S)``.
     """
-    own, *others = distortion
-    replaced, weights = torch.zeros_like(own, dtype=torch.bool), own.new_zeros(len(own), 0)
+    value, *others = distortion
+    replaced, weights = (torch.zeros_like(value, dtype=torch.bool), value.new_zeros(len(value), 0))
     for start, other in zip(starts, others, strict=True):
-        part = _part(own, other + slight, slack)
-        replaced = replaced | (part == 1)
-        weights = torch.cat([(1 - part)[:, None] * weights, part[:, None]], 1)
-        whole = part[:, None, None]
+        weight = _blend_weight(value, other + slight, slack)
+        replaced = replaced | (weight == 1)
+        weights = torch.cat([(1 - weight)[:, None] * weights, weight[:, None]], 1)
+        whole = weight[:, None, None]
         x = torch.where(whole < 1, torch.lerp(x, start, whole), start)
-        own = torch.where(part < 1, torch.lerp(own, other, part), other)
+        value = torch.where(weight < 1, torch.lerp(value, other, weight), other)
     return x, replaced, weights
 
 
 def _least(slack: float) -> float:
-    """Distortion over that of a start up to which a shape does not give way."""
+    """Ratio of distortions up to which a shape is not blended into its start."""
     return 1 + MARGIN * (slack - 1)
 
 
-def _part(own: Tensor, other: Tensor, slack: float) -> Tensor:
+def _blend_weight(value: Tensor, other: Tensor, slack: float) -> Tensor:
     """Part by which a shape gives way to one of its starts, 0 to 1. *Shape:* ``(B,), (..., B) -> (..., B)``."""
     least = _least(slack)
-    part = ((own / other - least) / (slack - least)).clamp(0, 1)
-    part = torch.where(own.isfinite(), part * part * (3 - 2 * part), 1)
-    return torch.where(other.isfinite(), part, 0)
+    weight = ((value / other - least) / (slack - least)).clamp(0, 1)
+    weight = torch.where(value.isfinite(), weight * weight * (3 - 2 * weight), 1)
+    return torch.where(other.isfinite(), weight, 0)

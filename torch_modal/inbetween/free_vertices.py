@@ -9,12 +9,12 @@ from torch import Tensor, nn
 
 from torch_modal import trees
 from torch_modal.autograd import lasting, made_outside, outlasting, recorded
-from torch_modal.elastic.energy import Energy, Linearised, OnMesh, Reference, energy_rounding
+from torch_modal.elastic.energy import AssembledTerm, Energy, Linearised, Reference, energy_rounding
 from torch_modal.elastic.minimise import Solution, Status
 from torch_modal.geometry.canonical import CANONICAL_SIZE
 from torch_modal.geometry.sparse import Solve, factorize, solve_by
 
-# Stiffness towards the start, relative to that of the mean edge: a vertex in a flat fan has none along its normal, and
+# Stiffness towards the start, relative to the mean edge: a vertex in a flat fan has none along its normal, and
 # a loose piece none against rigid motions.
 RIDGE = 1e-6
 
@@ -30,7 +30,7 @@ MOST_ITERATIONS = 100
 RESIDUAL_OF_STEP, RESIDUAL_OF_GRADIENT = 1e-3, 1e-13
 
 Placement = tuple[Tensor, Reference]
-"""Where the vertices start, *shape* ``(B, V, 3)``, and what the energy compares with."""
+"""The vertices at the start, *shape* ``(B, V, 3)``, and the reference of the energy."""
 
 
 class FreeVertices(nn.Module):
@@ -52,7 +52,7 @@ class FreeVertices(nn.Module):
         numbers = np.full(energy.n_extended, -1)
         numbers[free.numpy()] = np.arange(len(free))
         #: Of each term that is no total, the entries of its elements' Hessians between free coordinates, and where.
-        self.entries = [_entries(part, numbers) for part in energy.parts if not part.term.total]
+        self.entries = [_entries(summand, numbers) for summand in energy.parts if not summand.term.total]
 
     @property
     def n_amplitudes(self) -> int:
@@ -65,8 +65,8 @@ class FreeVertices(nn.Module):
 
     def gradient(self, a: Tensor, placement: Placement) -> Tensor:
         """Gradient at ``a``, to be differentiated in all that the placement holds. *Shape:* ``(B, 3 n)``."""
-        found = self.energy.fold(self.energy.gradient(self._linearise(a, placement)))
-        return found.movedim(0, -1)[:, self.free].flatten(1) + self._ridge(placement) * a
+        gradient = self.energy.fold(self.energy.gradient(self._linearise(a, placement)))
+        return gradient.movedim(0, -1)[:, self.free].flatten(1) + self._ridge(placement) * a
 
     def value(self, a: Tensor, placement: Placement) -> Tensor:
         """Energy at ``a``. *Shape:* ``(B, 3 n) -> (B,)``."""
@@ -89,14 +89,14 @@ class FreeVertices(nn.Module):
         A sample has converged where a step is below :data:`SMALL_STEP`; the tolerance plays no part.
         """
         a, placement = trees.mapped((a, placement), outlasting)  # products with the Hessian are gradients
-        each = [self._minimised(a[i : i + 1], trees.rows(placement, slice(i, i + 1)), max_steps) for i in range(len(a))]
+        each = [self._descend(a[i : i + 1], trees.rows(placement, slice(i, i + 1)), max_steps) for i in range(len(a))]
         if not each:
             return Solution(a, a.sum(-1), a.sum(-1), *(torch.zeros(0, dtype=torch.int64, device=a.device),) * 2)
         amplitudes, energies, norms, n_steps, status = zip(*each, strict=True)
         counts = (torch.tensor(values, device=a.device) for values in (n_steps, status))
         return Solution(torch.cat(amplitudes), torch.cat(energies), torch.cat(norms), *counts)
 
-    def _minimised(self, a: Tensor, placement: Placement, max_steps: int) -> tuple[Tensor, Tensor, Tensor, int, Status]:
+    def _descend(self, a: Tensor, placement: Placement, max_steps: int) -> tuple[Tensor, Tensor, Tensor, int, Status]:
         value, gradient, status, n_steps = self.value(a, placement), self.gradient(a, placement), Status.OUT_OF_STEPS, 0
         first = gradient.norm(dim=-1).clamp_min(torch.finfo(a.dtype).tiny)
         if not first.isfinite():
@@ -126,7 +126,7 @@ class FreeVertices(nn.Module):
 
         def make(a: Tensor, converged: Tensor, *tensors: Tensor) -> list[Solve]:
             flat = [x.flatten(0, x.dim() - n) for x, n in zip((a, converged, *tensors), ranks, strict=True)]
-            n = max(map(len, flat))  # under vmap, some are those of all samples
+            n = max(map(len, flat))  # under vmap, some are shared by all samples
             a, converged, *others = (x.repeat(n // len(x), *[1] * (x.dim() - 1)) for x in flat)
             place = trees.filled(tree, others)
             rows = [slice(i, i + 1) for i in range(n)]
@@ -142,15 +142,15 @@ class FreeVertices(nn.Module):
 
         def solve_all(right: Tensor) -> Tensor:
             rows = right.flatten(0, -2).split(1)
-            return torch.cat([solvers[i % len(solvers)](own) for i, own in enumerate(rows)]).view_as(right)
+            return torch.cat([solvers[i % len(solvers)](row) for i, row in enumerate(rows)]).view_as(right)
 
         def solve(right: Tensor) -> Tensor:
-            found = solve_by(lambda: solve_all, right)
-            if recorded(found, a, *tensors):
-                # Its derivative: that of the Hessian's product, solved once more.
-                product = torch.func.vjp(lambda a: self.gradient(a, placement), a)[1](found)[0]
-                found = found + solve_by(lambda: solve_all, torch.where(converged[:, None], right - product, 0))
-            return found
+            solution = solve_by(lambda: solve_all, right)
+            if recorded(solution, a, *tensors):
+                # Its derivative is the derivative of the Hessian's product, solved once more.
+                product = torch.func.vjp(lambda a: self.gradient(a, placement), a)[1](solution)[0]
+                solution = solution + solve_by(lambda: solve_all, torch.where(converged[:, None], right - product, 0))
+            return solution
 
         return solve
 
@@ -197,12 +197,12 @@ class FreeVertices(nn.Module):
         Raises:
             ValueError: It is not positive definite.
         """
-        n, own, values = self.n_amplitudes, iter(self.entries), []
+        n, entries, values = self.n_amplitudes, iter(self.entries), []
         rows, columns = (np.concatenate(each) for each in zip(*(entry[1:] for entry in self.entries), strict=True))
-        for part, one in zip(self.energy.parts, at, strict=True):
-            if not part.term.total:
-                blocks = _hessians(part, one, convex)[..., 0, :].cpu().numpy()
-                values.append(blocks.reshape(-1)[next(own)[0]])
+        for summand, one in zip(self.energy.parts, at, strict=True):
+            if not summand.term.total:
+                blocks = _hessians(summand, one, convex)[..., 0, :].cpu().numpy()
+                values.append(blocks.reshape(-1)[next(entries)[0]])
         whole = sparse.coo_matrix((np.concatenate(values), (rows, columns)), shape=(n, n)).tocsr()
         # Not CHOLMOD, which prints where a matrix is indefinite.
         factors = factorize(whole + float(self._ridge(placement)) * sparse.eye(n, format="csr"))
@@ -211,9 +211,9 @@ class FreeVertices(nn.Module):
         return lambda right: torch.from_numpy(factors.solve(right.cpu().numpy().T).T).to(right)
 
 
-def _entries(part: OnMesh, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _entries(summand: AssembledTerm, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Places among the entries of all elements' Hessians, ``(n, 3, n, 3, M)``; rows and columns of the matrix."""
-    vertex = numbers[part.corners.numpy()]  # (n, M)
+    vertex = numbers[summand.corners.numpy()]  # (n, M)
     coordinate = np.where(vertex[:, None] >= 0, 3 * vertex[:, None] + np.arange(3)[:, None], -1)  # (n, 3, M)
     shape = (*coordinate.shape[:2], *coordinate.shape)
     rows = np.broadcast_to(coordinate[:, :, None, None], shape).reshape(-1)
@@ -222,14 +222,14 @@ def _entries(part: OnMesh, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray,
     return places, rows[places], columns[places]
 
 
-def _hessians(part: OnMesh, one: Linearised, convex: bool) -> Tensor:
+def _hessians(summand: AssembledTerm, one: Linearised, convex: bool) -> Tensor:
     """Hessians of the energies of elements in their vertices. *Shape:* ``(n, 3, n, 3, B, M)``."""
     curvature = one.curvature if convex or one.beyond is None else one.curvature + one.beyond
     slope = one.slope
     if convex:  # what stretched elements of two vertices have across; others may have any sign
         slope = slope.clamp_min(0) if len(one.gradients) == 1 else torch.zeros_like(slope)
     outer = (curvature * one.gradients)[:, :, None, None] * one.gradients
-    blocks = outer + slope * part.term.hessians(one.edge_vectors)
+    blocks = outer + slope * summand.term.hessians(one.edge_vectors)
     for _ in range(2):
-        blocks = torch.stack(part.on_corners(blocks)).movedim((0, 1), (2, 3))
+        blocks = torch.stack(summand.on_corners(blocks)).movedim((0, 1), (2, 3))
     return blocks

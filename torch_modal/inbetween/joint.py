@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from torch_modal.elastic.backend import TorchBackend
-from torch_modal.elastic.energy import Energy, OnMesh, RestShapes
+from torch_modal.elastic.energy import AssembledTerm, Energy, RestShapes
 from torch_modal.elastic.modal import Derivatives, ModalEnergy, Placement
 from torch_modal.elastic.shell import N_SHELL_TERMS
 from torch_modal.elastic.steps import FineEnergy
@@ -39,16 +39,16 @@ class JointSpace(nn.Module):
         self, coarse: CoarseMesh, fine: FineEnergy, backend: TorchBackend, basis: SubspaceBasis, anchor: float = 0.0
     ) -> None:
         super().__init__()
-        mesh, terms = coarse.mesh, [part.term for part in fine.energy.parts]
+        mesh, terms = coarse.mesh, [summand.term for summand in fine.energy.parts]
         kinds = [2 if term.sampled else 1 if i >= N_SHELL_TERMS else 0 for i, term in enumerate(terms)]
         members = [[i for i, kind in enumerate(kinds) if kind == level] for level in range(3)]
         #: The terms of each part.
-        self.members = [own for own in members if own]
+        self.members = [numbers for numbers in members if numbers]
         self.n_anchors = [0 if term.anchors is None else len(term.anchors) for term in terms]
         parts = []
-        for own in self.members:
-            sampled = terms[own[0]].sampled
-            energy = Energy(fine.mesh if sampled else mesh, [terms[i] for i in own], sampled)
+        for numbers in self.members:
+            sampled = terms[numbers[0]].sampled
+            energy = Energy(fine.mesh if sampled else mesh, [terms[i] for i in numbers], sampled)
             columns = basis.fine[:, energy.vertices] if sampled else basis.coarse
             parts.append(backend.modal_energy(energy, mesh, columns))
         self.parts: Any = nn.ModuleList(parts)
@@ -64,37 +64,37 @@ class JointSpace(nn.Module):
         Args:
             base: The shape at amplitudes of zero. *Shape:* ``(B, V, 3)``.
             rests: The key-frames, or other rest shapes. *Shape:* ``(B, K, V, 3)``.
-            mu: Plays no part.
+            mu: Not used.
             soften: True for less bending stiffness at needles of the base.
         """
         restrict = self.coarse.restrict
-        bases, shapes = self._seen(base, restrict(base)), self._seen(rests.shapes, restrict(rests.shapes))
+        bases, shapes = self._on_meshes(base, restrict(base)), self._on_meshes(rests.shapes, restrict(rests.shapes))
         placed = []
-        for part, members, own, seen in zip(self.parts, self.members, bases, shapes, strict=True):
+        for part, members, part_base, seen in zip(self.parts, self.members, bases, shapes, strict=True):
             anchors = rests.anchors
             if anchors is not None:
                 each = anchors.split(self.n_anchors, 1)
                 anchors = torch.cat([each[i] for i in members], 1)
             stiffness = self._stiffness(part.energy, members, rests.stiffness)
-            reference = part.reference(RestShapes(seen, rests.weights, stiffness), own if soften else None)
-            placed.append(part.place(own, reference, anchors))
+            reference = part.reference(RestShapes(seen, rests.weights, stiffness), part_base if soften else None)
+            placed.append(part.place(part_base, reference, anchors))
         return placed
 
     def lift(self, a: Tensor, base: Tensor) -> Tensor:
         """The fine shape of amplitudes. *Shape:* ``(B, n), (B, V, 3) -> (B, V, 3)``."""
-        return self.basis.added(base, a)
+        return self.basis.displace(base, a)
 
-    def _seen(self, x: Tensor, coarse: Tensor) -> list[Tensor]:
+    def _on_meshes(self, x: Tensor, coarse: Tensor) -> list[Tensor]:
         """Fine and coarse shapes as each energy sees them. *Shape:* ``(..., V, 3)``."""
         return [x[..., part.energy.vertices, :] if part.energy.sampled else coarse for part in self.parts]
 
     def _stiffness(self, energy: Energy, members: Sequence[int], values: Sequence[Tensor]) -> list[Tensor]:
-        """Stiffnesses of the elements of the fine mesh on those of a part. *Shape of each:* ``(B, M)``, ``(B, 1)``."""
-        own = [values[i] for i in members]
+        """Stiffnesses of fine elements on the elements of a part. *Shape of each:* ``(B, M)``, ``(B, 1)``."""
+        stiffness = [values[i] for i in members]
         if energy.sampled:
-            return own
+            return stiffness
         fine, coarse = self.fine.energy.parts, self.coarse
-        parts = zip(own, members, energy.parts, strict=True)
+        parts = zip(stiffness, members, energy.parts, strict=True)
         return [coarse_values(value, fine[i], part, coarse.clusters, coarse.n_vertices) for value, i, part in parts]
 
     # ------------------------------------------------------------------------------------ the energy in the amplitudes
@@ -105,35 +105,35 @@ class JointSpace(nn.Module):
 
     def value(self, a: Tensor, placement: Sequence[Placement]) -> Tensor:
         """Energy at ``a``. *Shape:* ``(..., B, n) -> (..., B)``."""
-        energies = [part.value(a.to(own.base.dtype), own) for part, own in self._each(placement)]
+        energies = [part.value(a.to(at.base.dtype), at) for part, at in self._each(placement)]
         return reduce(torch.add, energies) + 0.5 * self.anchor * a.square().sum(-1)
 
     def derivatives(self, a: Tensor, placement: Sequence[Placement], second_order: bool = True) -> Derivatives:
         """Energy, gradient and Hessians at ``a``. *Shape:* ``(B, n)``."""
-        found = [part.derivatives(a.to(own.base.dtype), own, second_order) for part, own in self._each(placement)]
-        sums: list[Any] = [None if each[0] is None else reduce(torch.add, each) for each in zip(*found, strict=True)]
+        parts = [part.derivatives(a.to(at.base.dtype), at, second_order) for part, at in self._each(placement)]
+        sums: list[Any] = [None if each[0] is None else reduce(torch.add, each) for each in zip(*parts, strict=True)]
         value, gradient, gauss_newton, *others = sums
         value, eye = value + 0.5 * self.anchor * a.square().sum(-1), torch.eye(a.shape[-1]).to(gauss_newton)
         return Derivatives(value, gradient + self.anchor * a, gauss_newton + self.anchor * eye, *others)
 
     def value_and_gradient(self, a: Tensor, placement: Sequence[Placement]) -> tuple[Tensor, Tensor]:
         """Energy and gradient at ``a``. *Shape:* ``(B, n) -> (B,), (B, n)``."""
-        found = [part.value_and_gradient(a.to(own.base.dtype), own) for part, own in self._each(placement)]
-        values, gradients = zip(*found, strict=True)
+        each = [part.value_and_gradient(a.to(at.base.dtype), at) for part, at in self._each(placement)]
+        values, gradients = zip(*each, strict=True)
         value = torch.add(reduce(torch.add, values), a.square().sum(-1), alpha=0.5 * self.anchor)
         return value, torch.add(reduce(torch.add, gradients), a, alpha=self.anchor)
 
     def gradient(self, a: Tensor, placement: Sequence[Placement]) -> Tensor:
         """Gradient at ``a``, to be differentiated. *Shape:* ``(B, n) -> (B, n)``."""
-        found = [part.gradient(a.to(own.base.dtype), own) for part, own in self._each(placement)]
-        return reduce(torch.add, found) + self.anchor * a
+        each = [part.gradient(a.to(at.base.dtype), at) for part, at in self._each(placement)]
+        return reduce(torch.add, each) + self.anchor * a
 
     def _each(self, placement: Sequence[Placement]) -> list[tuple[ModalEnergy, Placement]]:
         return list(zip(self.parts, placement, strict=True))  # an iterator, torch 2.8 cannot compile
 
 
-def coarse_values(values: Tensor, fine: OnMesh, coarse: OnMesh, clusters: Tensor, n: int) -> Tensor:
-    """Values of the elements of the fine mesh on those of the coarse one: means over clusters, then over corners.
+def coarse_values(values: Tensor, fine: AssembledTerm, coarse: AssembledTerm, clusters: Tensor, n: int) -> Tensor:
+    """Values of fine elements on the coarse elements: means over clusters, then over corners.
 
     Args:
         values: *Shape:* ``(B, M)``, or ``(B, 1)``, which stays.
@@ -150,6 +150,6 @@ def coarse_values(values: Tensor, fine: OnMesh, coarse: OnMesh, clusters: Tensor
     owners = clusters[fine.corners].flatten()
     sums = values.new_zeros(len(values), n).index_add(1, owners, values.repeat(1, len(fine.corners)))
     counts = values.new_zeros(n).index_add(0, owners, values.new_ones(len(owners)))
-    # A cluster without elements of its own knows the mean only.
+    # A cluster without elements of its own uses the global mean.
     means = torch.where(counts > 0, sums / counts.clamp_min(1), values.mean(1, keepdim=True))
     return means[:, coarse.corners].mean(1)

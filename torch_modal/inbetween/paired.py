@@ -52,14 +52,14 @@ class PairedSpace(nn.Module):
         """The two shapes of each sample, each with its key-frame as base and as rest shape.
 
         Args:
-            base: Plays no part.
+            base: Not used.
             rests: The key-frames. *Shape:* ``(B, 2, V, 3)``.
             mu: *Shape:* ``(B,)``.
         """
         placed = []
         for k, space in enumerate((self.first, self.second)):
-            own = rests._replace(shapes=rests.shapes[:, k : k + 1], weights=torch.ones_like(rests.weights[:, :1]))
-            placed.append(tuple(space.place(rests.shapes[:, k], own, soften=False)))
+            rest = rests._replace(shapes=rests.shapes[:, k : k + 1], weights=torch.ones_like(rests.weights[:, :1]))
+            placed.append(tuple(space.place(rests.shapes[:, k], rest, soften=False)))
         difference = self.first.coarse.restrict(rests.shapes[:, 0] - rests.shapes[:, 1]).flatten(1)
         return PairedPlacement(placed[0], placed[1], difference @ self.gap.mT, (difference**2).sum(-1), mu)
 
@@ -88,7 +88,7 @@ class PairedSpace(nn.Module):
     def derivatives(self, a: Tensor, placement: PairedPlacement, second_order: bool = True) -> Derivatives:
         """Energy, gradient and Hessians at ``a``; the similarity is quadratic and part of Gauss-Newton's."""
         ends = self._ends(a, placement)
-        first, second = (space.derivatives(part, place, second_order) for space, part, place in ends)
+        first, second = (space.derivatives(a_k, place, second_order) for space, a_k, place in ends)
         similarity, pull = self._similarity(a, placement)
         value, gradient = first.value + second.value + similarity, torch.cat([first.gradient, second.gradient], -1)
         similar = 2 * placement.mu[:, None, None] * self.gap_gram
@@ -98,13 +98,13 @@ class PairedSpace(nn.Module):
 
     def value_and_gradient(self, a: Tensor, placement: PairedPlacement) -> tuple[Tensor, Tensor]:
         """Energy and gradient at ``a``. *Shape:* ``(B, n) -> (B,), (B, n)``."""
-        first, second = (space.value_and_gradient(part, place) for space, part, place in self._ends(a, placement))
+        first, second = (space.value_and_gradient(a_k, place) for space, a_k, place in self._ends(a, placement))
         similarity, pull = self._similarity(a, placement)
         return first[0] + second[0] + similarity, torch.cat([first[1], second[1]], -1) + pull
 
     def gradient(self, a: Tensor, placement: PairedPlacement) -> Tensor:
         """Gradient at ``a``, to be differentiated. *Shape:* ``(B, n) -> (B, n)``."""
-        ends = [space.gradient(part, place) for space, part, place in self._ends(a, placement)]
+        ends = [space.gradient(a_k, place) for space, a_k, place in self._ends(a, placement)]
         return torch.cat(ends, -1) + self._similarity(a, placement)[1]
 
     def _similarity(self, a: Tensor, placement: PairedPlacement) -> tuple[Tensor, Tensor]:

@@ -4,8 +4,8 @@
   fitted to that;
 - *segments* are parts that move nearly rigidly in all modes (Huang et al. 2009);
 - the *regions*, the segments of the largest mean error, are interpolated by examples (Froehlich and Botsch 2011): their
-  lengths, angles and volume are half-way between those of the key-frames, and all else is fixed. They are minimised to
-  convergence, with angles by the periodic function of the joint space: their gradient is that of the minimiser.
+  lengths, angles and volume are half-way between the key-frames, and all else is fixed. They are minimised to
+  convergence, with angles by the periodic function of the joint space: gradients follow from the minimiser.
 
 The paper's examples are ``x1*`` and the second key-frame, and ``x2*`` and the first. But both shapes are a part of the
 way there already: half-way on the rest of it, their regions have passed each other, and the mean is too short.
@@ -27,7 +27,7 @@ from torch_modal.elastic.stretch import Stretch
 from torch_modal.elastic.term import Mesh
 from torch_modal.elastic.volume import Volume
 from torch_modal.geometry.canonical import CANONICAL_SIZE
-from torch_modal.inbetween.coarse import stretching
+from torch_modal.inbetween.coarse import stretching_hessian
 from torch_modal.inbetween.free_vertices import FreeVertices
 from torch_modal.inbetween.paired import PairedSpace
 
@@ -83,7 +83,7 @@ def segments(space: PairedSpace, references: Tensor, n_segments: int = N_SEGMENT
     area, mesh = coarse.weights.numpy(), coarse.mesh
     sums = []
     for end, x in zip((space.first, space.second), coarse.restrict(references), strict=True):
-        stiffness = stretching(mesh, x, end.basis.coarse)
+        stiffness = stretching_hessian(mesh, x, end.basis.coarse)
         level = RIDGE * stiffness.diagonal().mean() * torch.eye(len(stiffness)).to(stiffness)
         lower = torch.linalg.cholesky(stiffness + level)
         modes = torch.linalg.solve_triangular(lower, end.basis.coarse.flatten(1), upper=False)
@@ -95,13 +95,13 @@ def segments(space: PairedSpace, references: Tensor, n_segments: int = N_SEGMENT
         return float(c.sum() - np.einsum("eik,eik->", b, np.linalg.pinv(a, hermitian=True) @ b))
 
     parts = {i: (normal[i], right[i], whole[i]) for i in range(len(area))}
-    own, owner = dict.fromkeys(parts, 0.0), np.arange(len(area))
+    cost, owner = dict.fromkeys(parts, 0.0), np.arange(len(area))
     near: dict[int, set[int]] = {i: set() for i in parts}
     queue: list[tuple[float, int, int]] = []
 
     def offer(i: int, j: int) -> None:
         a, b, c = (p + q for p, q in zip(parts[i], parts[j], strict=True))
-        heapq.heappush(queue, (deformation(a, b, c) - own[i] - own[j], i, j))
+        heapq.heappush(queue, (deformation(a, b, c) - cost[i] - cost[j], i, j))
 
     for i, j in mesh.connectivity.edges.tolist():
         near[i].add(j)
@@ -113,7 +113,7 @@ def segments(space: PairedSpace, references: Tensor, n_segments: int = N_SEGMENT
         if i not in parts or j not in parts:
             continue
         a, b, c = (p + q for p, q in zip(parts.pop(i), parts.pop(j), strict=True))
-        parts[new], own[new], near[new] = (a, b, c), deformation(a, b, c), (near.pop(i) | near.pop(j)) - {i, j}
+        parts[new], cost[new], near[new] = (a, b, c), deformation(a, b, c), (near.pop(i) | near.pop(j)) - {i, j}
         owner[(owner == i) | (owner == j)] = new
         for other in near[new]:
             near[other] = (near[other] - {i, j}) | {new}
@@ -149,7 +149,7 @@ class LocalInterpolation(nn.Module):
 
     Args:
         mesh: The caller's mesh.
-        fine: The terms on it; further ones than those of Eq. 5 play no part.
+        fine: The terms on it; only the terms of Eq. 5 are used.
         region: True for vertices of the regions, which the next ring of faces joins. *Shape:* ``(V,)``, bool.
     """
 
@@ -168,10 +168,10 @@ class LocalInterpolation(nn.Module):
         self.register_buffer("used", used, persistent=False)
         #: True for the vertices that move. *Shape:* ``(V,)``, bool.
         self.register_buffer("region", rings[1], persistent=False)
-        #: The elements of the regions among those of the mesh.
+        #: Indices of the elements of the regions among the elements of the mesh.
         self.elements: list[Tensor | None] = []
-        for part, own in zip(fine.parts, energy.parts, strict=False):
-            self.elements.append(None if own.term.total else _places(used[own.corners], part.corners))
+        for other, summand in zip(fine.parts, energy.parts, strict=False):
+            self.elements.append(None if summand.term.total else _places(used[summand.corners], other.corners))
 
     def forward(self, ends: Sequence[Tensor], rests: RestShapes, usable: Tensor) -> tuple[list[Tensor], Tensor]:
         """Interpolate.
@@ -187,27 +187,27 @@ class LocalInterpolation(nn.Module):
         energy, shapes = self.problem.energy, rests.shapes[:, :, self.used].double()
         rest = energy.rest_of(shapes)
         measures, stiffness = [], []
-        for part, q, some, value in zip(energy.parts, rest.measures, self.elements, rests.stiffness, strict=False):
-            measures.append(q[:, 0] + 0.5 * part.term.difference(q[:, 1], q[:, 0]))
-            own = value if some is None or value.shape[-1] == 1 else value[:, some.to(value.device)]
-            own = own.double()
-            if isinstance(part.term, Bend):  # needles turn over at little cost, and would end where they collapse
-                own = own * fullness(part.edge_vectors(shapes.movedim(-1, 0)), NEEDLE).prod(1)
-            stiffness.append(own)
+        for summand, q, some, value in zip(energy.parts, rest.measures, self.elements, rests.stiffness, strict=False):
+            measures.append(q[:, 0] + 0.5 * summand.term.difference(q[:, 1], q[:, 0]))
+            values = value if some is None or value.shape[-1] == 1 else value[:, some.to(value.device)]
+            values = values.double()
+            if isinstance(summand.term, Bend):  # needles turn over at little cost, and would end where they collapse
+                values = values * fullness(summand.edge_vectors(shapes.movedim(-1, 0)), NEEDLE).prod(1)
+            stiffness.append(values)
         reference = energy.against(Rest(tuple(measures), tuple(w.mean(1) for w in rest.weights)), stiffness)
-        found, status = [], torch.full_like(usable, Status.CONVERGED, dtype=torch.int64)
+        results, status = [], torch.full_like(usable, Status.CONVERGED, dtype=torch.int64)
         for x in ends:
             place = x[:, self.used].double(), reference
             method = FreeVertices.minimise, FreeVertices.inverse
             solution = solve_implicit(self.problem, place, usable, N_STEPS, 0.0, *method)
-            found.append(x.index_copy(1, self.used, self.problem.shapes(solution.amplitudes, place[0]).to(x)))
+            results.append(x.index_copy(1, self.used, self.problem.shapes(solution.amplitudes, place[0]).to(x)))
             status = torch.where(status == Status.CONVERGED, solution.status, status)
-        return found, status
+        return results, status
 
 
 def _places(some: Tensor, corners: Tensor) -> Tensor:
     """Columns of some elements among all. *Shape:* ``(n, m), (n, M) -> (m,)``."""
     keys = ([(frozenset(c[:2]), frozenset(c[2:])) for c in each.T.tolist()] for each in (corners, some))
     numbers = {key: i for i, key in enumerate(next(keys))}
-    # Where more than two faces share an edge, the rim has hinges of its own: nothing of them moves.
+    # Where more than two faces share an edge, the rim has hinges of its own, which are fixed.
     return torch.tensor([numbers.get(key, 0) for key in next(keys)], dtype=torch.int64)

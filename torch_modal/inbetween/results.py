@@ -26,13 +26,13 @@ class InBetweenResult(NamedTuple):
     solution: Solution
     """One value per shape: energy, relative gradient norm, number of steps, status."""
     first: Tensor | None = None
-    """Of the paired space, ``x1*`` near the first key-frame; the shapes are the mean of both. *Shape:* as theirs."""
+    """In the paired space, ``x1*`` near the first key-frame; the shapes are the mean of ``first`` and ``second``."""
     second: Tensor | None = None
-    """Likewise ``x2*``, near the second."""
+    """In the paired space, ``x2*`` near the second key-frame."""
     shell_energy: Tensor | None = None
-    """Of the paired space, the mean of Eq. 5 from both key-frames, on the fine mesh. *Shape:* ``(...)``."""
+    """In the paired space, the mean of Eq. 5 from both key-frames, on the fine mesh. *Shape:* ``(...)``."""
     linear_energy: Tensor | None = None
-    """The same of linear interpolation."""
+    """The mean energy of linear interpolation. *Shape:* ``(...)``."""
 
     def unflattened(self, lead: torch.Size) -> "InBetweenResult":
         """A flat batch with these leading dimensions."""
@@ -54,7 +54,7 @@ class Samples(NamedTuple):
     mu: Tensor
     """*Shape:* ``(B,)``."""
     stiffness: list[Tensor]
-    """Of each term. *Shape of each:* ``(B, M)`` or ``(B, 1)``."""
+    """Stiffness of each term. *Shape of each:* ``(B, M)`` or ``(B, 1)``."""
 
     def rows(self, some: slice) -> "Samples":
         """Some of the samples."""

@@ -71,7 +71,7 @@ class Objective:
             raise ValueError(f"terms holds a {type(wrong[0]).__name__}; each is an instance of torch_modal.Term")
 
     def all_terms(self) -> list[Term]:
-        """Those of Eq. 5 and the further ones."""
+        """The terms of Eq. 5 and the further terms."""
         bend = SquaredBend if self.space == "paired" else Bend
         return [Stretch(self.alpha), bend(self.beta), Volume(self.gamma), *self.terms]
 
@@ -124,7 +124,7 @@ class Solver:
 
 
 class Settings(NamedTuple):
-    """Both."""
+    """Objective and solver."""
 
     objective: Objective
     solver: Solver

@@ -43,7 +43,7 @@ class InBetweenSolver(nn.Module):
         modes: Of the bases; without any, the shapes are the base and the steps of all vertices alone. *Shape of each:*
             ``(k, V, 3)``.
         mesh: The caller's mesh.
-        terms: Of the energy, those of Eq. 5 first; the layer owns them.
+        terms: The terms of the energy, Eq. 5 first; the layer owns them.
         objective: What is minimised.
         solver: How.
     """
@@ -65,7 +65,7 @@ class InBetweenSolver(nn.Module):
         self.distortion = backend.distortion(mesh, Energy(mesh, others) if others else None)
         joint = objective.space == "joint"
         self.blend = RotationBlend(mesh.connectivity, self.alignment.references, backend) if joint else None
-        self.space: Any = self._space(modes, objective) if any(len(own) for own in modes) else None
+        self.space: Any = self._space(modes, objective) if any(len(each) for each in modes) else None
         self.local: LocalInterpolation | None = None
         if solver.regions and isinstance(self.space, PairedSpace):
             region = worst_regions(self.space, self.alignment.references, solver.regions)
@@ -74,14 +74,14 @@ class InBetweenSolver(nn.Module):
     def _space(self, modes: Sequence[Tensor], objective: Objective) -> JointSpace | PairedSpace:
         """The space that the modal solve minimises in."""
         alignment, turns = self.alignment, self.alignment.turns
-        turned = [own @ turn.mT for own, turn in zip(modes, turns, strict=True)]
+        turned = [basis @ turn.mT for basis, turn in zip(modes, turns, strict=True)]
         coarse = CoarseMesh(alignment.references, self.mesh, objective.coarse_faces, alignment.weights, turned)
         # The paired space, and steps that are unrolled, are differentiated like any other expression: by torch.
         by_kernels = objective.space == "joint" and self.solver.gradient == "implicit"
-        given = coarse, self.fine, self.backend if by_kernels else TorchBackend()
+        args = coarse, self.fine, self.backend if by_kernels else TorchBackend()
         if objective.space == "joint":
-            return JointSpace(*given, elastic_subspace(turned, alignment, coarse), objective.anchor)
-        first, second = (JointSpace(*given, elastic_subspace([own], alignment, coarse)) for own in turned)
+            return JointSpace(*args, elastic_subspace(turned, alignment, coarse), objective.anchor)
+        first, second = (JointSpace(*args, elastic_subspace([basis], alignment, coarse)) for basis in turned)
         return PairedSpace(first, second)
 
     def forward(self, samples: Samples) -> InBetweenResult:
@@ -98,26 +98,26 @@ class InBetweenSolver(nn.Module):
         rests = RestShapes(shapes, weights, samples.stiffness, anchors)
         straight = torch.bmm(weights[:, None], shapes.flatten(2)).view_as(shapes[:, 0])
         base = straight if self.blend is None else self.blend(shapes, weights, straight)
-        solution = self.minimised(base, rests, samples.mu, usable)
+        solution = self.minimise_amplitudes(base, rests, samples.mu, usable)
         if self.blend is None:
-            return self.paired(straight, rests, solution, pose)
+            return self.finish_paired(straight, rests, solution, pose)
         x = base if self.space is None else self.space.lift(solution.amplitudes, base)
-        x = self.relaxed(x, rests)
+        x = self.relax(x, rests)
         # No shape is better for being far from a key-frame with a weight below zero.
         compared = rests._replace(weights=weights.clamp_min(0))
         x, solution = no_worse(x, [base, straight], solution, self.distortion, compared, SLACK)
-        x, solution = self.finished(x, solution, rests)
+        x, solution = self.finish(x, solution, rests)
         valid, x = solution.status != Status.INVALID, self.alignment.restore(x, pose)
         x = x if plain(valid) and valid.all() else torch.where(valid[:, None, None], x, torch.nan)
         return InBetweenResult(x, solution)
 
-    def paired(self, straight: Tensor, rests: RestShapes, solution: Solution, pose: Pose) -> InBetweenResult:
-        """The two shapes of Eq. 4, interpolated locally, and their mean: the paper's, with nothing in its place."""
+    def finish_paired(self, straight: Tensor, rests: RestShapes, solution: Solution, pose: Pose) -> InBetweenResult:
+        """The two shapes of Eq. 4, interpolated locally, and their mean, as in the paper."""
         ends = self.space.lift(solution.amplitudes, rests.shapes)
         if self.local is not None:
             ends, status = self.local(ends, rests, solution.status != Status.INVALID)
             solution = solution._replace(status=torch.where(solution.converged, status, solution.status))
-        x = self.relaxed((ends[0] + ends[1]) / 2, rests)
+        x = self.relax((ends[0] + ends[1]) / 2, rests)
         energies = [self.mean_energy(shape.detach(), rests) for shape in (x, straight)]
         valid = (solution.status != Status.INVALID)[:, None, None]
         first, second, x = (torch.where(valid, self.alignment.restore(y, pose), torch.nan) for y in (*ends, x))
@@ -130,7 +130,7 @@ class InBetweenSolver(nn.Module):
         each = [energy.against(energy.rest_of(shape.detach()), rests.stiffness) for shape in rests.shapes.unbind(1)]
         return (energy.value(rows, each[0]) + energy.value(rows, each[1])).detach() / 2
 
-    def minimised(self, base: Tensor, rests: RestShapes, mu: Tensor, usable: Tensor) -> Solution:
+    def minimise_amplitudes(self, base: Tensor, rests: RestShapes, mu: Tensor, usable: Tensor) -> Solution:
         """Amplitudes of least energy in the modal space. *Shape:* of ``mu`` and ``usable`` ``(B,)``."""
         if self.space is None:
             return unminimised(base, usable)
@@ -144,11 +144,11 @@ class InBetweenSolver(nn.Module):
         values = (value.to(base) if value.is_floating_point() else value for value in solution if value is not None)
         return Solution(*values)
 
-    def finished(self, x: Tensor, solution: Solution, rests: RestShapes) -> tuple[Tensor, Solution]:
+    def finish(self, x: Tensor, solution: Solution, rests: RestShapes) -> tuple[Tensor, Solution]:
         """Shapes and solutions as they are; a solver with contacts goes on from them. *Shape:* ``(B, V, 3)``."""
         return x, solution
 
-    def relaxed(self, x: Tensor, rests: RestShapes) -> Tensor:
+    def relax(self, x: Tensor, rests: RestShapes) -> Tensor:
         """Local steps and polish: deformation that the modes cannot represent. *Shape:* ``(B, V, 3)``."""
         if not len(x) or not (self.solver.local_steps or self.solver.polish):
             return x

@@ -33,7 +33,7 @@ class SubspaceBasis(nn.Module):
         """Number of directions, n."""
         return len(self.fine)
 
-    def added(self, x: Tensor, a: Tensor) -> Tensor:
+    def displace(self, x: Tensor, a: Tensor) -> Tensor:
         """Fine shapes displaced by amplitudes. *Shape:* ``(B, V, 3), (B, n) -> (B, V, 3)``."""
         return torch.addmm(x.flatten(1), a, self.fine.flatten(1)).view_as(x)
 
@@ -52,24 +52,24 @@ def elastic_subspace(modes: Sequence[Tensor], alignment: KeyframeAlignment, coar
     Returns:
         No more directions than two of the bases have modes: of more bases, what most of them have in common.
     """
-    most = sum(sorted(len(own) for own in modes)[-2:])
+    most = sum(sorted(len(each) for each in modes)[-2:])
     fine = torch.cat([infinitesimal_motions(alignment.references.mean(0)), *modes])
     rigid, others = coarse.restrict(fine).tensor_split([6])
-    to_rigid = _orthonormal(rigid, coarse.weights)
-    rigid = _mixed(to_rigid, rigid)
+    to_rigid = _orthonormalise(rigid, coarse.weights)
+    rigid = _combine(to_rigid, rigid)
     parts = others.flatten(1) @ (rigid * coarse.weights[:, None]).flatten(1).mT
-    elastic = others - _mixed(parts, rigid)
+    elastic = others - _combine(parts, rigid)
     sizes = elastic.flatten(1).norm(dim=1)[:, None].clamp_min(torch.finfo(elastic.dtype).tiny)
-    mix = _orthonormal(elastic / sizes[:, None], coarse.weights, most) / sizes.T
-    return SubspaceBasis(_mixed(torch.cat([-mix @ parts @ to_rigid, mix], 1), fine), _mixed(mix, elastic))
+    mix = _orthonormalise(elastic / sizes[:, None], coarse.weights, most) / sizes.T
+    return SubspaceBasis(_combine(torch.cat([-mix @ parts @ to_rigid, mix], 1), fine), _combine(mix, elastic))
 
 
-def _mixed(mix: Tensor, fields: Tensor) -> Tensor:
+def _combine(mix: Tensor, fields: Tensor) -> Tensor:
     """*Shape:* ``(n, m), (m, V, 3) -> (n, V, 3)``."""
     return (mix @ fields.flatten(1)).unflatten(1, (-1, 3))
 
 
-def _orthonormal(fields: Tensor, weights: Tensor, most: int | None = None) -> Tensor:
+def _orthonormalise(fields: Tensor, weights: Tensor, most: int | None = None) -> Tensor:
     """Combinations that are orthonormal, at most so many: those that the fields have most in common.
 
     Dependent ones are dropped. *Shape:* ``(m, V, 3), (V,) -> (n, m)``.

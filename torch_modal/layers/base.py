@@ -73,7 +73,7 @@ class PreciseModule(nn.Module):
         return super()._apply(kept, recurse)
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
-        """As in torch, but a state that does not fit is refused as a whole, before anything of it is loaded."""
+        """Load a state as torch does, but refuse one that does not fit as a whole, before any of it is loaded."""
         self._check_state(state_dict, "", strict)
         return super().load_state_dict(state_dict, strict, assign)
 
@@ -82,13 +82,13 @@ class PreciseModule(nn.Module):
         super()._load_from_state_dict(state_dict, prefix, *others)
 
     def _check_state(self, state_dict: Mapping[str, Any], prefix: str, strict: bool) -> None:
-        own, given = self.state_dict(prefix=prefix), {k: x for k, x in state_dict.items() if k.startswith(prefix)}
-        wrong = [name for name in own.keys() & given.keys() if own[name].shape != given[name].shape]
-        if wrong := sorted([*wrong, *(own.keys() ^ given.keys() if strict else [])]):
-            what = ", ".join(f"{name} {tuple(given[name].shape) if name in given else 'missing'}" for name in wrong[:4])
+        present, state = self.state_dict(prefix=prefix), {k: x for k, x in state_dict.items() if k.startswith(prefix)}
+        wrong = [name for name in present.keys() & state.keys() if present[name].shape != state[name].shape]
+        if wrong := sorted([*wrong, *(present.keys() ^ state.keys() if strict else [])]):
+            what = ", ".join(f"{name} {tuple(state[name].shape) if name in state else 'missing'}" for name in wrong[:4])
             raise RuntimeError(f"the state does not fit this {type(self).__name__}, which stays as it is: {what}")
         names = [f"{prefix}bases.{i}.reference" for i in range(len(self.bases))]
-        checked_surface([given.get(name, own[name]).double().cpu() for name in names], self.faces.cpu())
+        checked_surface([state.get(name, present[name]).double().cpu() for name in names], self.faces.cpu())
 
     def check_shapes(self, *sizes: int | str, **shapes: Tensor) -> None:
         """Raise a ValueError for shapes that do not fit the mesh, sizes of their leading dimensions, or the device."""
@@ -97,7 +97,7 @@ class PreciseModule(nn.Module):
             check_tensor(name, x, "...", *sizes, *reference.shape, device=reference.device)
 
     def _marks(self) -> Tensor:
-        """Numbers that tell the bases from others. *Shape:* ``(K, 3)``."""
+        """Numbers that identify the bases. *Shape:* ``(K, 3)``."""
         return torch.stack([torch.cat([b.reference, *b.modes[-1:]]).square().mean(0) for b in self.bases])
 
     def _require_own_bases(self) -> None:
@@ -114,12 +114,12 @@ class PreciseModule(nn.Module):
 
 
 class InBetweenLayer(PreciseModule):
-    """A layer that solves in-betweens of the modal spaces of all its bases, those of :func:`basis_buffers`."""
+    """A layer that solves in-betweens in the modal spaces of its bases (:func:`basis_buffers`)."""
 
     terms: Any
     cores: Any
     separate = True
-    """False for bodies as one problem, as where something is between them."""
+    """False to solve all bodies as one problem, for example with contact."""
 
     def __init__(self, bases: Sequence[BasisBuffers], faces: Tensor, chosen: Settings) -> None:
         super().__init__()
@@ -145,21 +145,21 @@ class InBetweenLayer(PreciseModule):
         )
         connectivity = checked_surface(references, self.faces.cpu())[1]
         self.faces = torch.tensor(connectivity.faces)
-        chosen, found = self.objective, [(slice(None), connectivity)]
+        chosen, several = self.objective, [(slice(None), connectivity)]
         numbers = all(torch.as_tensor(term.stiffness).shape[-1:] in ((), (1,)) for term in self.terms)
         if self.separate and chosen.space == "joint" and numbers and not (chosen.contact or chosen.terms):
-            found = bodies(torch.stack(references).numpy(), connectivity)
+            several = bodies(torch.stack(references).numpy(), connectivity)
         #: Vertices of each body, and its solver.
-        self.vertices, self.cores = [own for own, _ in found], nn.ModuleList()
+        self.vertices, self.cores = [vertices for vertices, _ in several], nn.ModuleList()
         #: True where there is a volume to be kept: not in sheets, whose energy has two terms.
         self.encloses = []
         kind = ContactSolver if chosen.contact else InBetweenSolver
-        for own, mesh in found:
-            shapes, moves = torch.stack(references)[:, own], [each[:, own] for each in modes]
+        for vertices, mesh in several:
+            shapes, moves = torch.stack(references)[:, vertices], [each[:, vertices] for each in modes]
             if chosen.space == "joint":  # nothing depends on the caller's order
                 order = own_order([x.numpy() for x in shapes], mesh.faces)
                 shapes, moves = shapes[order], [moves[i] for i in order]
-            if len(found) > 1:  # without the modes of other bodies
+            if len(several) > 1:  # without the modes of other bodies
                 moves = [each[each.flatten(1).any(1)] for each in moves]
             self.cores.append(kind(shapes, moves, Mesh(mesh), list(self.terms), chosen, self.solver).to(like))
             self.encloses.append(all(encloses(x, mesh) for x in shapes))
@@ -187,12 +187,12 @@ class InBetweenLayer(PreciseModule):
         n, item = weights.shape[-1], keyframes.shape[-2:]
         flat = keyframes.to(self.dtype).expand(*lead, n, *item).reshape(-1, n, *item)
         pulls = weights.to(self.dtype).expand(*lead, n).reshape(-1, n)
-        mu, found = self.mu_of(pulls, lead), []
-        for i, (own, core) in enumerate(zip(self.vertices, self.cores, strict=True)):
-            samples = Samples(flat[:, :, own], pulls, mu, self.stiffness_of(pulls, lead, i))
+        mu, results = self.mu_of(pulls, lead), []
+        for i, (vertices, core) in enumerate(zip(self.vertices, self.cores, strict=True)):
+            samples = Samples(flat[:, :, vertices], pulls, mu, self.stiffness_of(pulls, lead, i))
             # Further terms may have parameters of their own.
-            found.append(by_chunks(core, samples, samples.keyframes.shape[2], closed=not self.objective.terms))
-        return of_bodies(found, self.vertices).unflattened(lead)
+            results.append(by_chunks(core, samples, samples.keyframes.shape[2], closed=not self.objective.terms))
+        return of_bodies(results, self.vertices).unflattened(lead)
 
     def mu_of(self, like: Tensor, lead: torch.Size) -> Tensor:
         """``mu`` of a flat batch of these leading dimensions. *Shape:* ``(B,)``."""
@@ -206,20 +206,20 @@ class InBetweenLayer(PreciseModule):
 
     def stiffness_of(self, like: Tensor, lead: torch.Size, body: int = 0) -> list[Tensor]:
         """Stiffnesses of a body in a flat batch, of each term. *Shape of each:* ``(B, M)`` or ``(B, 1)``."""
-        found = []
-        for term, part in zip(self.terms, self.core.fine.energy.parts, strict=True):
+        stiffnesses = []
+        for term, summand in zip(self.terms, self.core.fine.energy.parts, strict=True):
             values = torch.as_tensor(term.stiffness, dtype=like.dtype, device=like.device)
             values = values[None] if values.dim() == 0 else values
             values = values if self.encloses[body] or not isinstance(term, Volume) else 0 * values
-            n = 1 if term.total else part.corners.shape[1]
+            n = 1 if term.total else summand.corners.shape[1]
             try:
                 if values.shape[-1] not in (1, n):
                     raise RuntimeError
-                found.append(values.expand(*lead, values.shape[-1]).reshape(-1, values.shape[-1]))
+                stiffnesses.append(values.expand(*lead, values.shape[-1]).reshape(-1, values.shape[-1]))
             except RuntimeError:
                 raise ValueError(
                     f"a stiffness of {type(term).__name__} has shape {tuple(values.shape)}; its last dimension counts "
                     f"the {n} elements or is 1, its others broadcast against samples of {tuple(lead)}: one for each "
                     "sample is values[:, None]"
                 ) from None
-        return found
+        return stiffnesses

@@ -10,7 +10,7 @@ from torch_modal.keyframes.arrays import broadcast_leading, check_tensor
 from torch_modal.layers.base import Bases, InBetweenLayer, basis_buffers
 
 MOST_BELOW_ZERO = 0.25
-"""What weights below zero may add up to: energies then still have a minimum."""
+"""Largest sum of the weights below zero with which energies still have a minimum."""
 
 ROUNDING = 1e-5
 """Sums of weights may differ from one by so much, or by the rounding of their dtype."""
@@ -27,15 +27,15 @@ class Blend(InBetweenLayer):
     key-frames is taken out first; the result has the weighted mean of their poses.
 
     Gradients reach the key-frames, the weights and the stiffnesses. Second derivatives of more than two key-frames are
-    an error. The modes are constants. Precision, warnings and statuses are those of :class:`InBetween`.
+    an error. The modes are constants. Precision, warnings and statuses are as for :class:`InBetween`.
 
     Args:
-        bases: The bases, one or more, in any order (:func:`torch_modal.extract_bases`). In their place key-frames,
+        bases: The bases, one or more, in any order (:func:`torch_modal.extract_bases`). Instead, key-frames,
             *shape* ``(K, V, 3)``, as for :class:`InBetween`.
         faces: Vertex indices. *Shape:* ``(F, 3)``.
         preset: ``"accurate"`` or ``"fast"``, as for :class:`InBetween`.
-        objective: What is minimised, in the place of the preset's.
-        solver: How it is solved, in the place of the preset's.
+        objective: What is minimised, instead of the preset's objective.
+        solver: How it is solved, instead of the preset's solver.
 
     Raises:
         ValueError: An argument is not usable, or the objective has contact or the paired space, which are of pairs.
@@ -75,9 +75,9 @@ class Blend(InBetweenLayer):
             ValueError: Shapes, dtypes, devices or weights that do not fit.
             ConvergenceError: A sample did not converge, gradients are recorded and ``unconverged="raise"``.
         """
-        found = self.solve(keyframes, weights)
-        report(found.solution, self.solver)
-        return found.shapes
+        result = self.solve(keyframes, weights)
+        report(result.solution, self.solver)
+        return result.shapes
 
     @untraced
     def solve(self, keyframes: Tensor, weights: Tensor) -> InBetweenResult:

@@ -25,14 +25,14 @@ class InBetween(InBetweenLayer):
     ``autocast``, ``.half()`` and ``.bfloat16()`` it stays there. Results have the dtype of the key-frames.
 
     Args:
-        bases: Two bases (:func:`torch_modal.extract_bases`), or one that serves for both ends. In their place
+        bases: Two bases (:func:`torch_modal.extract_bases`), or one that serves for both ends. Instead,
             key-frames, *shape* ``(2, V, 3)``: then nothing is minimised in modal space, and the shapes are the blend by
             local rotations with the steps of all vertices alone.
         faces: Vertex indices. *Shape:* ``(F, 3)``.
         preset: ``"accurate"``, ``"fast"`` or ``"paper"``: docs/layer.md says what each costs and gives.
-        objective: What is minimised, in the place of the preset's.
-        solver: How it is solved, in the place of the preset's.
-        contact: True to keep parts from passing through each other, in the place of what the objective says
+        objective: What is minimised, instead of the preset's objective.
+        solver: How it is solved, instead of the preset's solver.
+        contact: True to keep parts from passing through each other; overrides the objective
             (docs/contact.md; extra ``contact``). Each in-between is then pushed apart on its own: a motion is made by
             :class:`torch_modal.Path`, which does it the same way at all times.
 
@@ -85,9 +85,9 @@ class InBetween(InBetweenLayer):
             ValueError: Shapes, dtypes, devices or times that do not fit.
             ConvergenceError: A sample did not converge, gradients are recorded and ``unconverged="raise"``.
         """
-        found = self.solve(x_a, x_b, t)
-        report(found.solution, self.solver)
-        return found.shapes
+        result = self.solve(x_a, x_b, t)
+        report(result.solution, self.solver)
+        return result.shapes
 
     @untraced
     def solve(self, x_a: Tensor, x_b: Tensor, t: Tensor | float) -> InBetweenResult:

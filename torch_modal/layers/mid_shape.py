@@ -20,8 +20,8 @@ class MidShape(nn.Module):
             objective's.
         mu: Weight of the similarity of Eq. 4, in the paired space. Default: the objective's.
         preset: As for :class:`InBetween`; ``"paper"`` is its method, whole: Eq. 4, local interpolation, the mean.
-        objective: What is minimised, in the place of the preset's.
-        solver: How it is solved, in the place of the preset's.
+        objective: What is minimised, instead of the preset's objective.
+        solver: How it is solved, instead of the preset's solver.
         regions: Segments that local interpolation takes, in the paired space. Default: the solver's.
 
     Raises:
@@ -54,7 +54,7 @@ class MidShape(nn.Module):
 
         In the paired space the result has ``first`` and ``second``, the paper's ``x1*`` and ``x2*``, too, and the
         energies of the mid-shape and of linear interpolation. There, a shape is what the method gives, whatever its
-        status: nothing replaces it by a better one.
+        status: it is not replaced by a better one.
         """
         return self.in_between.solve(x_a, x_b, 0.5)
 

@@ -21,9 +21,9 @@ class LatentElasticity(nn.Module):
 
     With the Jacobian ``J`` of the decoder and the Hessian ``H`` of :class:`ShellLoss` about the decoded shape, a step
     ``u`` costs :math:`u^T G u` with :math:`G = \tfrac12 J^T H J`. Its eigenvalues are zero where the latent only turns
-    or shifts the shape. The loss is the mean of their square roots, as in ARAPReg (Huang et al. 2021), whose Hessian is
-    that of an as-rigid-as-possible energy, or of the eigenvalues themselves. ``H`` is Gauss and Newton's; no matrix of
-    vertices is made.
+    or shifts the shape. The loss is the mean of their square roots, as in ARAPReg (Huang et al. 2021), which takes
+    the Hessian of an as-rigid-as-possible energy, or of the eigenvalues themselves. ``H`` is the Gauss-Newton Hessian,
+    and is never summand.
 
     Args:
         faces: Vertex indices. *Shape:* ``(F, 3)``.
@@ -60,8 +60,8 @@ class LatentElasticity(nn.Module):
     def forward(self, decoder: Decoder, z: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """The loss at each latent; gradients reach the latents and the parameters of the decoder, through ``J``.
 
-        ``H`` is a constant of the graph: else a decoder would learn to crumple, so that edges are long and across the
-        way in which they move.
+        ``H`` is a constant of the graph: otherwise a decoder would learn to crumple shapes, with long edges across the
+        direction of motion.
 
         Args:
             decoder: Maps latents ``(B, n)`` to shapes ``(B, V, 3)``, each for itself: no normalisation over the batch.
@@ -98,13 +98,13 @@ class LatentElasticity(nn.Module):
             x, tangents = decoder(z), [(up - down) / (2 * self.step) for up, down in both]
         else:
             try:
-                found: list[Any] = [torch.func.jvp(decoder, (z,), (row,)) for row in steps]
+                pairs: list[Any] = [torch.func.jvp(decoder, (z,), (row,)) for row in steps]
             except (NotImplementedError, RuntimeError) as error:
                 decoder(z)  # a decoder that fails without derivatives too has an error of its own
                 raise NotImplementedError(
                     f"the decoder has no forward mode ({error}); pass LatentElasticity(..., step=1e-3) for differences"
                 ) from error
-            x, tangents = found[0][0], [tangent for _, tangent in found]
+            x, tangents = pairs[0][0], [tangent for _, tangent in pairs]
         check_tensor("the decoder's shapes", x, len(z), "V", 3)
         return x.to(torch.promote_types(x.dtype, torch.float32)), tangents  # of an autocast decoder
 

@@ -14,7 +14,7 @@ from torch_modal.geometry.vectors import cross, inverse, norm, pick
 from torch_modal.keyframes.arrays import as_faces
 
 BEND, VOLUME = 1e-6, 1e-4
-"""Stiffnesses beside a stretching stiffness of one: about the paper's at a size of 100 and 5,000 vertices."""
+"""Stiffnesses relative to a stretching stiffness of one: about the paper's at a size of 100 and 5,000 vertices."""
 
 # Smallest rest volume, as a part of (surface area)^(3/2), by which changes are divided; a sphere has 0.094.
 SMALLEST_VOLUME = 0.01
@@ -39,10 +39,10 @@ class ShellLoss(ShellEnergy):
         + \beta \sum_e (\theta_e - \bar\theta_e)^2 \frac{\bar l_e^2}{\bar A_e}
         + \gamma \frac{(v - \bar v)^2}{\bar v^2}
 
-    :math:`A_e` is a third of the area of the faces at an edge, at rest, and :math:`A` that of all; :math:`\bar A_e`
-    that of both faces of a hinge. So it has no unit, and neither translations and rotations nor a common scale of both
-    shapes change it. A mesh that approaches a smooth surface has a limit as it is refined; of a faceted surface whose
-    triangles are cut into four, the first and the last term stay and the second, which is infinite for a crease,
+    :math:`A_e` is a third of the area of the faces at an edge, at rest, :math:`A` the total area, and :math:`\bar A_e`
+    the area of both faces of a hinge. So the loss has no unit, and neither rigid motions nor a common scale of both
+    shapes change it. A mesh that approaches a smooth surface has a limit as it is refined. If the triangles of a
+    faceted surface are cut into four, the first and the last term stay, and the second, which is infinite for a crease,
     doubles.
 
     The rest shape is a template, the last frame, a neighbour in latent space, or the target itself. Gradients reach
@@ -88,11 +88,11 @@ class ShellLoss(ShellEnergy):
         self._check(x, x_rest)
         scale = self.scale(x_rest)
         rows, rest = self._rows(scale * x), self.rest(scale * x_rest)
-        found = []
-        for part, measures, weights in zip(self.energy.parts, rest.measures, rest.weights, strict=True):
-            off = part.term.difference(part.measures(part.edge_vectors(rows)), measures)
-            found.append((weights * off.square()).sum(-1))
-        return ShellTerms(*found)
+        terms = []
+        for summand, measures, weights in zip(self.energy.parts, rest.measures, rest.weights, strict=True):
+            off = summand.term.difference(summand.measures(summand.edge_vectors(rows)), measures)
+            terms.append((weights * off.square()).sum(-1))
+        return ShellTerms(*terms)
 
     def forward(self, x: Tensor, x_rest: Tensor) -> Tensor:
         """The loss of each shape.

@@ -6,7 +6,7 @@ and it does all that here. It imports no torch and nothing of torch_modal, so th
 
 import sys
 
-# A script's folder comes first on the path, where modules of this package would shadow those of libraries.
+# A script's folder comes first on the path, where modules of this package would shadow modules of libraries.
 del sys.path[0]
 
 import ctypes  # noqa: E402
@@ -74,7 +74,7 @@ def main(job_path: str, result_path: str) -> None:
             num_threads=1,  # more make it no faster
         )
     except (RuntimeError, ValueError) as error:
-        # Failures of the mesher last, but not those of missing libraries, memory or threads.
+        # Failures of the mesher last, but not failures for lack of libraries, memory or threads.
         traceback.print_exc()
         sys.exit(1 if any(word in str(error) for word in ("alloc", "memory", "Resource")) else MESHER_RAISED)
     np.savez(result_path, vertices=np.asarray(points, np.float64), tets=np.asarray(tets, np.int64))

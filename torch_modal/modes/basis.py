@@ -25,7 +25,7 @@ def checked_bases(bases: Any) -> "list[ModalBasis]":
     several = list(bases) if isinstance(bases, Iterable) else [bases]
     others = sorted({type(basis).__name__ for basis in several if not hasattr(basis, "modes")})
     if others or not several:
-        raise ValueError(f"bases, one or more, are those of extract_bases; got {', '.join(others) or 'none'}")
+        raise ValueError(f"bases, one or more, come from extract_bases; got {', '.join(others) or 'none'}")
     sizes = sorted({len(basis.reference) for basis in several})
     if len(sizes) > 1:
         raise ValueError(f"the bases belong to meshes of {sizes} vertices; they need one connectivity")

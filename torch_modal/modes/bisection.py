@@ -6,7 +6,7 @@ from collections.abc import Callable
 import numpy as np
 
 from torch_modal.arrays import BoolArray, FloatArray, IntArray
-from torch_modal.modes.tetrahedra import EDGES, Tetrahedra, oriented
+from torch_modal.modes.tetrahedra import EDGES, Tetrahedra, orient
 
 UNITS = 256
 """Integer coordinates along the edge of a cube, so that edges can be bisected eight times."""
@@ -18,7 +18,7 @@ _SECOND_HALF = np.array([(0, 1, 2, 3), (1, 1, 2, 3), (1, 2, 2, 3), (1, 2, 3, 3)]
 """Corners of the second half by the end of the bisected edge; the midpoint replaces the one at its place."""
 
 
-def bisected(
+def bisect(
     cubes: IntArray, points: FloatArray, wanted: FloatArray, is_inside: Callable[[FloatArray], BoolArray], most: int
 ) -> tuple[Tetrahedra, IntArray]:
     """Cut cubes into tetrahedra and bisect them until none is larger than the target size at the points it contains.
@@ -50,7 +50,7 @@ def bisected(
         # Halves have 0.79 of the size. The largest come first, as the number is limited.
         mesh.halve(chosen & (ratio > 0.8 * ratio.max()))
     used, tets = np.unique(mesh.tets, return_inverse=True)
-    return oriented(Tetrahedra(mesh.coordinates(used), tets.reshape(-1, 4))), mesh.owner
+    return orient(Tetrahedra(mesh.coordinates(used), tets.reshape(-1, 4))), mesh.owner
 
 
 class _Mesh:

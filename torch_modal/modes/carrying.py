@@ -92,7 +92,7 @@ class Carrier:
 def vertex_rotations(before: FloatArray, after: FloatArray, faces: IntArray) -> FloatArray:
     """Rotation of the surface around each vertex from one pose to another.
 
-    It is the nearest to the mean by area of those of the faces. *Shape:* ``(U, 3), (U, 3), (F, 3) -> (U, 3, 3)``.
+    It is the nearest to the mean of the faces' rotations by area. *Shape:* ``(U, 3), (U, 3), (F, 3) -> (U, 3, 3)``.
     """
     frames = []
     for x in (after, before):

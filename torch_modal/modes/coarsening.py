@@ -75,7 +75,7 @@ def coarsen(
         faces: Vertex indices. *Shape:* ``(F, 3)``.
         n_faces: Faces of the coarse mesh; smaller meshes are not coarsened.
         candidates: Indices of the key-frames whose collapses are tried; by default all.
-        known: Collapses of key-frames down to fewer faces, from earlier calls; those of this call are added.
+        known: Collapses of key-frames down to fewer faces, from earlier calls; this call adds its own.
 
     Raises:
         ValueError: If ``n_faces`` is below 4.
@@ -89,7 +89,7 @@ def coarsen(
             break
         for i in set(sources) - set(known) if n < len(faces) else ():
             known[i] = decimate(keyframes[i], faces, n)[2]
-        each = [collapsed(keyframes[i], faces, n, known.get(i)) for i in sources]
+        each = [collapse(keyframes[i], faces, n, known.get(i)) for i in sources]
         tried = [(*_fatness(keyframes, one), one) for one in each]
         # Those without needles first, then by the 1st percentile.
         least, _, best = max(tried, key=lambda one: (min(one[0], NEEDLE), one[1]))
@@ -106,7 +106,7 @@ def _fatness(keyframes: FloatArray, coarsening: Coarsening) -> tuple[float, floa
     return float(fatness.min()), float(np.percentile(fatness, 1, axis=-1).min())
 
 
-def collapsed(points: FloatArray, faces: IntArray, n_faces: int, known: IntArray | None = None) -> Coarsening:
+def collapse(points: FloatArray, faces: IntArray, n_faces: int, known: IntArray | None = None) -> Coarsening:
     """Partition by the edge collapses of one pose, the first of known ones; pieces that would vanish have their own."""
     if len(faces) <= n_faces:
         return Coarsening.of_labels(np.arange(len(points)), faces)
@@ -127,15 +127,15 @@ def collapsed(points: FloatArray, faces: IntArray, n_faces: int, known: IntArray
         areas = np.bincount(piece[faces[:, 0]], double_areas(points, faces))
         for i in np.argsort(-areas, kind="stable")[:MOST_PIECES]:
             if poor[i]:
-                members, own = np.unique(faces[piece[faces[:, 0]] == i], return_inverse=True)
+                members, corners = np.unique(faces[piece[faces[:, 0]] == i], return_inverse=True)
                 root[members] = members
                 if before[i] > FACES_OF_PIECE:
-                    collapses = decimate(points[members], own.reshape(-1, 3), FACES_OF_PIECE)[2]
+                    collapses = decimate(points[members], corners.reshape(-1, 3), FACES_OF_PIECE)[2]
                     root[members] = members[_roots(collapses, len(members))]
     return Coarsening.of_labels(root, faces)
 
 
-def joined(points: FloatArray, faces: IntArray, coarsening: Coarsening, shortest: float) -> Coarsening:
+def join_clusters(points: FloatArray, faces: IntArray, coarsening: Coarsening, shortest: float) -> Coarsening:
     """Merge clusters of a shape whose averages coincide: at edges up to ``shortest`` mean lengths."""
     centres, edges = coarsening.restrict(points), Connectivity(coarsening.faces).edges
     lengths = np.linalg.norm(centres[edges[:, 1]] - centres[edges[:, 0]], axis=1)

@@ -16,7 +16,7 @@ N_RIGID = 6
 DENSE_BELOW = 600
 """Number of unknowns below which LAPACK is as fast as Lanczos."""
 MORE_VECTORS = 20
-"""Lanczos vectors beside the wanted ones."""
+"""Lanczos vectors in addition to the requested modes."""
 RIGID_TOLERANCE = 1e-5
 """Largest eigenvalue of a rigid motion relative to the first elastic one: typically 1e-13, and 1e-7 for a wire with
 aspect ratio 300."""
@@ -39,7 +39,7 @@ class ElasticBody(NamedTuple):
         stiffness: ``K``, symmetric positive semi-definite; row ``3 i + c`` is coordinate ``c`` of vertex ``i``.
             *Shape:* ``(3N, 3N)``.
         mass: ``M``, entries for vertices. *Shape:* ``(N, N)``.
-        to_surface: Displacements of the surface from those of the body. *Shape:* ``(N, 3, k) -> (U, 3, k)``.
+        to_surface: Displacements of the surface from displacements of the body. *Shape:* ``(N, 3, k) -> (U, 3, k)``.
         shift: Positive shift of the eigenproblem, near the lowest eigenvalues of slender bodies. None: that of a
             solid, the inverse square of the diagonal of the bounding box.
         largest_residual: Largest residual ``|K phi - lambda M phi| / (lambda |M phi|)`` of a mode.
@@ -69,10 +69,10 @@ class ElasticModes(NamedTuple):
 def lowest_modes(body: ElasticBody, n_modes: int) -> ElasticModes:
     """Lowest elastic modes of a body, at most ``3N - 6``.
 
-    Shift-invert Lanczos with a negative shift: ``K + shift M`` is positive definite, and the modes are those of ``K``
-    itself. Rigid motions are known and projected out, so that Lanczos need not find six equal eigenvalues. Connected
-    components are solved separately for the same reason. Small problems are solved densely. The first of the largest
-    components of each mode is positive.
+    Shift-invert Lanczos with a negative shift: ``K + shift M`` is positive definite and has the modes of ``K``. Rigid
+    motions are known and projected out, so that Lanczos need not find six equal eigenvalues. Connected components are
+    solved separately for the same reason. Small problems are solved densely. The first of the largest components of
+    each mode is positive.
 
     Returns:
         The modes. Rigid motions of connected components against each other come first, six for each further component,
@@ -98,17 +98,17 @@ def lowest_modes(body: ElasticBody, n_modes: int) -> ElasticModes:
     eigenvalues, modes, n_zero = [], [], N_RIGID * n_pieces
     for index in range(n_pieces):
         vertices = np.flatnonzero(piece == index)
-        own = _unknowns(vertices)
-        part, part_inertia = sp.csc_matrix(k[own][:, own]), inertia[own][:, own]
+        rows = _unknowns(vertices)
+        block, block_inertia = sp.csc_matrix(k[rows][:, rows]), inertia[rows][:, rows]
         n_own = min(n_modes, 3 * len(vertices) - N_RIGID)
-        found = _component_modes(part, part_inertia, positions[vertices], n_own, shift, largest_residual)
+        component = _component_modes(block, block_inertia, positions[vertices], n_own, shift, largest_residual)
         whole = np.zeros((len(rigid), n_own))
-        whole[own] = found.modes
+        whole[rows] = component.modes
         modes.append(whole)
-        eigenvalues.append(found.eigenvalues)
-        rigid[own, N_RIGID * index : N_RIGID * (index + 1)] = rigid_motions(positions[vertices], part_inertia)
-        n_zero += found.n_zero - N_RIGID
-    # The rigid motions of components, without those of the whole.
+        eigenvalues.append(component.eigenvalues)
+        rigid[rows, N_RIGID * index : N_RIGID * (index + 1)] = rigid_motions(positions[vertices], block_inertia)
+        n_zero += component.n_zero - N_RIGID
+    # The rigid motions of components, without the rigid motions of the whole.
     whole_rigid = rigid_motions(positions, inertia)
     relative = rigid @ scipy.linalg.qr(rigid.T @ (inertia @ whole_rigid))[0][:, N_RIGID:]
     order = np.argsort(np.concatenate(eigenvalues), kind="stable")[:n_modes]
@@ -166,8 +166,8 @@ def _component_modes(
     first_elastic, not_rigid = eigenvalues[n_zero], np.abs(rigid_eigenvalues).max()
     if not not_rigid < RIGID_TOLERANCE * first_elastic:
         raise ModalAnalysisError(
-            f"the six rigid motions have eigenvalues up to {not_rigid:.2e}, which is not zero beside the first elastic "
-            f"one, {first_elastic:.2e}; the mesh is degenerate"
+            f"the six rigid motions have eigenvalues up to {not_rigid:.2e}, which is not zero compared with the "
+            f"first elastic one, {first_elastic:.2e}; the mesh is degenerate"
         )
     impulses = inertia @ modes
     residuals = np.linalg.norm(forces - impulses * eigenvalues, axis=0)
@@ -199,9 +199,9 @@ def _lanczos(
     factors = factorize(shifted[order][:, order].tocsr().T, "NATURAL")
 
     def elastic_solve(forces: FloatArray) -> FloatArray:
-        found = np.empty(n)
-        found[order] = factors.solve(forces.reshape(-1)[order])
-        return found - rigid @ (momentum.T @ found)
+        solved = np.empty(n)
+        solved[order] = factors.solve(forces.reshape(-1)[order])
+        return solved - rigid @ (momentum.T @ solved)
 
     # A fixed start makes modes reproducible. Full accuracy: a looser tolerance misses copies of equal eigenvalues.
     start = elastic_solve(np.random.default_rng(0).standard_normal(n))

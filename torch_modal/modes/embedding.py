@@ -158,7 +158,7 @@ def _moving_least_squares(
     mean = (theta[:, None] @ offset)[:, 0]
     centered = offset - mean[:, None]
     covariance = (theta[..., None] * centered).transpose(0, 2, 1) @ centered
-    # Coplanar neighbours determine no slope across their plane: that of a pseudo-inverse is zero.
+    # Coplanar neighbours determine no slope across their plane: a pseudo-inverse makes it zero.
     flat = np.linalg.det(covariance) <= FLAT * np.trace(covariance, axis1=1, axis2=2) ** 3
     inverse = np.empty_like(covariance)
     inverse[~flat] = np.linalg.inv(covariance[~flat])

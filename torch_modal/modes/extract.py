@@ -153,8 +153,8 @@ def bases_of_checked(
         for index, shape in enumerate(shapes):
             with extraction.stage(index, "checks"):
                 extraction.surfaces.append(CanonicalSurface.of(shape, triangles))
-        found = extraction.by(method)
-    if loose := [one for one in found if one["n_zero"][0] > N_RIGID]:
+        results = extraction.by(method)
+    if loose := [one for one in results if one["n_zero"][0] > N_RIGID]:
         warnings.warn(
             f"the shape has {max(int(one['n_pieces'][0]) for one in loose)} loose pieces, or parts hung on an edge or "
             "a vertex: modes deform each of them, and how they move against each other is left to the interpolation of "
@@ -163,7 +163,7 @@ def bases_of_checked(
             stacklevel=3,
         )
     bases = []
-    for shape, surface, one in zip(shapes, extraction.surfaces, found, strict=True):
+    for shape, surface, one in zip(shapes, extraction.surfaces, results, strict=True):
         # lambda ~ 1 / length², and phi ~ length^(-3/2) since phi' M phi = 1 with a mass ~ length³.
         modes = np.zeros((n_modes, *shape.shape))
         modes[:, surface.used] = one["modes"] @ surface.axes * surface.scale**1.5
@@ -174,15 +174,15 @@ def bases_of_checked(
 
 def _bases_of_bodies(several: Sequence[Any], keyframes: torch.Tensor, n_modes: int, *options: Any) -> list[ModalBasis]:
     """Bases with the modes of each body, which are zero on the others. *Shape:* ``(K, V, 3)``."""
-    found = []
-    for own, mesh in several:
+    bases_of_bodies = []
+    for vertices, mesh in several:
         most = min(n_modes, 3 * len(mesh.used) - N_RIGID)
-        found.append(bases_of_checked(keyframes[:, own], torch.tensor(mesh.faces), most, *options))
+        bases_of_bodies.append(bases_of_checked(keyframes[:, vertices], torch.tensor(mesh.faces), most, *options))
     bases = []
-    for shape, *parts in zip(keyframes, *found, strict=True):
+    for shape, *parts in zip(keyframes, *bases_of_bodies, strict=True):
         values, order = torch.cat([basis.eigenvalues for basis in parts]).sort(stable=True)
-        each = ((own, basis.modes) for (own, _), basis in zip(several, parts, strict=True))
-        modes = [shape.new_zeros(len(moves), *shape.shape).index_copy(1, own, moves) for own, moves in each]
+        each = ((vertices, basis.modes) for (vertices, _), basis in zip(several, parts, strict=True))
+        modes = [shape.new_zeros(len(moves), *shape.shape).index_copy(1, vertices, moves) for vertices, moves in each]
         rigid_eigenvalues = torch.stack([basis.rigid_eigenvalues for basis in parts]).amax(0)
         bases.append(ModalBasis(shape, values, torch.cat(modes)[order], rigid_eigenvalues))
     return bases
@@ -268,8 +268,8 @@ class _Extraction:
             if carried is not None:
                 with contextlib.suppress(ModalAnalysisError):  # too distorted
                     return self._modes_of(index, lambda: carried.body(self.form))
-            own = self._mesh(index)
-            return self._modes_of(index, lambda: own.body(self.form))
+            mesh = self._mesh(index)
+            return self._modes_of(index, lambda: mesh.body(self.form))
 
         inputs = {"points": solid.surface.points, **solid.tetrahedra.arrays()}
         inputs = {f"rest_{name}": array for name, array in inputs.items()}
@@ -283,15 +283,15 @@ class _Extraction:
         def modes(index: int) -> Arrays:
             surface = self.surfaces[index]
             arrays = {"points": surface.points, "faces": surface.faces, **inputs}
-            found = self.cache.get("modes", arrays, {"n_modes": self.n_modes, **parameters}, lambda: compute(index))
+            result = self.cache.get("modes", arrays, {"n_modes": self.n_modes, **parameters}, lambda: compute(index))
             self.bar.update()
-            return found
+            return result
 
         return run_all(modes, len(self.surfaces), self.stop, VERTICES_AT_ONCE // n_vertices)
 
     def _mesh(self, index: int) -> Solid:
         with self.stage(index, "tetrahedra"):
-            return Solid.filling(self.surfaces[index], self.mesher, self.cache, self.stop)
+            return Solid.from_surface(self.surfaces[index], self.mesher, self.cache, self.stop)
 
     def _modes_of(self, index: int, make_body: Callable[[], ElasticBody]) -> Arrays:
         """Modes of a body, at the points of its surface. *Shape:* ``modes (k, U, 3)``."""
@@ -299,8 +299,8 @@ class _Extraction:
         with self.stage(index, "modes"):
             try:
                 body = make_body()
-                found = lowest_modes(body, min(self.n_modes, body.points.size - N_RIGID))
-                modes = body.to_surface(found.modes.reshape(len(body.points), 3, -1))
+                result = lowest_modes(body, min(self.n_modes, body.points.size - N_RIGID))
+                modes = body.to_surface(result.modes.reshape(len(body.points), 3, -1))
             except ModalAnalysisError:
                 raise
             except (RuntimeError, np.linalg.LinAlgError) as error:
@@ -309,19 +309,19 @@ class _Extraction:
                     "another method or mesher"
                 ) from error
             modes = np.ascontiguousarray(modes.transpose(2, 0, 1))
-            n_zero = found.n_zero - N_RIGID
-            modes = np.concatenate([_deforming(modes[:n_zero], surface.points, surface.faces), modes[n_zero:]])
+            n_zero = result.n_zero - N_RIGID
+            modes = np.concatenate([_deforming_motions(modes[:n_zero], surface.points, surface.faces), modes[n_zero:]])
             if len(modes) < self.n_modes:
                 raise ModalAnalysisError(
-                    f"only {len(modes)} modes deform the {found.n_pieces} loose pieces, {self.n_modes} are requested; "
+                    f"only {len(modes)} modes deform the {result.n_pieces} loose pieces, {self.n_modes} are requested; "
                     "request fewer, or give a finer mesher"
                 )
         return {
-            "eigenvalues": found.eigenvalues[len(found.eigenvalues) - len(modes) :][: self.n_modes],
+            "eigenvalues": result.eigenvalues[len(result.eigenvalues) - len(modes) :][: self.n_modes],
             "modes": modes[: self.n_modes],
-            "rigid_eigenvalues": found.rigid_eigenvalues,
-            "n_zero": np.array([found.n_zero]),
-            "n_pieces": np.array([found.n_pieces]),
+            "rigid_eigenvalues": result.rigid_eigenvalues,
+            "n_zero": np.array([result.n_zero]),
+            "n_pieces": np.array([result.n_pieces]),
         }
 
     @contextlib.contextmanager
@@ -340,7 +340,7 @@ class _Extraction:
             raise named from error
 
 
-def _deforming(motions: FloatArray, points: FloatArray, faces: IntArray) -> FloatArray:
+def _deforming_motions(motions: FloatArray, points: FloatArray, faces: IntArray) -> FloatArray:
     """Combinations of motions without energy that deform a surface, as where a piece spans several of tetrahedra.
 
     Rigid motions of pieces are left to the interpolation of the key-frames. *Shape:* ``(k, U, 3) -> (m, U, 3)``.
@@ -349,12 +349,12 @@ def _deforming(motions: FloatArray, points: FloatArray, faces: IntArray) -> Floa
         return motions
     piece = connected_pieces(np.concatenate([faces[:, :2], faces[:, 1:]]), len(points))
     left = motions.copy()
-    for own in (np.flatnonzero(piece == index) for index in range(piece.max() + 1)):
-        arms = points[own] - points[own].mean(axis=0)
+    for members in (np.flatnonzero(piece == index) for index in range(piece.max() + 1)):
+        arms = points[members] - points[members].mean(axis=0)
         turns = np.cross(np.eye(3)[:, None], arms[None])
         rigid = np.concatenate([np.broadcast_to(np.eye(3)[:, None], turns.shape), turns]).reshape(2 * 3, -1)
-        flat = motions[:, own].reshape(len(motions), -1)
-        left[:, own] = (flat - flat @ np.linalg.pinv(rigid) @ rigid).reshape(len(motions), -1, 3)
+        flat = motions[:, members].reshape(len(motions), -1)
+        left[:, members] = (flat - flat @ np.linalg.pinv(rigid) @ rigid).reshape(len(motions), -1, 3)
     size = np.linalg.norm(motions)
     mixes, sizes, _ = np.linalg.svd(left.reshape(len(motions), -1), full_matrices=False)
     return np.tensordot(mixes[:, sizes > DEFORMS * size].T, motions, 1)

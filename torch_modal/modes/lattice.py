@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from torch_modal.arrays import BoolArray, FloatArray, IntArray
 from torch_modal.geometry.canonical import CANONICAL_SIZE
 from torch_modal.geometry.connectivity import Connectivity, connected_pieces
-from torch_modal.modes.bisection import bisected
+from torch_modal.modes.bisection import bisect
 from torch_modal.modes.parallel import n_cpus
 from torch_modal.modes.surface import CanonicalSurface, SurfaceSamples, clearances
 from torch_modal.modes.tetrahedra import (
@@ -102,14 +102,14 @@ class Lattice:
 
     def fill(self, surface: CanonicalSurface, stop: threading.Event) -> Tetrahedra:
         """Fill a surface with tetrahedra."""
-        found = lattice(surface, self.cube)
+        tetrahedra = lattice(surface, self.cube)
         pairs = np.concatenate([surface.faces[:, :2], surface.faces[:, 1:]])
         most = connected_pieces(pairs, len(surface.points)).max()
-        if (n_pieces := face_connected_pieces(found.tets).max()) <= most:
-            return found
+        if (n_pieces := face_connected_pieces(tetrahedra.tets).max()) <= most:
+            return tetrahedra
         turned = lattice(replace(surface, points=surface.points @ TURN.T), self.cube)
         better = face_connected_pieces(turned.tets).max() < n_pieces
-        return turned._replace(vertices=turned.vertices @ TURN) if better else found
+        return turned._replace(vertices=turned.vertices @ TURN) if better else tetrahedra
 
 
 class Indicator:
@@ -132,13 +132,13 @@ class Indicator:
         self.samples, self.has_sides, self.low, self.spacing = samples, has_sides, low, spacing
         places = (samples.points - low) / spacing
         base = np.floor(places).astype(np.int64)
-        part = np.ascontiguousarray((places - base).T)
+        fraction = np.ascontiguousarray((places - base).T)
         normals = np.ascontiguousarray((samples.normals * samples.areas[:, None]).T)
         index = np.ravel_multi_index(tuple(base.T), tuple(counts))
         size = int(counts.prod())
         divergence = np.zeros(size)
         for step in itertools.product((0, 1), repeat=3):
-            share = np.where(np.array(step)[:, None], part, 1 - part)
+            share = np.where(np.array(step)[:, None], fraction, 1 - fraction)
             slope = np.where(step, 1.0, -1.0)
             weight = sum(normals[a] * slope[a] * share[a - 1] * share[a - 2] for a in range(3))
             divergence += np.bincount(index + np.ravel_multi_index(step, tuple(counts)), weight, minlength=size)
@@ -210,17 +210,17 @@ def lattice(surface: CanonicalSurface, cube: float) -> Tetrahedra:
     cubes[tuple(((points - low) / root).astype(np.int64).T)] = True
     cubes[tuple(corner[is_inside(corner + 0.5)].T)] = True
     most = int(MOST_TETRAHEDRA * max(1.0, USUAL_CUBE * CANONICAL_SIZE / largest) ** 3)
-    cut, owner = bisected(np.argwhere(cubes), (points - low) / root, wanted / root, is_inside, most)
+    cut, owner = bisect(np.argwhere(cubes), (points - low) / root, wanted / root, is_inside, most)
     vertices, tets = low + root * cut.vertices, cut.tets
     inside = indicator.inside(vertices[tets])
     kept = inside >= LEAST_INSIDE
     kept[owner] = True
-    kept = _bridged(tets, kept, np.ones(len(kept), dtype=bool))
+    kept = _bridge(tets, kept, np.ones(len(kept), dtype=bool))
     filled = kept_tetrahedra(Tetrahedra(vertices, tets, np.maximum(inside, LEAST_INSIDE)), kept)
-    return _fitted(without_debris(filled), indicator)
+    return _fit(without_debris(filled), indicator)
 
 
-def _fitted(filled: Tetrahedra, indicator: Indicator) -> Tetrahedra:
+def _fit(filled: Tetrahedra, indicator: Indicator) -> Tetrahedra:
     """Move outer vertices onto the surface, unless that splits the mesh, loses volume or uncovers the surface."""
     samples = indicator.samples
     volumes = tet_volumes(filled)
@@ -238,8 +238,8 @@ def _fitted(filled: Tetrahedra, indicator: Indicator) -> Tetrahedra:
     for retreat in range(MOST_RETREATS):
         bad = np.unique(filled.tets[tet_volumes(Tetrahedra(vertices, filled.tets)) < LEAST_VOLUME * volumes])
         # Half the way back at first, then all the way, which restores the original position.
-        part = 1.0 if retreat >= MOST_RETREATS // 2 else 0.5
-        vertices[bad] += part * (filled.vertices[bad] - vertices[bad])
+        retreat_factor = 1.0 if retreat >= MOST_RETREATS // 2 else 0.5
+        vertices[bad] += retreat_factor * (filled.vertices[bad] - vertices[bad])
         retreated[bad] = True
     placed = indicator.at(vertices) >= 0.5
     retreated &= ~placed
@@ -249,7 +249,7 @@ def _fitted(filled: Tetrahedra, indicator: Indicator) -> Tetrahedra:
     placed[rim[(vertices[rim] != filled.vertices[rim]).any(axis=1)]] = True
     placed[retreated] = False
     inside[placed[filled.tets].all(axis=1)] = 1.0
-    kept = _bridged(filled.tets, kept, inside > 0)
+    kept = _bridge(filled.tets, kept, inside > 0)
     moved = Tetrahedra(vertices, filled.tets, np.maximum(inside, LEAST_INSIDE))
     fitted = without_debris(kept_tetrahedra(moved, kept))
     if len(fitted.tets) == 0 or face_connected_pieces(fitted.tets).max() != face_connected_pieces(filled.tets).max():
@@ -261,7 +261,7 @@ def _fitted(filled: Tetrahedra, indicator: Indicator) -> Tetrahedra:
     return fitted if np.isfinite(distance).all() else filled
 
 
-def _bridged(tets: IntArray, kept: BoolArray, allowed: BoolArray) -> BoolArray:
+def _bridge(tets: IntArray, kept: BoolArray, allowed: BoolArray) -> BoolArray:
     """Keep further tetrahedra that join pieces which share only an edge or a vertex. *Shape:* ``(T,)``."""
     kept = kept.copy()
     for _ in range(MOST_BRIDGES):

@@ -1,6 +1,6 @@
-"""Vibration modes of a surface itself: those of Eq. 5 at rest, without tetrahedra.
+"""Vibration modes of a surface itself: modes of Eq. 5 at rest, without tetrahedra.
 
-The stiffness is the Gauss-Newton Hessian of edge lengths and dihedral angles at rest, the mass that of a sheet. Sheets,
+The stiffness is the Gauss-Newton Hessian of edge lengths and dihedral angles at rest, the mass is lumped areas. Sheets,
 thin and open bodies have such modes, as all surfaces do. The enclosed volume is left out: it hardly
 changes in-betweens (docs/precompute.md).
 """
@@ -14,7 +14,7 @@ from torch_modal.elastic.rest_hessian import rest_hessian
 from torch_modal.elastic.shell import BETA
 from torch_modal.geometry.canonical import CANONICAL_SIZE
 from torch_modal.geometry.connectivity import Connectivity, double_areas, vertex_areas
-from torch_modal.modes.coarsening import collapsed, joined
+from torch_modal.modes.coarsening import collapse, join_clusters
 from torch_modal.modes.eigen import ElasticBody
 from torch_modal.modes.surface import CanonicalSurface
 from torch_modal.modes.tetrahedra import small_pieces
@@ -24,7 +24,7 @@ THICKNESS = 0.01
 COARSE_FACES = 4000
 """Faces of the mesh that modes are computed on: with 2,000 or 8,000, in-betweens are as good."""
 FACES_PER_MODE = 50
-"""Where many modes are asked for, there are more faces."""
+"""Faces for each requested mode, where there are many."""
 SHORTEST = 1e-6
 """Length of an edge over the mean up to which its ends are one vertex: it would have no stiffness."""
 LEAST_MASS = 1e-3
@@ -46,15 +46,15 @@ def sheet_body(surface: CanonicalSurface, n_modes: int) -> ElasticBody:
     """A surface as a thin elastic sheet.
 
     Vertices are clustered by edge collapses, and modes are computed on the mesh of the clusters, with stretching as
-    stiff as that of the fine mesh: in Eq. 5 it grows as edges become shorter. Small loose pieces follow the rest.
+    stiff as the fine mesh: in Eq. 5 it grows as edges become shorter. Small loose pieces follow the rest.
     """
     fine = Connectivity(surface.faces, len(surface.points))
     piece = fine.vertex_pieces[surface.faces[:, 0]]
     amounts = np.bincount(piece, double_areas(surface.points, surface.faces))
     large = surface.faces[~small_pieces(amounts, surface.points[surface.faces], piece)[piece]]
     # Modes do not mind needles, for which `coarsen` would collapse several times.
-    coarsening = collapsed(surface.points, large, n_coarse_faces(n_modes))
-    coarsening = joined(surface.points, large, coarsening, SHORTEST)
+    coarsening = collapse(surface.points, large, n_coarse_faces(n_modes))
+    coarsening = join_clusters(surface.points, large, coarsening, SHORTEST)
     points, mesh = coarsening.restrict(surface.points), Connectivity(coarsening.faces, coarsening.n_vertices)
 
     coarser = _mean_length(points, mesh) / _mean_length(surface.points, fine)
@@ -86,10 +86,10 @@ def _cluster_weights(
 ) -> sp.coo_matrix:
     """Weights of the clusters that move each vertex, membership averaged over neighbours. *Shape:* ``(U, N)``."""
     n_fine, n = len(surface.points), len(points)
-    own = np.flatnonzero(clusters >= 0)
-    weights = sp.csr_matrix((np.ones(len(own)), (own, clusters[own])), shape=(n_fine, n))
+    clustered = np.flatnonzero(clusters >= 0)
+    weights = sp.csr_matrix((np.ones(len(clustered)), (clustered, clusters[clustered])), shape=(n_fine, n))
     averages = _averages(fine)
-    for _ in range(round(SPREAD * (len(own) / n) ** 0.5)):
+    for _ in range(round(SPREAD * (len(clustered) / n) ** 0.5)):
         weights = averages @ weights
     total = np.asarray(weights.sum(axis=1)).reshape(-1)
     weights = sp.diags(1 / np.where(total > 0, total, 1)) @ weights

@@ -43,7 +43,7 @@ class Solid:
     meshed: "Solid | None" = None
 
     @classmethod
-    def filling(cls, surface: CanonicalSurface, mesher: Mesher, cache: Cache, stop: threading.Event) -> "Solid":
+    def from_surface(cls, surface: CanonicalSurface, mesher: Mesher, cache: Cache, stop: threading.Event) -> "Solid":
         """Mesh a surface, unless the cache has its tetrahedra; raises as :meth:`Mesher.fill`."""
 
         def compute() -> dict[str, NDArray[Any]]:
@@ -57,12 +57,12 @@ class Solid:
             return {**tetrahedra.arrays(), "neighbours": neighbours, "kernel": kernel}
 
         inputs = {"points": surface.points, "faces": surface.faces}
-        found = cache.get("solid", inputs, mesher.key(), compute)
-        tetrahedra = Tetrahedra(found["vertices"], found["tets"], found.get("inside"))
-        return cls(surface, tetrahedra, found["neighbours"], found["kernel"])
+        arrays = cache.get("solid", inputs, mesher.key(), compute)
+        tetrahedra = Tetrahedra(arrays["vertices"], arrays["tets"], arrays.get("inside"))
+        return cls(surface, tetrahedra, arrays["neighbours"], arrays["kernel"])
 
     def weights(self) -> sp.csr_matrix:
-        """Displacements of the surface from those of the tetrahedra. *Shape:* ``(U, N)``."""
+        """Displacements of the surface from displacements of the tetrahedra. *Shape:* ``(U, N)``."""
         return fit_weights(self.surface.points, self.tetrahedra.vertices, self.neighbours, self.kernel)
 
     def body(self, form: HessianForm) -> ElasticBody:
@@ -95,10 +95,10 @@ def larger_pieces(tetrahedra: Tetrahedra) -> tuple[Tetrahedra, IntArray, sp.csr_
         return tetrahedra, stays, sp.identity(n, format="csr")
     kept = kept_tetrahedra(tetrahedra, ~small[of_tets])
     rows, weights = [stays], [sp.identity(len(stays), format="csr")]
-    for own in (np.flatnonzero(piece == index) for index in np.flatnonzero(small)):
-        points = tetrahedra.vertices[own]
-        around = np.tile(_around(points, kept.vertices, piece[stays]), (len(own), 1))
-        rows.append(own)
+    for members in (np.flatnonzero(piece == index) for index in np.flatnonzero(small)):
+        points = tetrahedra.vertices[members]
+        around = np.tile(_around(points, kept.vertices, piece[stays]), (len(members), 1))
+        rows.append(members)
         weights.append(fit_weights(points, kept.vertices, around, np.ones(around.shape)))
     order = np.argsort(np.concatenate(rows))
     return kept, stays, sp.csr_matrix(sp.vstack(weights, format="csr")[order])
@@ -114,8 +114,8 @@ def _around(points: FloatArray, vertices: FloatArray, piece: IntArray) -> IntArr
     near = np.argsort(distance, kind="stable")
     near = near[: max(int((distance <= reach).sum()), min(N_NEIGHBOURS, int(np.isfinite(distance).sum())))]
     # Farthest-point sampling.
-    found, to_found = [0], distance[near]
-    while len(found) < N_NEIGHBOURS:
-        found.append(int(to_found.argmax()))
-        to_found = np.minimum(to_found, np.linalg.norm(vertices[near] - vertices[near[found[-1]]], axis=1))
-    return near[found]
+    chosen, to_found = [0], distance[near]
+    while len(chosen) < N_NEIGHBOURS:
+        chosen.append(int(to_found.argmax()))
+        to_found = np.minimum(to_found, np.linalg.norm(vertices[near] - vertices[near[chosen[-1]]], axis=1))
+    return near[chosen]

@@ -20,12 +20,12 @@ def arap_hessian(tetrahedra: Tetrahedra, form: HessianForm = "edge") -> sp.csc_m
 
     Both forms measure ``min_W ∫ |∇u - W|²`` over infinitesimal rotations ``W`` (skew matrices), with one rotation for
     each edge or vertex; both are positive semi-definite, with the rigid motions in the null space. Their modes are
-    alike, their eigenvalues are not: those of the vertex form are 1.9 to 5.6 times the others on lattices.
+    alike, their eigenvalues are not: the vertex form has 1.9 to 5.6 times the eigenvalues of the others on lattices.
 
     - ``"edge"``: ``sum_e vol_e |sym ∇u_e|²``, where ``∇u_e`` is the mean of ``∇u`` over the tetrahedra around an edge
       and ``vol_e`` a sixth of their volume (edge-based smoothed finite elements; Cazes and Meschke 2013 for
       tetrahedra). Linear tetrahedra are too stiff in bending, by half or more with one or two across a limb; smoothing
-      removes most of this error. The energy is at least a fifth of that of linear tetrahedra, so no mode is spurious.
+      removes most of this error. The energy is at least a fifth of that of linear tetrahedra: no mode is spurious.
       Couples vertices whose tetrahedra share an edge.
     - ``"vertex"`` (Huang, Wicke, Adams and Guibas 2009): ``½ sum_i sum_{j in N(i)} c_ij |u_i - u_j - w_i ×
       (x_i - x_j)|²`` with the rotations ``w_i`` eliminated, ``K = L ⊗ I - Bᵀ C⁻¹ B``. Couples vertices two
@@ -51,7 +51,7 @@ def mass_matrix(tetrahedra: Tetrahedra) -> sp.csr_matrix:
     """
     # For each tetrahedron: (1 + δ) / 20 if consistent, δ / 4 if lumped.
     entries = solid_volumes(tetrahedra)[:, None, None] * (np.full((4, 4), 1 / 40) + np.eye(4) * (1 / 40 + 1 / 8))
-    return _assembled(entries, tetrahedra).tocsr()
+    return _assemble(entries, tetrahedra).tocsr()
 
 
 def dirichlet_matrix(tetrahedra: Tetrahedra, gradients: FloatArray) -> sp.coo_matrix:
@@ -60,10 +60,10 @@ def dirichlet_matrix(tetrahedra: Tetrahedra, gradients: FloatArray) -> sp.coo_ma
     *Shape:* ``(T, 4, 3) -> (N, N)``.
     """
     products = np.einsum("tak,tbk->tab", gradients, gradients)
-    return _assembled(products * solid_volumes(tetrahedra)[:, None, None], tetrahedra)
+    return _assemble(products * solid_volumes(tetrahedra)[:, None, None], tetrahedra)
 
 
-def _assembled(entries: FloatArray, tetrahedra: Tetrahedra) -> sp.coo_matrix:
+def _assemble(entries: FloatArray, tetrahedra: Tetrahedra) -> sp.coo_matrix:
     """Entries of pairs of corners at their vertices; duplicates are summed on conversion. *Shape:* ``(T, 4, 4)``."""
     n = len(tetrahedra.vertices)
     rows, columns = np.repeat(tetrahedra.tets, 4, axis=1), np.tile(tetrahedra.tets, 4)
@@ -107,9 +107,9 @@ def _vertex_hessian(tetrahedra: Tetrahedra) -> sp.csc_matrix:
     """``K = 2 L ⊗ I - Bᵀ C⁻¹ B`` (each edge occurs in both directions, hence the 2)."""
     n = len(tetrahedra.vertices)
     # Every edge in both directions with its clamped cotangent weight c_ij = -Σ_t vol_t g_i · g_j.
-    found = dirichlet_matrix(tetrahedra, hat_gradients(tetrahedra))
-    apart = found.row != found.col
-    summed = sp.coo_matrix((-found.data[apart], (found.row[apart], found.col[apart])), shape=(n, n)).tocsr()
+    dirichlet = dirichlet_matrix(tetrahedra, hat_gradients(tetrahedra))
+    apart = dirichlet.row != dirichlet.col
+    summed = sp.coo_matrix((-dirichlet.data[apart], (dirichlet.row[apart], dirichlet.col[apart])), shape=(n, n)).tocsr()
     summed = ((summed + summed.T) / 2).tocoo()  # equal up to rounding; exactly equal from here on
     tail, head = summed.row.astype(np.int64), summed.col.astype(np.int64)
     weights = np.maximum(summed.data, WEIGHT_FLOOR * np.abs(summed.data).mean())

@@ -147,8 +147,8 @@ def self_proximity(surface: CanonicalSurface) -> float:
     points, normals = surface.points[::step], surface.normals[::step]
     tree = cKDTree(points)
     opposed = np.zeros(len(points), dtype=bool)
-    for part in (1 / 16, 1 / 8, 1 / 4, 1 / 2):  # beyond half the gap, the opposing side is nearer than the point itself
-        nearest = tree.query(points + part * NEAR * CANONICAL_SIZE * normals, workers=n_cpus())[1]
+    for gap in (1 / 16, 1 / 8, 1 / 4, 1 / 2):  # beyond half the gap, the opposing side is nearer than the point itself
+        nearest = tree.query(points + gap * NEAR * CANONICAL_SIZE * normals, workers=n_cpus())[1]
         opposed |= np.einsum("vi,vi->v", normals, normals[nearest]) < OPPOSED
     areas = vertex_areas(surface.points, surface.faces)[::step]
     return float(areas[opposed].sum() / areas.sum())
@@ -162,8 +162,8 @@ def clearances(surface: CanonicalSurface) -> tuple[FloatArray, FloatArray]:
     """
     samples = SurfaceSamples(surface, np.full(len(surface.faces), np.sqrt(surface.area / N_SAMPLES)))
     seen = np.arange(0, len(samples.points), max(len(samples.points) // SEEN_SAMPLES, 1))
-    found = np.full((2, len(surface.faces)), np.inf)
-    for smallest, side in zip(found, (-1.0, 1.0), strict=True):
+    clearance = np.full((2, len(surface.faces)), np.inf)
+    for smallest, side in zip(clearance, (-1.0, 1.0), strict=True):
         left, radius = seen, np.full(len(seen), MOST * CANONICAL_SIZE / 2)
         for _ in range(MOST_SHRINKINGS):
             point, direction = samples.points[left], side * samples.normals[left]
@@ -177,4 +177,4 @@ def clearances(surface: CanonicalSurface) -> tuple[FloatArray, FloatArray]:
             np.minimum.at(smallest, samples.faces[left], 2 * radius)
             if len(left) == 0:
                 break
-    return found[0], found[1]
+    return clearance[0], clearance[1]

@@ -85,7 +85,7 @@ def solid_volumes(tetrahedra: Tetrahedra) -> FloatArray:
     return volumes if tetrahedra.inside is None else volumes * tetrahedra.inside
 
 
-def oriented(tetrahedra: Tetrahedra) -> Tetrahedra:
+def orient(tetrahedra: Tetrahedra) -> Tetrahedra:
     """Orient tetrahedra to positive volumes; remove degenerate ones and unused vertices."""
     volumes = tet_volumes(tetrahedra)
     tets = tetrahedra.tets.copy()

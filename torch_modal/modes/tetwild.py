@@ -18,7 +18,7 @@ from torch_modal.geometry.connectivity import double_areas
 from torch_modal.modes.lattice import Lattice
 from torch_modal.modes.processes import ChildError, run_child
 from torch_modal.modes.surface import CanonicalSurface, clearances, self_proximity
-from torch_modal.modes.tetrahedra import Tetrahedra, TetrahedralizationError, oriented, without_debris
+from torch_modal.modes.tetrahedra import Tetrahedra, TetrahedralizationError, orient, without_debris
 from torch_modal.progress import logger
 
 WORKER = Path(__file__).resolve().with_name("_tetwild_worker.py")
@@ -103,7 +103,7 @@ class TetWild:
         edge_length_fac = self.edge_length_fac
         if edge_length_fac is None:
             thickness = surface.thickness
-            if self_proximity(surface) <= TOUCHING:  # otherwise, that of the overlap of two parts is measured
+            if self_proximity(surface) <= TOUCHING:  # otherwise, the overlap of two parts is measured
                 thin = clearances(surface)[0]
                 order = np.argsort(thin)
                 areas = double_areas(surface.points, surface.faces)[order].cumsum()
@@ -112,7 +112,7 @@ class TetWild:
             edge_length_fac = float(np.clip(edges, *EDGE_RANGE))
         settings = replace(self, edge_length_fac=edge_length_fac)
         try:
-            tetrahedra = without_debris(oriented(_run_worker(points, surface.faces, settings, stop)))
+            tetrahedra = without_debris(orient(_run_worker(points, surface.faces, settings, stop)))
             _check_fills(tetrahedra, points, edge_length_fac, self.epsilon)
         except TetrahedralizationError as error:
             mesh = f"a mesh of {len(points)} vertices and {len(surface.faces)} faces"
@@ -131,7 +131,7 @@ class Auto:
     tetwild: TetWild = TetWild()
 
     def key(self) -> dict[str, Any]:
-        """Those of both."""
+        """The keys of both meshers."""
         return {**Lattice().key(), **{f"touching_{name}": value for name, value in self.tetwild.key().items()}}
 
     def fill(self, surface: CanonicalSurface, stop: threading.Event) -> Tetrahedra:

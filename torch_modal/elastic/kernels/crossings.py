@@ -5,7 +5,7 @@ import warp as wp
 from torch_modal.elastic.kernels.types import place, real, vec3
 
 MARGIN = wp.constant(real(1e-12))
-"""Of the cube of the largest length in a determinant: more than its rounding error."""
+"""Relative to the cubed largest length in a determinant; above its rounding error."""
 box = wp.types.vector(length=6, dtype=real)
 """Its lowest corner, and the opposite of its highest."""
 
@@ -31,7 +31,7 @@ def overlap(a: box, b: box) -> bool:
 
 @wp.func
 def meet(a: wp.vec3i, b: wp.vec3i):
-    """Whether two faces have a common vertex."""
+    """True if two faces have a common vertex."""
     one = a[0] == b[0] or a[0] == b[1] or a[0] == b[2]
     other = a[1] == b[0] or a[1] == b[1] or a[1] == b[2]
     return one or other or a[2] == b[0] or a[2] == b[1] or a[2] == b[2]
@@ -44,20 +44,20 @@ def turn(along: vec3, a: vec3, b: vec3):
 
 @wp.func
 def through(start: vec3, end: vec3, height: real, end_height: real, margin: real, a: vec3, b: vec3, c: vec3) -> bool:
-    """Whether an edge passes through a triangle, or misses it by rounding only; with the heights of its ends."""
-    found = wp.min(height, end_height) < margin and wp.max(height, end_height) > -margin
-    if found:
+    """True if an edge passes through a triangle, or misses it by rounding only; with the heights of its ends."""
+    result = wp.min(height, end_height) < margin and wp.max(height, end_height) > -margin
+    if result:
         along = end - start
         first = turn(along, a - start, b - start)
         second = turn(along, b - start, c - start)
         third = turn(along, c - start, a - start)
-        found = wp.min(first, wp.min(second, third)) > -margin or wp.max(first, wp.max(second, third)) < margin
-    return found
+        result = wp.min(first, wp.min(second, third)) > -margin or wp.max(first, wp.max(second, third)) < margin
+    return result
 
 
 @wp.func
 def pierces(p: vec3, q: vec3, r: vec3, a: vec3, b: vec3, c: vec3) -> bool:
-    """Whether an edge of the first triangle passes through the second, or misses it by rounding only."""
+    """True if an edge of the first triangle passes through the second, or misses it by rounding only."""
     reach = wp.max(wp.length(p - a), wp.max(wp.length(q - a), wp.length(r - a)))
     reach = wp.max(reach, wp.max(wp.length(b - a), wp.length(c - a)))
     margin = MARGIN * reach * reach * reach
@@ -67,29 +67,29 @@ def pierces(p: vec3, q: vec3, r: vec3, a: vec3, b: vec3, c: vec3) -> bool:
     r_height = wp.dot(r - a, normal)
     lowest = wp.min(p_height, wp.min(q_height, r_height))
     highest = wp.max(p_height, wp.max(q_height, r_height))
-    found = lowest < margin and highest > -margin
-    if found:
-        found = (
+    result = lowest < margin and highest > -margin
+    if result:
+        result = (
             through(p, q, p_height, q_height, margin, a, b, c)
             or through(q, r, q_height, r_height, margin, a, b, c)
             or through(r, p, r_height, p_height, margin, a, b, c)
         )
-    return found
+    return result
 
 
 @wp.func
 def cross(x: wp.array[vec3], f: wp.vec3i, g: wp.vec3i) -> bool:
-    """Whether two faces without a common vertex pass through each other, or miss each other by rounding only."""
-    found = not meet(f, g)
-    if found:
+    """True if two faces without a common vertex pass through each other, or miss each other by rounding only."""
+    result = not meet(f, g)
+    if result:
         p = x[place(f[0], 0)]
         q = x[place(f[1], 0)]
         r = x[place(f[2], 0)]
         a = x[place(g[0], 0)]
         b = x[place(g[1], 0)]
         c = x[place(g[2], 0)]
-        found = pierces(p, q, r, a, b, c) or pierces(a, b, c, p, q, r)
-    return found
+        result = pierces(p, q, r, a, b, c) or pierces(a, b, c, p, q, r)
+    return result
 
 
 @wp.kernel(enable_backward=False)

@@ -25,10 +25,10 @@ def _common(f: KernelFunctions) -> SimpleNamespace:
     @wp.func
     def edge_vectors(x: wp.array[vec3], at: int, q: corners):
         origin = x[place(at, q[0])]
-        found = vectors()
+        result = vectors()
         for j in range(wp.static(n)):
-            found[j] = x[place(at, q[j + 1])] - origin
-        return found
+            result[j] = x[place(at, q[j + 1])] - origin
+        return result
 
     @wp.func
     def add(out: wp.array[vec3], at: int, q: corners, received: vectors):
@@ -41,10 +41,10 @@ def _common(f: KernelFunctions) -> SimpleNamespace:
     @wp.func
     def inner(a: vectors, b: vectors):
         """By rows: several times as fast as ``wp.ddot``."""
-        found = wp.dot(a[0], b[0])
+        result = wp.dot(a[0], b[0])
         for j in range(1, wp.static(n)):
-            found += wp.dot(a[j], b[j])
-        return found
+            result += wp.dot(a[j], b[j])
+        return result
 
     @wp.func
     def pushed(gradient: vectors, along: real, e: vectors):
@@ -134,20 +134,20 @@ def _common(f: KernelFunctions) -> SimpleNamespace:
             return real(1.0)
 
     @wp.func
-    def softness(own: real, usual: real, relative: int):
+    def softness(at_start: real, usual: real, relative: int):
         """bend.Bend.softening."""
-        found = own
+        result = at_start
         if relative > 0:
-            part = wp.min(own / wp.max(usual, least), real(1.0))
-            found = part * part * (real(3.0) - real(2.0) * part)
-        return found
+            ratio = wp.min(at_start / wp.max(usual, least), real(1.0))
+            result = ratio * ratio * (real(3.0) - real(2.0) * ratio)
+        return result
 
     return SimpleNamespace(**locals())
 
 
-def _module(f: KernelFunctions, part: str) -> "wp.Module":
+def _module(f: KernelFunctions, kind: str) -> "wp.Module":
     """A module of the kernels of a term, which Warp compiles as a whole."""
-    return wp.get_module(f"{__name__}.{f.name}.{part}")
+    return wp.get_module(f"{__name__}.{f.name}.{kind}")
 
 
 def _kernel(f: KernelFunctions, module: "wp.Module") -> Callable[[Callable[..., None]], "wp.Kernel"]:
@@ -165,14 +165,14 @@ def _rider(f: KernelFunctions | None) -> SimpleNamespace:
             return real(0.0)
 
         @wp.func
-        def linearised(e: vec3, rests: wp.array[real], at: int, factors: wp.array[real], to: int):
+        def linearise(e: vec3, rests: wp.array[real], at: int, factors: wp.array[real], to: int):
             return real(0.0), vec3(), symmetric()
 
         @wp.func
         def product(factors: wp.array[real], at: int, e: vec3):
             return vec3(), real(0.0)
 
-        return SimpleNamespace(record=real, Factors=real, energy=energy, linearised=linearised, product=product)
+        return SimpleNamespace(record=real, Factors=real, energy=energy, linearise=linearise, product=product)
     c, potential = _common(f), f.potential
     record, Factors = potential.record, c.Factors
 
@@ -181,23 +181,23 @@ def _rider(f: KernelFunctions | None) -> SimpleNamespace:
         return potential.energy(f.measure(wp.matrix_from_rows(e)), rests[at])
 
     @wp.func
-    def linearised(e: vec3, rests: wp.array[record], at: int, factors: wp.array[Factors], to: int):
-        m, g = f.linearised(wp.matrix_from_rows(e))
-        own = rests[at]
-        slope = potential.slope(m, own)
+    def linearise(e: vec3, rests: wp.array[record], at: int, factors: wp.array[Factors], to: int):
+        m, g = f.linearise(wp.matrix_from_rows(e))
+        record_of = rests[at]
+        slope = potential.slope(m, record_of)
         square = symmetric()
         if factors:
-            along, across = c.stiffness(m, slope, real(2.0) * own.weight)
+            along, across = c.stiffness(m, slope, real(2.0) * record_of.weight)
             factors[to] = c.factors(g, along, across)
             square = block(along, g[0], across)
-        return potential.energy(m, own), slope * g[0], square
+        return potential.energy(m, record_of), slope * g[0], square
 
     @wp.func
     def product(factors: wp.array[Factors], at: int, e: vec3):
         received, form = c.product(factors[at], wp.matrix_from_rows(e))
         return received[0], form
 
-    return SimpleNamespace(record=record, Factors=Factors, energy=energy, linearised=linearised, product=product)
+    return SimpleNamespace(record=record, Factors=Factors, energy=energy, linearise=linearise, product=product)
 
 
 @cache
@@ -235,7 +235,7 @@ def convex(f: KernelFunctions, rider: KernelFunctions | None) -> SimpleNamespace
         s = i // threads
         v = s * n_vertices
         r = s % n_references
-        found = real(0.0)
+        summed = real(0.0)
         for k in range(i - s * threads, elements.shape[0], threads):
             q = elements[place(k, 0)]
             at = k
@@ -243,14 +243,14 @@ def convex(f: KernelFunctions, rider: KernelFunctions | None) -> SimpleNamespace
                 at = own[place(k, 0)]
             e = edge_vectors(x, v, q)
             if gradient:
-                energy, ridden, square = other.linearised(
+                energy, ridden, square = other.linearise(
                     e[0], others, place(r * elements.shape[0], k), other_factors, place(s * elements.shape[0], k)
                 )
-                found += energy
+                summed += energy
                 if at >= 0:
-                    m, g = f.linearised(e)
+                    m, g = f.linearise(e)
                     to = rests[place(r * n_own, at)]
-                    found += potential.energy(m, to)
+                    summed += potential.energy(m, to)
                     slope = potential.slope(m, to)
                     received = slope * g
                     received[0] = received[0] + ridden
@@ -271,10 +271,10 @@ def convex(f: KernelFunctions, rider: KernelFunctions | None) -> SimpleNamespace
                         wp.atomic_add(diagonal, place(v, q[1]), square)
                         wp.atomic_add(diagonal, place(v, q[0]), square)
             else:
-                found += other.energy(e[0], others, place(r * elements.shape[0], k))
+                summed += other.energy(e[0], others, place(r * elements.shape[0], k))
                 if at >= 0:
-                    found += potential.energy(f.measure(e), rests[place(r * n_own, at)])
-        wp.atomic_add(total, s, found)
+                    summed += potential.energy(f.measure(e), rests[place(r * n_own, at)])
+        wp.atomic_add(total, s, summed)
         if faces:
             middle = middle_of(x, v, centre, s, faces[0][0])
             volume = real(0.0)
@@ -343,23 +343,23 @@ def forward(f: KernelFunctions) -> SimpleNamespace:
             q = elements[place(k, 0)]
             to = rests[place(s * elements.shape[0], k)]
             row = s * n_rows + first_row + k
-            m, g = f.linearised(edge_vectors(x, s * n_vertices, q))
+            m, g = f.linearise(edge_vectors(x, s * n_vertices, q))
             root = wp.sqrt(real(2.0) * to.weight)
             g = root * g
             for b in range(n_blocks):
-                found = wide()
+                product_row = wide()
                 first = vec3()
                 for j in range(wp.static(n)):
                     at = place(3 * n_blocks * q[j + 1], b)
-                    found += g[j, 0] * columns[at]
-                    found += g[j, 1] * columns[place(at, n_blocks)]
-                    found += g[j, 2] * columns[place(at, 2 * n_blocks)]
+                    product_row += g[j, 0] * columns[at]
+                    product_row += g[j, 1] * columns[place(at, n_blocks)]
+                    product_row += g[j, 2] * columns[place(at, 2 * n_blocks)]
                     first += g[j]
                 at = place(3 * n_blocks * q[0], b)
-                found -= first[0] * columns[at]
-                found -= first[1] * columns[place(at, n_blocks)]
-                found -= first[2] * columns[place(at, 2 * n_blocks)]
-                out[place(row * n_blocks, b)] = found
+                product_row -= first[0] * columns[at]
+                product_row -= first[1] * columns[place(at, n_blocks)]
+                product_row -= first[2] * columns[place(at, 2 * n_blocks)]
+                out[place(row * n_blocks, b)] = product_row
             residual = real(0.0)
             if root > real(0.0):
                 residual = potential.slope(m, to) / root
@@ -368,11 +368,11 @@ def forward(f: KernelFunctions) -> SimpleNamespace:
             energy += potential.energy(m, to)
         wp.atomic_add(totals, s, wp.vec2d(total, energy))
 
-    merge = _merging(f, module) if f.weight is not None else {}
+    merge = _merge_kernel(f, module) if f.weight is not None else {}
     return SimpleNamespace(module=module, jacobian=jacobian, **merge)
 
 
-def _merging(f: KernelFunctions, module: "wp.Module") -> dict[str, "wp.Kernel"]:
+def _merge_kernel(f: KernelFunctions, module: "wp.Module") -> dict[str, "wp.Kernel"]:
     """Kernels that merge the rest shapes of a term into records (Eq. 8), where it has weights for them."""
     c, potential = _common(f), f.potential
     corners, edge_vectors, record, sums = c.corners, c.edge_vectors, potential.record, potential.sums
@@ -391,18 +391,18 @@ def _merging(f: KernelFunctions, module: "wp.Module") -> dict[str, "wp.Kernel"]:
         left = real(0.0)
         for k in range(i - s * threads, elements.shape[0], threads):
             q = elements[place(k, 0)]
-            found = sums()
+            moments_sum = sums()
             usual = real(0.0)
             for r in range(s * n_shapes, (s + 1) * n_shapes):
                 e = edge_vectors(x, r * n_vertices, q)
-                found += contribution(e, pulls[r], mean_of(whole, r, elements.shape[0]))
+                moments_sum += contribution(e, pulls[r], mean_of(whole, r, elements.shape[0]))
                 if relative > 0:
                     usual += pulls[r] * fullness(e, altitude)
             factor = stiffness[place(s * n_stiffness, wp.min(k, n_stiffness - 1))]
             if start:
                 factor *= softness(fullness(edge_vectors(start, s * n_vertices, q), altitude), usual, relative)
-            to = potential.merged(found, factor)
-            left += potential.left(found, factor, to)
+            to = potential.merge_rests(moments_sum, factor)
+            left += potential.left(moments_sum, factor, to)
             out[place(s * elements.shape[0], k)] = to
         wp.atomic_add(constant, s, left)
 
@@ -416,24 +416,24 @@ def _merging(f: KernelFunctions, module: "wp.Module") -> dict[str, "wp.Kernel"]:
         """All measures together."""
         i = wp.tid()
         s = i // threads
-        found = real(0.0)
+        moments_sum = real(0.0)
         for k in range(i - s * threads, elements.shape[0], threads):
-            found += f.measure(edge_vectors(x, s * n_vertices, elements[place(k, 0)]))
-        wp.atomic_add(out, s, found)
+            moments_sum += f.measure(edge_vectors(x, s * n_vertices, elements[place(k, 0)]))
+        wp.atomic_add(out, s, moments_sum)
 
     return {"merge": merge, "total": total}
 
 
-def _merging_back(f: KernelFunctions, module: "wp.Module") -> "wp.Kernel":
+def _merge_back_kernel(f: KernelFunctions, module: "wp.Module") -> "wp.Kernel":
     """The adjoint of ``merge``."""
     c, potential = _common(f), f.potential
     corners, edge_vectors, add, sums = c.corners, c.edge_vectors, c.add, potential.sums
     fullness, softness, contribution, mean_of = c.fullness, c.softness, c.contribution, c.mean_of
-    packed, row, weight_of = potential.packed, potential.row, f.weight
+    pack, row, weight_of = potential.pack, potential.row, f.weight
 
     @wp.func
     def of_record(m: sums, factor: real, received: row):
-        return wp.dot(packed(potential.merged(m, factor)), received)
+        return wp.dot(pack(potential.merge_rests(m, factor)), received)
 
     @wp.func
     def of_measure(m: potential.kind, pull: real, received: sums):
@@ -451,25 +451,25 @@ def _merging_back(f: KernelFunctions, module: "wp.Module") -> "wp.Kernel":
         s = i // threads
         for k in range(i - s * threads, elements.shape[0], threads):
             q = elements[place(k, 0)]
-            found = sums()
+            moments_sum = sums()
             usual = real(0.0)
             for r in range(s * n_shapes, (s + 1) * n_shapes):
                 e = edge_vectors(x, r * n_vertices, q)
-                found += contribution(e, pulls[r], mean_of(whole, r, elements.shape[0]))
+                moments_sum += contribution(e, pulls[r], mean_of(whole, r, elements.shape[0]))
                 if relative > 0:
                     usual += pulls[r] * fullness(e, altitude)
             at = place(s * n_stiffness, wp.min(k, n_stiffness - 1))
-            own = real(1.0)
+            at_start = real(1.0)
             soft = real(1.0)
             if start:
-                own = fullness(edge_vectors(start, s * n_vertices, q), altitude)
-                soft = softness(own, usual, relative)
+                at_start = fullness(edge_vectors(start, s * n_vertices, q), altitude)
+                soft = softness(at_start, usual, relative)
             received = to_out[place(s * elements.shape[0], k)]
-            to_sums, to_factor, _0 = wp.grad(of_record)(found, soft * stiffness[at], received)
+            to_sums, to_factor, _0 = wp.grad(of_record)(moments_sum, soft * stiffness[at], received)
             wp.atomic_add(to_stiffness, at, soft * to_factor)
             to_usual = real(0.0)
             if start:
-                to_own, to_usual, _1 = wp.grad(softness)(own, usual, relative)
+                to_own, to_usual, _1 = wp.grad(softness)(at_start, usual, relative)
                 to_own *= stiffness[at] * to_factor
                 to_usual *= stiffness[at] * to_factor
                 if to_own != real(0.0):  # few elements are softened
@@ -477,7 +477,7 @@ def _merging_back(f: KernelFunctions, module: "wp.Module") -> "wp.Kernel":
                     add(to_start, s * n_vertices, q, to_own * to_start_e)
             for r in range(s * n_shapes, (s + 1) * n_shapes):
                 e = edge_vectors(x, r * n_vertices, q)
-                m, g = f.linearised(e)
+                m, g = f.linearise(e)
                 mean = mean_of(whole, r, elements.shape[0])
                 weight = f.weight(e, m, mean)
                 to_m, to_weight, _3 = wp.grad(of_measure)(m, pulls[r] * weight, to_sums)
@@ -500,7 +500,7 @@ def backward(f: KernelFunctions) -> SimpleNamespace:
     """Adjoints, and second derivatives."""
     c, potential, module, n = _common(f), f.potential, _module(f, "backward"), f.n
     vectors, corners, edge_vectors, add, inner = c.vectors, c.corners, c.edge_vectors, c.add, c.inner
-    stiffness, record, packed, row = c.stiffness, potential.record, potential.packed, potential.row
+    stiffness, record, pack, row = c.stiffness, potential.record, potential.pack, potential.row
     kind, slope_of = potential.kind, potential.slope
 
     @wp.func
@@ -513,16 +513,16 @@ def backward(f: KernelFunctions) -> SimpleNamespace:
     @wp.func
     def of_gradient(e: vectors, received: vectors):
         """The gradient of the measure along a direction: its own gradient is a product with a Hessian."""
-        _m, g = f.linearised(e)
+        _m, g = f.linearise(e)
         return inner(g, received)
 
-    turned = f.turned
-    if turned is None:
+    hessian_product = f.hessian_product
+    if hessian_product is None:
 
         @wp.func
-        def turned(e: vectors, received: vectors):
-            found, _unused = wp.grad(of_gradient)(e, received)
-            return found
+        def hessian_product(e: vectors, received: vectors):
+            product, _unused = wp.grad(of_gradient)(e, received)
+            return product
 
     @wp.kernel(module=module)
     def linearise(
@@ -544,7 +544,7 @@ def backward(f: KernelFunctions) -> SimpleNamespace:
             to = rests[at]
             e = edge_vectors(x, v, q)
             d = edge_vectors(to_gradient, v, q)
-            m, g = f.linearised(e)
+            m, g = f.linearise(e)
             slope = potential.slope(m, to)
             to_g = slope * d
             to_along = real(0.0)
@@ -554,15 +554,15 @@ def backward(f: KernelFunctions) -> SimpleNamespace:
                 first = vec3()
                 for j in range(wp.static(n)):
                     first += g[j]
-                own = to_diagonal[place(v, q[0])]
-                of_first = from_square(own, first)
+                received_diagonal = to_diagonal[place(v, q[0])]
+                of_first = from_square(received_diagonal, first)
                 to_along += HALF * wp.dot(of_first, first)
-                to_across += own[0] + own[3] + own[5]
+                to_across += received_diagonal[0] + received_diagonal[3] + received_diagonal[5]
                 for j in range(wp.static(n)):
-                    own = to_diagonal[place(v, q[j + 1])]
-                    of_own = from_square(own, g[j])
+                    received_diagonal = to_diagonal[place(v, q[j + 1])]
+                    of_own = from_square(received_diagonal, g[j])
                     to_along += HALF * wp.dot(of_own, g[j])
-                    to_across += own[0] + own[3] + own[5]
+                    to_across += received_diagonal[0] + received_diagonal[3] + received_diagonal[5]
                     to_g[j] = to_g[j] + along * (of_first + of_own)
                 both = vectors()
                 for p in range(n_products):
@@ -578,9 +578,9 @@ def backward(f: KernelFunctions) -> SimpleNamespace:
             if to_total:
                 to_energy = to_total[s]
             to_m, received, _0, _1, _2, _3 = wp.grad(of_measure)(m, to, to_energy, inner(g, d), to_along, to_across)
-            to_e = turned(e, to_g) + potential.rate(m, to_m) * g
+            to_e = hessian_product(e, to_g) + potential.rate(m, to_m) * g
             add(to_x, v, q, to_e)
-            to_rests[at] = to_rests[at] + packed(received)
+            to_rests[at] = to_rests[at] + pack(received)
 
     @wp.kernel(module=module)
     def hessians(
@@ -595,16 +595,16 @@ def backward(f: KernelFunctions) -> SimpleNamespace:
             at = place(s * elements.shape[0], k)
             to = rests[at]
             e = edge_vectors(x, s * n_vertices, q)
-            m, g = f.linearised(e)
+            m, g = f.linearise(e)
             slope = potential.slope(m, to)
             to_m, _0 = wp.grad(slope_of)(m, to)
             beyond = potential.rate(m, to_m) - real(2.0) * to.weight
             for j in range(3 * n):
                 unit = vectors()
                 unit[j // 3, j % 3] = slope
-                out[place(3 * n * at, j)] = turned(e, unit) + (beyond * g[j // 3, j % 3]) * g
+                out[place(3 * n * at, j)] = hessian_product(e, unit) + (beyond * g[j // 3, j % 3]) * g
 
-    merge = _merging_back(f, module) if f.weight is not None else None
+    merge = _merge_back_kernel(f, module) if f.weight is not None else None
     return SimpleNamespace(module=module, linearise=linearise, hessians=hessians, merge=merge)
 
 

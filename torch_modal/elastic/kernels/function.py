@@ -10,11 +10,11 @@ from torch_modal.autograd import applied, flattened, pushed, recorded, traced
 
 
 class Operation(Protocol):
-    """A function of float64 tensors by kernels. The first dimension of all is that of the samples."""
+    """A function of float64 tensors by kernels. The first dimension of all tensors counts the samples."""
 
     n_results: int
     n_differentiable: int
-    """How many of the results have gradients; they come first."""
+    """Number of results with gradients; they come first."""
 
     @property
     def run(self) -> Callable[..., tuple[Tensor, ...]]:
@@ -26,55 +26,55 @@ class Operation(Protocol):
 
     @property
     def by_torch(self) -> Callable[..., tuple[Tensor, ...]]:
-        """The same results by torch: for forward mode, second derivatives, and tensors without data."""
+        """Results by torch instead of kernels: for forward mode, second derivatives, and tensors without data."""
 
 
-def fused(operation: Operation, *given: Tensor) -> tuple[Tensor, ...]:
+def run_operation(operation: Operation, *tensors: Tensor) -> tuple[Tensor, ...]:
     """The results of an operation, of tensors of any dtype."""
-    given = tuple(x.double() for x in given)
-    if any(map(traced, given)):
-        return operation.by_torch(*given)
-    keep = torch.is_grad_enabled() and any(x.requires_grad for x in given)
-    return tuple(applied(_Fused, operation, [] if keep else None, *given))
+    tensors = tuple(x.double() for x in tensors)
+    if any(map(traced, tensors)):
+        return operation.by_torch(*tensors)
+    keep = torch.is_grad_enabled() and any(x.requires_grad for x in tensors)
+    return tuple(applied(_Fused, operation, [] if keep else None, *tensors))
 
 
-def by_torch(operation: Operation, *given: Tensor) -> tuple[Tensor, ...]:
-    """Likewise, without kernels."""
-    return operation.by_torch(*(x.double() for x in given))
+def run_by_torch(operation: Operation, *tensors: Tensor) -> tuple[Tensor, ...]:
+    """The results of an operation by torch, without kernels."""
+    return operation.by_torch(*(x.double() for x in tensors))
 
 
 class _Fused(torch.autograd.Function):
     @staticmethod
-    def forward(operation: Operation, kept: list[Any] | None, *given: Tensor) -> tuple[Tensor, ...]:
-        return operation.run(kept, *(x.detach().contiguous() for x in given))
+    def forward(operation: Operation, kept: list[Any] | None, *tensors: Tensor) -> tuple[Tensor, ...]:
+        return operation.run(kept, *(x.detach().contiguous() for x in tensors))
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
-        ctx.operation, ctx.kept, *given = inputs
+        ctx.operation, ctx.kept, *tensors = inputs
         ctx.mark_non_differentiable(*output[ctx.operation.n_differentiable :])
-        ctx.save_for_backward(*given)
-        ctx.save_for_forward(*given)
+        ctx.save_for_backward(*tensors)
+        ctx.save_for_forward(*tensors)
 
     @staticmethod
     def jvp(ctx: Any, *tangents: Tensor | None) -> tuple[Tensor | None, ...]:
-        n, by_torch = ctx.operation.n_differentiable, ctx.operation.by_torch
-        found = pushed(lambda *given: by_torch(*given)[:n], ctx.saved_tensors, tangents[2:])
-        return *found, *[None] * (ctx.operation.n_results - n)
+        n, run_by_torch = ctx.operation.n_differentiable, ctx.operation.by_torch
+        results = pushed(lambda *tensors: run_by_torch(*tensors)[:n], ctx.saved_tensors, tangents[2:])
+        return *results, *[None] * (ctx.operation.n_results - n)
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        operation, given = ctx.operation, ctx.saved_tensors
-        if recorded(*grads, *given):
-            found = torch.func.vjp(operation.by_torch, *given)[1](grads)
+        operation, tensors = ctx.operation, ctx.saved_tensors
+        if recorded(*grads, *tensors):
+            gradients = torch.func.vjp(operation.by_torch, *tensors)[1](grads)
         else:
-            own = [x.detach().contiguous() for x in given]
-            found = operation.back(ctx.kept or [], [x.contiguous() for x in grads], *own)
-        return None, None, *found
+            detached = [x.detach().contiguous() for x in tensors]
+            gradients = operation.back(ctx.kept or [], [x.contiguous() for x in grads], *detached)
+        return None, None, *gradients
 
     @staticmethod
     def vmap(
-        info: Any, in_dims: tuple[Any, ...], operation: Operation, kept: list[Any] | None, *given: Tensor
+        info: Any, in_dims: tuple[Any, ...], operation: Operation, kept: list[Any] | None, *tensors: Tensor
     ) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
-        flat = flattened(info.batch_size, in_dims[2:], given)
-        found = _Fused.apply(operation, None if kept is None else [], *flat)
-        return tuple(x.unflatten(0, (info.batch_size, -1)) for x in found), (0,) * len(found)
+        flat = flattened(info.batch_size, in_dims[2:], tensors)
+        results = _Fused.apply(operation, None if kept is None else [], *flat)
+        return tuple(x.unflatten(0, (info.batch_size, -1)) for x in results), (0,) * len(results)

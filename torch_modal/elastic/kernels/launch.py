@@ -43,29 +43,29 @@ def kernels(name: Module) -> Any:
     return importlib.import_module(f"{PACKAGE}.{name}")
 
 
-def made(make: Callable[..., Any], *given: Any) -> Any:
-    """Kernels of one module that a function makes, compiled likewise; by one thread for all."""
-    key = make, *given
+def make_once(make: Callable[..., Any], *arguments: Any) -> Any:
+    """Kernels of one module that a function makes, compiled likewise, once for all threads."""
+    key = make, *arguments
     if key not in _MADE:
         with _LOADING:
             if key not in _MADE:
-                _MADE[key] = make(*given)
+                _MADE[key] = make(*arguments)
     return _MADE[key]
 
 
-def of_elements(part: Literal["convex", "forward", "backward", "curving"], *given: Any) -> Any:
+def of_elements(kind: Literal["convex", "forward", "backward", "curving"], *arguments: Any) -> Any:
     """Kernels of a module that one or two terms have, or elements of so many edge vectors."""
-    return made(getattr(importlib.import_module(f"{PACKAGE}.elements"), part), *given)
+    return make_once(getattr(importlib.import_module(f"{PACKAGE}.elements"), kind), *arguments)
 
 
 def load_kernels() -> None:
-    """Load those of in-betweens without gradients for the CPU, so that nobody waits for it later."""
+    """Load the kernels of in-betweens without gradients for the CPU, so that the first call does not wait for them."""
     with _LOADING:
         elements, *_ = (importlib.import_module(f"{PACKAGE}.{name}") for name in ("elements", *IN_BETWEENS))
-        own = bend.kernel_functions(), stretch.kernel_functions()
-        for functions in (*own, volume.kernel_functions()):
+        shell_functions = bend.kernel_functions(), stretch.kernel_functions()
+        for functions in (*shell_functions, volume.kernel_functions()):
             elements.forward(functions)
-        elements.convex(*own)
+        elements.convex(*shell_functions)
         volume.kernels()
         importlib.import_module("torch_modal.elastic.distortion").kernels()
         _load(PACKAGE, torch.device("cpu"))
@@ -140,15 +140,15 @@ class Constants:
         if device not in self._made:
             import warp as wp
 
-            made = getattr(importlib.import_module(f"{PACKAGE}.{self.module}"), self.struct)()
+            struct = getattr(importlib.import_module(f"{PACKAGE}.{self.module}"), self.struct)()
             for name, value in self.values.items():
                 if isinstance(value, Tensor):
                     entry: Any = wp.dtype_from_torch(value.dtype)
                     entry = wp.types.vector(length=value.shape[1], dtype=entry) if value.dim() == 2 else entry
-                    setattr(made, name, wp.array(value.numpy(), dtype=entry, device=wp.device_from_torch(device)))
+                    setattr(struct, name, wp.array(value.numpy(), dtype=entry, device=wp.device_from_torch(device)))
                 else:
-                    setattr(made, name, value)
-            return self._made.setdefault(device, made)  # one for all threads: a struct owns its arrays
+                    setattr(struct, name, value)
+            return self._made.setdefault(device, struct)  # one for all threads: a struct owns its arrays
         return self._made[device]
 
     def __getstate__(self) -> dict[str, Any]:
@@ -161,7 +161,7 @@ class Entry(NamedTuple):
     width: int
     """Numbers in each."""
     dtype: torch.dtype
-    """Of the numbers."""
+    """Type of the numbers."""
     n_bytes: int
 
 
@@ -170,23 +170,23 @@ def _entries(kernel: Any) -> list[Entry | None]:
     """Entries of each argument that is an array; None for others."""
     import warp as wp
 
-    found: list[Entry | None] = []
+    entries: list[Entry | None] = []
     for argument in inspect.get_annotations(kernel.func).values():
         if not wp.types.is_array(argument):
-            found.append(None)
+            entries.append(None)
         elif wp.types.type_is_struct(argument.dtype):  # structs in arrays are of float64 alone
             n_bytes = wp.types.type_size_in_bytes(argument.dtype)
-            found.append(Entry(n_bytes // 8, torch.float64, n_bytes))
+            entries.append(Entry(n_bytes // 8, torch.float64, n_bytes))
         else:
             sample = wp.to_torch(wp.empty(1, dtype=argument.dtype, device="cpu"))
-            found.append(Entry(sample.numel(), sample.dtype, sample.numel() * sample.element_size()))
-    return found
+            entries.append(Entry(sample.numel(), sample.dtype, sample.numel() * sample.element_size()))
+    return entries
 
 
 def launch(
     kernel: Any,
     dim: tuple[int, ...],
-    given: Sequence[Any],
+    arguments: Sequence[Any],
     adjoints: Sequence[Any] = (),
 ) -> None:
     """Run a kernel, or its adjoint, on the tensors' device and torch's stream.
@@ -195,7 +195,7 @@ def launch(
         kernel: Of :func:`kernels`.
         dim: Number of samples; and of what each has, where a sample may have several threads, whose number is then the
             kernel's last argument. Each takes the first of what is left, then every so many-th. On a CPU there is one.
-        given: Its arguments but for that: :class:`Constants`, contiguous tensors, None for no array, and numbers.
+        arguments: Its arguments but for that: :class:`Constants`, contiguous tensors, None for no array, and numbers.
         adjoints: Gradients of each, where the adjoint is wanted; None for what has none.
 
     Raises:
@@ -204,18 +204,18 @@ def launch(
     """
     if 0 in dim:
         return
-    device = next(x.device for x in given if isinstance(x, Tensor))
+    device = next(x.device for x in arguments if isinstance(x, Tensor))
     n_threads = dim[0]
     if len(dim) == 2:
-        given = [*given, 1 if device.type == "cpu" else dim[1]]
-        n_threads *= given[-1]
+        arguments = [*arguments, 1 if device.type == "cpu" else dim[1]]
+        n_threads *= arguments[-1]
     if n_threads > MOST_ENTRIES:
         raise ValueError(f"{n_threads} threads are more than a kernel counts, {MOST_ENTRIES}: pass fewer samples")
     key = kernel, device, len(adjoints) > 0
     command = _COMMANDS.known.get(key)
     if command is None:
-        command = _COMMANDS.known[key] = _Command(*key, given)
-    command(n_threads, given, adjoints)
+        command = _COMMANDS.known[key] = _Command(*key, arguments)
+    command(n_threads, arguments, adjoints)
 
 
 class _Command:
@@ -224,12 +224,12 @@ class _Command:
     Its descriptions of arrays are written anew each time: they do not hold the tensors.
     """
 
-    def __init__(self, kernel: Any, device: torch.device, back: bool, given: Sequence[Any]) -> None:
+    def __init__(self, kernel: Any, device: torch.device, back: bool, arguments: Sequence[Any]) -> None:
         import warp as wp
 
         _load(kernel.module, device)
         self.device, self.n_threads, entries = device, 1, _entries(kernel)
-        pairs = list(zip(entries, given, strict=True))
+        pairs = list(zip(entries, arguments, strict=True))
         self.others = {i: x for i, (entry, x) in enumerate(pairs) if entry is None}
         self.arrays = [
             [(i, array := wp.from_torch(torch.zeros(1), return_ctype=True), array.shape, *entry[:2])
@@ -239,9 +239,9 @@ class _Command:
         for i, array, *_ in chain(*self.arrays):
             entry: Any = entries[i]
             array.data, array.strides[0] = 0, entry.n_bytes
-        plain = [x.on(device) if isinstance(x, Constants) else x for x in given]
+        values = [x.on(device) if isinstance(x, Constants) else x for x in arguments]
         first, *adjoint = (
-            [dict((i, a) for i, a, *_ in own).get(i, x) for i, x in enumerate(plain)] for own in self.arrays
+            [dict((i, a) for i, a, *_ in own).get(i, x) for i, x in enumerate(values)] for own in self.arrays
         )
         own = wp.device_from_torch(device)
         self.recorded = wp.launch(
@@ -251,9 +251,9 @@ class _Command:
             for i, array, *_ in arrays:
                 self.recorded.set_param_at_index_from_ctype(i, array, adjoint=number > 0)
 
-    def __call__(self, n_threads: int, given: Sequence[Any], adjoints: Sequence[Any]) -> None:
+    def __call__(self, n_threads: int, arguments: Sequence[Any], adjoints: Sequence[Any]) -> None:
         for i, before in self.others.items():
-            x = given[i]
+            x = arguments[i]
             if x is before:
                 continue
             self.others[i] = x
@@ -261,7 +261,7 @@ class _Command:
                 self.recorded.set_param_at_index(i, x.on(self.device))
             else:
                 self.recorded.set_param_at_index_from_ctype(i, x)
-        for arrays, tensors in zip(self.arrays, (given, adjoints), strict=False):
+        for arrays, tensors in zip(self.arrays, (arguments, adjoints), strict=False):
             for i, array, shape, width, dtype in arrays:
                 x = tensors[i] if i < len(tensors) else None  # not all have an adjoint
                 if x is None:

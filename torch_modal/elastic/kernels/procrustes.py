@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from torch_modal.elastic.kernels.rotations import about, half_turn, quaternion
+from torch_modal.elastic.kernels.rotations import about, half_rotation, quaternion
 from torch_modal.elastic.kernels.types import HALF, TINIEST, real, vec3
 
 EPSILON = wp.constant(real(64 * 2.0**-52))
@@ -45,5 +45,5 @@ def mean_pose(
     turns[2 * s] = first
     turns[2 * s + 1] = first @ onto
     q = quaternion(back)
-    half = half_turn(wp.where(q[0] < real(0.0), -q, q))
+    half = half_rotation(wp.where(q[0] < real(0.0), -q, q))
     pose[s] = wp.quat_to_matrix(about(w[1] * half)) @ wp.transpose(first)

@@ -1,4 +1,4 @@
-"""A step of BFGS of each sample: :func:`torch_modal.elastic.minimise.updated` in one pass."""
+"""A step of BFGS of each sample: :func:`torch_modal.elastic.minimise.bfgs_update` in one pass."""
 
 import warp as wp
 
@@ -18,9 +18,9 @@ def update(
     square = real(0.0)
     for i in range(n):
         square += slope[place(v, i)] * slope[place(v, i)]
-    own = wp.sqrt(square)
+    size_of_slope = wp.sqrt(square)
     bound = energy[s] * slack
-    if own < norm[s]:
+    if size_of_slope < norm[s]:
         bound += rounding[s] * wp.sqrt(wp.max(energy[s], real(0.0)))
     if length[s] > real(0.0) and value[s] <= bound:
         curvature = real(0.0)
@@ -52,10 +52,10 @@ def update(
                 at = place(row, i)
                 inverse[at] = inverse[at] - (scaled * pushed[place(v, i)] + other * slope[place(v, i)])
         energy[s] = value[s]
-        norm[s] = own
+        norm[s] = size_of_slope
         n_steps[s] = n_steps[s] + wp.int64(1)
         length[s] = real(1.0)
-        if own <= goal[s]:
+        if size_of_slope <= goal[s]:
             length[s] = real(0.0)
     elif length[s] > shortest:
         length[s] = HALF * length[s]

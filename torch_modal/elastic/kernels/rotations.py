@@ -7,8 +7,8 @@ import warp as wp
 from torch_modal.elastic.kernels.types import HALF, TINIEST, TINY, length_of, place, real, vec3, vec4
 from torch_modal.geometry import rotations, triangle_frames
 
-packed_turn = wp.types.matrix(shape=(4, 3), dtype=real)
-"""Both axes of the frame of a triangle in the first shape, and the entries of its stretch in both."""
+packed_rotation = wp.types.matrix(shape=(4, 3), dtype=real)
+"""Axes of the frame of a triangle in the first shape, and the entries of its stretch in two shapes."""
 packed_trajectory = wp.types.matrix(shape=(10, 3), dtype=real)
 """The frame and the stretch of a ``Trajectory``; turn and growth of its step, of its first and of its last part."""
 
@@ -39,7 +39,7 @@ class FaceTables:
 
 
 @wp.func
-def half_turn(q: vec4):
+def half_rotation(q: vec4):
     """Axis times half the angle: rotations.arc. The axis of a triangle that is a point is zero, of either sign."""
     axis = vec3(q[1], q[2], q[3])
     sine = wp.dot(axis, axis)
@@ -147,9 +147,9 @@ def sides(e1: vec3, e2: vec3, stretch: vec3):
 @wp.kernel(enable_backward=False)
 def turns(
     surface: FaceTables, x: wp.array[vec3], quaternions: wp.array[vec4], areas: wp.array[real],
-    found: wp.array[packed_turn], threads: int,
+    packed: wp.array[packed_rotation], threads: int,
 ):  # fmt: skip
-    """Quaternions between the frames of two shapes, twice both areas, and the other inputs of :func:`part_turned`."""
+    """Quaternions between the frames of two shapes, twice both areas, and inputs of :func:`right_hand_side`."""
     i = wp.tid()
     s = i // threads
     v = 2 * s * surface.n_vertices
@@ -159,7 +159,7 @@ def turns(
         at = place(s * surface.faces.shape[0], k)
         quaternions[at] = quaternion(wp.transpose(b) @ a)
         areas[at] = doubled_area(here) + doubled_area(there)
-        found[at] = wp.matrix_from_rows(a[0], a[1], here, there)
+        packed[at] = wp.matrix_from_rows(a[0], a[1], here, there)
 
 
 @wp.kernel(enable_backward=False)
@@ -174,20 +174,20 @@ def sign_votes(
         k = surface.order[place(j, 0)]
         at = place(s * n, k)
         above = place(s * n, surface.parent[place(k, 0)])
-        own = wp.where(wp.dot(quaternions[at], quaternions[above]) < real(0.0), -sign[above], sign[above])
-        sign[at] = own
+        sign_here = wp.where(wp.dot(quaternions[at], quaternions[above]) < real(0.0), -sign[above], sign[above])
+        sign[at] = sign_here
         p = place(s * surface.n_pieces, surface.piece[place(k, 0)])
-        wp.atomic_add(vote, p, areas[at] * own * quaternions[at][0])
+        wp.atomic_add(vote, p, areas[at] * sign_here * quaternions[at][0])
     for k in range(n):
         if vote[place(s * surface.n_pieces, surface.piece[place(k, 0)])] < real(0.0):
             sign[place(s * n, k)] = -sign[place(s * n, k)]
 
 
 @wp.func
-def pulls_between(at: packed_turn, half: vec3, w: wp.vec2d, c: vec3):
-    """Pulls of the sides of a triangle between two shapes on its corners, with stiffnesses of the sides."""
-    part = about(w[1] * half)
-    s = sides(wp.quat_rotate(part, at[0]), wp.quat_rotate(part, at[1]), w[0] * at[2] + w[1] * at[3])
+def corner_values(at: packed_rotation, half: vec3, w: wp.vec2d, c: vec3):
+    """Right-hand side at the corners of a triangle from its sides between two shapes, with stiffnesses of the sides."""
+    fraction = about(w[1] * half)
+    s = sides(wp.quat_rotate(fraction, at[0]), wp.quat_rotate(fraction, at[1]), w[0] * at[2] + w[1] * at[3])
     return wp.matrix_from_rows(c[2] * s[2] - c[0] * s[0], c[0] * s[0] - c[1] * s[1], c[1] * s[1] - c[2] * s[2])
 
 
@@ -199,25 +199,25 @@ def at_sides(surface: FaceTables, shares: wp.array[vec3], stiffness: wp.array[re
 
 
 @wp.func
-def pulled(at: packed_turn, half: vec3, w: wp.vec2d, stiffness: vec3, to: wp.mat33d):
-    return wp.ddot(pulls_between(at, half, w, stiffness), to)
+def work_of(at: packed_rotation, half: vec3, w: wp.vec2d, stiffness: vec3, to: wp.mat33d):
+    return wp.ddot(corner_values(at, half, w, stiffness), to)
 
 
 @wp.kernel(enable_backward=False)
-def part_turned(
-    surface: FaceTables, quaternions: wp.array[vec4], sign: wp.array[real], given: wp.array[packed_turn],
-    weights: wp.array[wp.vec2d], shares: wp.array[vec3], stiffness: wp.array[real], pulls: wp.array[vec3],
+def right_hand_side(
+    surface: FaceTables, quaternions: wp.array[vec4], sign: wp.array[real], between: wp.array[packed_rotation],
+    weights: wp.array[wp.vec2d], shares: wp.array[vec3], stiffness: wp.array[real], right: wp.array[vec3],
     threads: int,
 ):  # fmt: skip
-    """Pulls of the edge vectors between two shapes on their vertices, of turns whose signs are known."""
+    """Right-hand side of the Poisson system of the edge vectors between two shapes, from rotations with signs."""
     i = wp.tid()
     s = i // threads
     for k in range(i - s * threads, surface.faces.shape[0], threads):
         at = place(s * surface.faces.shape[0], k)
-        half = half_turn(sign[at] * quaternions[at])
-        found = pulls_between(given[at], half, weights[s], at_sides(surface, shares, stiffness, k))
+        half = half_rotation(sign[at] * quaternions[at])
+        values = corner_values(between[at], half, weights[s], at_sides(surface, shares, stiffness, k))
         for j in range(3):
-            wp.atomic_add(pulls, place(s * surface.n_vertices, surface.faces[place(k, 0)][j]), found[j])
+            wp.atomic_add(right, place(s * surface.n_vertices, surface.faces[place(k, 0)][j]), values[j])
 
 
 @wp.kernel(enable_backward=False)
@@ -235,10 +235,10 @@ def trajectory_edges(
     for k in range(i - s * threads, surface.faces.shape[0], threads):
         c = trajectory[place(which[s] * surface.faces.shape[0], k)]
         size = c[3]
-        turned = wp.quat_to_matrix(about((HALF * u) * c[4]) * about(HALF * (a * c[6] + b * c[8])))
-        axes = wp.transpose(turned) @ wp.matrix_from_rows(c[0], c[1], c[2])
-        found = sides(axes[0], axes[1], size + u * c[5] + a * c[7] + b * c[9])
+        rotation = wp.quat_to_matrix(about((HALF * u) * c[4]) * about(HALF * (a * c[6] + b * c[8])))
+        axes = wp.transpose(rotation) @ wp.matrix_from_rows(c[0], c[1], c[2])
+        edge_sides = sides(axes[0], axes[1], size + u * c[5] + a * c[7] + b * c[9])
         area = (real(1.0) - u) * doubled_area(size) + u * doubled_area(size + c[5])
         for j in range(3):
-            x = (area * surface.signs[place(k, 0)][j]) * found[j]
+            x = (area * surface.signs[place(k, 0)][j]) * edge_sides[j]
             wp.atomic_add(total, place(e, surface.sides[place(k, 0)][j]), vec4(x[0], x[1], x[2], area))

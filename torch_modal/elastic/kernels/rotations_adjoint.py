@@ -1,7 +1,7 @@
-"""Adjoints of kernels of rotations and poses, which Warp generates but for that of a triangle's frame.
+"""Adjoints of kernels of rotations and poses, which Warp generates, except for the frame of a triangle.
 
-A kernel that uses ``wp.grad`` must not have ``enable_backward=False``: what nested functions pass on would be lost. Its
-own adjoint, which Warp then warns of, nobody asks for.
+A kernel that uses ``wp.grad`` must not have ``enable_backward=False``: gradients of nested functions would be lost.
+Warp warns of its own adjoint, which is not used.
 """
 
 import warp as wp
@@ -11,11 +11,11 @@ from torch_modal.elastic.kernels.rotations import (
     FaceTables,
     at_sides,
     corners,
-    half_turn,
-    pulled,
+    half_rotation,
     quaternion,
     to_corners,
     triangle,
+    work_of,
 )
 from torch_modal.elastic.kernels.types import HALF, TINIEST, place, real, vec3
 
@@ -30,8 +30,8 @@ def gradients(first: wp.mat33d, second: wp.mat33d, sign: real, w: wp.vec2d, stif
     b, there = triangle(second)
     q = sign * quaternion(wp.transpose(b) @ a)
     at = wp.matrix_from_rows(a[0], a[1], here, there)
-    half = half_turn(q)
-    to_at, to_half, to_w, _stiffness, _to = wp.grad(pulled)(at, half, w, stiffness, to)
+    half = half_rotation(q)
+    to_at, to_half, to_w, _stiffness, _to = wp.grad(work_of)(at, half, w, stiffness, to)
     # By hand, as ``wp.grad`` takes the arc twice more.
     axis = vec3(q[1], q[2], q[3])
     square = wp.max(wp.dot(axis, axis), TINIEST)
@@ -41,17 +41,17 @@ def gradients(first: wp.mat33d, second: wp.mat33d, sign: real, w: wp.vec2d, stif
     # The torque on the rotation, and back in the first shape.
     torque = HALF * (q[0] * to_axis + along * axis + wp.cross(axis, to_axis))
     twice = real(2.0) * wp.cross(torque, axis)
-    own = wp.cross(a[0], to_at[0]) + wp.cross(a[1], to_at[1]) - torque - q[0] * twice + wp.cross(axis, twice)
-    return to_corners(a, here, own, to_at[2]), to_corners(b, there, torque, to_at[3]), to_w
+    torque_of_a = wp.cross(a[0], to_at[0]) + wp.cross(a[1], to_at[1]) - torque - q[0] * twice + wp.cross(axis, twice)
+    return to_corners(a, here, torque_of_a, to_at[2]), to_corners(b, there, torque, to_at[3]), to_w
 
 
 @wp.kernel
-def part_turned(
+def right_hand_side(
     surface: FaceTables, shapes: wp.array[vec3], weights: wp.array[wp.vec2d], sign: wp.array[real],
-    shares: wp.array[vec3], stiffness: wp.array[real], to_pulls: wp.array[vec3], to_shapes: wp.array[vec3],
+    shares: wp.array[vec3], stiffness: wp.array[real], to_right: wp.array[vec3], to_shapes: wp.array[vec3],
     to_weights: wp.array[wp.vec2d], threads: int,
 ):  # fmt: skip
-    """Adjoint of ``rotations.part_turned``: adds the gradients of both shapes and the weights."""
+    """Adjoint of ``rotations.right_hand_side``: adds the gradients of both shapes and the weights."""
     i = wp.tid()
     s = i // threads
     v = 2 * s * surface.n_vertices
@@ -59,10 +59,10 @@ def part_turned(
     for k in range(i - s * threads, surface.faces.shape[0], threads):
         a = corners(surface, shapes, v, k)
         b = corners(surface, shapes, v + surface.n_vertices, k)
-        to = corners(surface, to_pulls, s * surface.n_vertices, k)
-        own = sign[place(s * surface.faces.shape[0], k)]
+        to = corners(surface, to_right, s * surface.n_vertices, k)
+        sign_here = sign[place(s * surface.faces.shape[0], k)]
         sides = at_sides(surface, shares, stiffness, k)
-        first, second, to_own = gradients(a, b, own, weights[s], sides, to)
+        first, second, to_own = gradients(a, b, sign_here, weights[s], sides, to)
         to_w += to_own
         for j in range(3):
             f = place(v, surface.faces[place(k, 0)][j])

@@ -9,13 +9,13 @@ in the opposite order; for each product with ``H`` there is one more, with a fie
 import warp as wp
 
 from torch_modal.elastic import steps as relax
-from torch_modal.elastic.kernels.types import applied, place, real, symmetric, vec3
+from torch_modal.elastic.kernels.types import multiply, place, real, symmetric, vec3
 
 RIDGE = wp.constant(real(relax.RIDGE))
 
 
 @wp.func
-def inverted(m: symmetric):
+def invert(m: symmetric):
     trace = m[0] + m[3] + m[5]
     if trace <= real(0.0):
         trace = real(1.0)
@@ -35,16 +35,16 @@ def inverted(m: symmetric):
 @wp.func
 def quotient(a: real, b: real):
     # A sample that is solved exactly has nothing left: 0 / 0.
-    found = real(0.0)
+    result = real(0.0)
     if b > real(0.0):
-        found = a / b
-    return found
+        result = a / b
+    return result
 
 
 @wp.func
-def form_of(own: vec3, stiffness: real):
+def form_of(sums: vec3, stiffness: real):
     """The inner product of a direction with its product, with the volume's part."""
-    return own[2] + stiffness * own[1] * own[1]
+    return sums[2] + stiffness * sums[1] * sums[1]
 
 
 @wp.func
@@ -66,19 +66,19 @@ def begin(
     direction = row(1, 0, n_kept, n_samples, s, n)
     product = row(2, 0, n_kept, n_samples, s, n)
     push = moment[s]
-    found = vec3()
+    products = vec3()
     for k in range(i - s * threads, n, threads):
         v = place(s * n, k)
         r = -(gradient[v] + push * normal[v])
-        inverse = inverted(diagonal[v])
-        z = applied(inverse, r)
+        inverse = invert(diagonal[v])
+        z = multiply(inverse, r)
         diagonal[v] = inverse
         fields[place(residual, k)] = r
         fields[place(direction, k)] = z
         fields[place(product, k)] = vec3()
         solution[v] = vec3()
-        found += vec3(wp.dot(r, z), wp.dot(normal[v], z), real(0.0))
-    wp.atomic_add(scalars, s, found)
+        products += vec3(wp.dot(r, z), wp.dot(normal[v], z), real(0.0))
+    wp.atomic_add(scalars, s, products)
 
 
 @wp.kernel(enable_backward=False)
@@ -94,9 +94,9 @@ def advance(
     direction = row(1, m, n_kept, n_samples, s, n)
     product = row(2, m, n_kept, n_samples, s, n)
     following = row(0, m + 1, n_kept, n_samples, s, n)
-    own = scalars[m * n_samples + s]
-    push = stiffness[s] * own[1]
-    step = quotient(own[0], form_of(own, stiffness[s]))
+    sums = scalars[m * n_samples + s]
+    push = stiffness[s] * sums[1]
+    step = quotient(sums[0], form_of(sums, stiffness[s]))
     size = real(0.0)
     last = (m + 2) * n_samples == scalars.shape[0]
     for k in range(i - s * threads, n, threads):
@@ -105,7 +105,7 @@ def advance(
         if not last:
             r = fields[place(residual, k)] - step * (fields[place(product, k)] + push * normal[v])
             fields[place(following, k)] = r
-            size += wp.dot(r, applied(inverse[v], r))
+            size += wp.dot(r, multiply(inverse[v], r))
     wp.atomic_add(scalars, (m + 1) * n_samples + s, vec3(size, real(0.0), real(0.0)))
 
 
@@ -126,7 +126,7 @@ def turn(
     swept = real(0.0)
     for k in range(i - s * threads, n, threads):
         v = place(s * n, k)
-        d = applied(inverse[v], fields[place(residual, k)]) + ratio * fields[place(direction, k)]
+        d = multiply(inverse[v], fields[place(residual, k)]) + ratio * fields[place(direction, k)]
         fields[place(following, k)] = d
         fields[place(product, k)] = vec3()
         swept += wp.dot(normal[v], d)
@@ -135,14 +135,14 @@ def turn(
 
 # ----------------------------------------------------------------------------------------------------- and back again
 @wp.kernel(enable_backward=False)
-def inner(a: wp.array[vec3], b: wp.array[vec3], n: int, found: wp.array[vec3], threads: int):
+def inner(a: wp.array[vec3], b: wp.array[vec3], n: int, out: wp.array[vec3], threads: int):
     """Inner product of two fields, added to the first of three numbers."""
     i = wp.tid()
     s = i // threads
     total = real(0.0)
     for k in range(i - s * threads, n, threads):
         total += wp.dot(a[place(s * n, k)], b[place(s * n, k)])
-    wp.atomic_add(found, s, vec3(total, real(0.0), real(0.0)))
+    wp.atomic_add(out, s, vec3(total, real(0.0), real(0.0)))
 
 
 @wp.kernel(enable_backward=False)
@@ -172,13 +172,13 @@ def back_to_direction(
     swept = real(0.0)
     for k in range(i - s * threads, n, threads):
         v = place(s * n, k)
-        found = step * to_solution[v] + to_form * (fields[place(product, k)] + push * normal[v])
+        direction_gradient = step * to_solution[v] + to_form * (fields[place(product, k)] + push * normal[v])
         f = to_form * fields[place(direction, k)]
         if m + 1 < n_products:
-            found += ratio * to_direction[v]
+            direction_gradient += ratio * to_direction[v]
             f -= step * to_residual[v]
         pushed[place(at * n, k)] = f
-        to_direction[v] = found
+        to_direction[v] = direction_gradient
         swept += wp.dot(normal[v], f)
     wp.atomic_add(received, at, vec3(real(0.0), real(0.0), swept))
 
@@ -201,10 +201,10 @@ def back_to_normal(
     along = real(0.0)
     for k in range(i - s * threads, n, threads):
         v = place(s * n, k)
-        found = to_direction[v] + to_across * normal[v]
-        to_direction[v] = found
+        direction_gradient = to_direction[v] + to_across * normal[v]
+        to_direction[v] = direction_gradient
         to_normal[v] = to_normal[v] + across * pushed[place(at * n, k)] + to_across * fields[place(direction, k)]
-        along += wp.dot(found, fields[place(previous, k)])
+        along += wp.dot(direction_gradient, fields[place(previous, k)])
     if m > 0:
         wp.atomic_add(received, at, vec3(real(0.0), along, real(0.0)))
 
@@ -235,11 +235,11 @@ def back_to_residual(
     for k in range(i - s * threads, n, threads):
         v = place(s * n, k)
         c = inverse[v]
-        z = applied(c, fields[place(residual, k)])
-        w = applied(c, to_direction[v])
+        z = multiply(c, fields[place(residual, k)])
+        w = multiply(c, to_direction[v])
         u = w + to_size * z
-        found = to_residual[v] + u + to_size * z
-        to_residual[v] = found
+        residual_gradient = to_residual[v] + u + to_size * z
+        to_residual[v] = residual_gradient
         ridge = RIDGE * wp.dot(u, z)
         to_diagonal[v] = to_diagonal[v] - symmetric(
             u[0] * z[0] + ridge,
@@ -250,6 +250,6 @@ def back_to_residual(
             u[2] * z[2] + ridge,
         )
         along += wp.dot(to_solution[v], fields[place(direction, k)])
-        along -= wp.dot(found, fields[place(product, k)] + push * normal[v])
+        along -= wp.dot(residual_gradient, fields[place(product, k)] + push * normal[v])
     if m > 0:
         wp.atomic_add(received, at - n_samples, vec3(along, real(0.0), real(0.0)))

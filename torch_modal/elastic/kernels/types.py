@@ -37,7 +37,7 @@ def block(along: real, g: vec3, across: real):
 
 
 @wp.func
-def applied(m: symmetric, g: vec3):
+def multiply(m: symmetric, g: vec3):
     return vec3(
         m[0] * g[0] + m[1] * g[1] + m[2] * g[2],
         m[1] * g[0] + m[3] * g[1] + m[4] * g[2],
