@@ -184,8 +184,8 @@ def kernels() -> SimpleNamespace:
             for r in range(s * n_rests, (s + 1) * n_rests):
                 e = hinge_of(rests, r * n_vertices, q4)
                 phase = hinge.measure(e)
-                pull = weights[r] * wp.min(hinge.weight(e, phase, real(0.0)), largest_weight)
-                sums += potential.moments(phase, pull)
+                weight = weights[r] * wp.min(hinge.weight(e, phase, real(0.0)), largest_weight)
+                sums += potential.moments(phase, weight)
             factor = beta[place(s * n_beta, wp.min(k, n_beta - 1))]
             to = potential.merge_rests(sums, factor)
             left = potential.left(sums, factor, to)

@@ -108,8 +108,8 @@ class AssembledTerm(nn.Module):
         if start is not None:
             factor = self.term.softening(self.edge_vectors(start), edge_vectors, weights if relative else None)
             stiffness = stiffness if factor is None else factor * stiffness
-        pulls = weights[..., None] * self.term.weights(edge_vectors, measures).expand_as(measures)
-        return self.term.merge_rests(self.term.at_rest(measures), pulls, stiffness)
+        rest_weights = weights[..., None] * self.term.weights(edge_vectors, measures).expand_as(measures)
+        return self.term.merge_rests(self.term.at_rest(measures), rest_weights, stiffness)
 
     def on_elements(self, weights: Tensor) -> Tensor:
         """Weights of vertices on the elements: means of their corners. *Shape:* ``(..., V) -> (..., M or 1)``."""
@@ -245,10 +245,10 @@ class Energy(nn.Module):
             weights: They add up to one. *Shape:* ``(K, V)``.
         """
         measures, stiffness = [], []
-        for summand, values, pulls in zip(self.parts, rest.measures, rest.weights, strict=True):
-            element_weights, pulls = summand.on_elements(weights), pulls.expand_as(values)
-            measures.append((element_weights * summand.term.on_one_branch(values, pulls)).sum(-2))
-            stiffness.append((element_weights * pulls).sum(-2).clamp_min(0))
+        for summand, values, rest_weights in zip(self.parts, rest.measures, rest.weights, strict=True):
+            element_weights, rest_weights = summand.on_elements(weights), rest_weights.expand_as(values)
+            measures.append((element_weights * summand.term.on_one_branch(values, rest_weights)).sum(-2))
+            stiffness.append((element_weights * rest_weights).sum(-2).clamp_min(0))
         return Rest(tuple(measures), tuple(stiffness))
 
     def against(self, rest: Rest, stiffness: Sequence[float | Tensor]) -> Reference:

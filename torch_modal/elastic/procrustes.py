@@ -15,8 +15,8 @@ def mean_pose(to_reference: Tensor, among: Tensor, weights: Tensor) -> tuple[Ten
     """:func:`torch_modal.geometry.procrustes.mean_pose`; of two shapes by a kernel, in float64."""
     if weights.shape[1] != 2:
         return procrustes.mean_pose(to_reference, among, weights)
-    turns, pose = run_operation(_MeanPose(), to_reference, among, weights)
-    return turns.to(among), pose.to(among)
+    rotations, pose = run_operation(_MeanPose(), to_reference, among, weights)
+    return rotations.to(among), pose.to(among)
 
 
 class _MeanPose:
@@ -27,9 +27,9 @@ class _MeanPose:
 
     @staticmethod
     def run(kept: list[Any] | None, *tensors: Tensor) -> tuple[Tensor, ...]:
-        turns, pose = torch.empty_like(tensors[0]), torch.empty_like(tensors[0][:, 0])
-        launch(kernels("procrustes").mean_pose, (len(pose),), [*tensors, turns, pose])
-        return turns, pose
+        rotations, pose = torch.empty_like(tensors[0]), torch.empty_like(tensors[0][:, 0])
+        launch(kernels("procrustes").mean_pose, (len(pose),), [*tensors, rotations, pose])
+        return rotations, pose
 
     @staticmethod
     def back(kept: list[Any], grads: Sequence[Tensor], *tensors: Tensor) -> tuple[Tensor | None, ...]:

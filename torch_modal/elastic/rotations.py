@@ -91,13 +91,13 @@ class _RightHandSide:
     n_results = n_differentiable = 1
 
     def run(self, kept: list[Any] | None, shapes: Tensor, weights: Tensor) -> tuple[Tensor, ...]:
-        rotations, pulls = self.rotations, torch.zeros_like(shapes[:, 0])
+        rotations, right = self.rotations, torch.zeros_like(shapes[:, 0])
         quaternions, sign, frames = rotations.signed_quaternions(shapes)
-        args = [rotations.constants, quaternions, sign, frames, weights, *self._stiffness(), pulls]
+        args = [rotations.constants, quaternions, sign, frames, weights, *self._stiffness(), right]
         launch(kernels("rotations").right_hand_side, (len(shapes), len(rotations.faces)), args)
         if kept is not None:
             kept.append(sign)
-        return (pulls,)
+        return (right,)
 
     def back(self, kept: list[Any], grads: Sequence[Tensor], shapes: Tensor, weights: Tensor) -> tuple[Tensor, ...]:
         rotations, gradients = self.rotations, (torch.zeros_like(shapes), torch.zeros_like(weights))

@@ -63,9 +63,9 @@ class Potential(NamedTuple):
     sums: Any
     """The type of the sums over rest shapes."""
     moments: Any
-    """Sums over rest shapes are of these: measure, pull -> vector."""
+    """Summands of the sums over rest shapes: measure, weight -> vector."""
     merge_rests: Any
-    """From the sums, and a factor of the pulls, to the record."""
+    """From the sums, and a factor of the weights, to the record."""
     energy: Any
     """Measure, record -> energy, but for what is left at the record."""
     slope: Any
@@ -182,25 +182,25 @@ class Term(nn.Module):
         return measures - rest
 
     # ---------------------------------------------------------------- the square of the difference, and its derivatives
-    def merge_rests(self, measures: Tensor, pulls: Tensor, factor: float | Tensor = 1.0) -> tuple[Tensor, Tensor]:
+    def merge_rests(self, measures: Tensor, weights: Tensor, factor: float | Tensor = 1.0) -> tuple[Tensor, Tensor]:
         """K parabolas as one (Eq. 8).
 
         Weights below zero may outweigh the others: then there is no minimum, and no weight.
 
         Args:
             measures: Of K rest shapes. *Shape:* ``(..., K, M)``.
-            pulls: Their weights. *Shape:* ``(..., K, M)``.
-            factor: Of all pulls: the stiffness. *Shape:* ``(..., M)`` or ``(..., 1)``.
+            weights: Their weights. *Shape:* ``(..., K, M)``.
+            factor: Of all weights: the stiffness. *Shape:* ``(..., M)`` or ``(..., 1)``.
 
         Returns:
             The record of the rest shapes, weight and value, *shape* ``(..., 2, M)``; and the energy that remains,
             *shape* ``(..., M)``.
         """
-        whole = pulls.sum(-2)
-        shares = pulls * inverse(whole, whole <= 0)[..., None, :]
+        whole = weights.sum(-2)
+        shares = weights * inverse(whole, whole <= 0)[..., None, :]
         first = measures[..., 0, :]
         value = first + (shares * self.difference(measures, first[..., None, :])).sum(-2)
-        left = (pulls * self.difference(measures, value[..., None, :]) ** 2).sum(-2)
+        left = (weights * self.difference(measures, value[..., None, :]) ** 2).sum(-2)
         record = torch.broadcast_tensors(factor * torch.where(whole > 0, whole, 0), value)
         return torch.stack(record, -2), factor * left
 
@@ -226,7 +226,7 @@ class Term(nn.Module):
         """A second derivative that is never negative, and the correction to the true one, None where it is zero."""
         return 2 * record[..., 0, :].expand_as(measures), None
 
-    def on_one_branch(self, measures: Tensor, pulls: Tensor) -> Tensor:
+    def on_one_branch(self, measures: Tensor, weights: Tensor) -> Tensor:
         """The measures of K rest shapes, such that weighted sums make sense. *Shape:* ``(..., K, M)`` each."""
         return measures
 
@@ -304,16 +304,16 @@ class PeriodicTerm(Term):
     .. math:: f(d) = 2 (1 - \cos d) + \tfrac{1}{3} (1 - \cos d)^2 = \tfrac{5}{2} - \tfrac{8}{3} \cos d
         + \tfrac{1}{6} \cos 2d = d^2 + O(d^6)
 
-    It is 1.2 % below the square at 60 degrees, 5 % at 90, and has no pull at half a turn, where the square of the
+    It is 1.2 % below the square at 60 degrees, 5 % at 90, and no slope at half a turn, where the square of the
     wrapped difference jumps from one side to the other. It is a trigonometric polynomial of second order, so that its
     weighted sum over K rest angles follows exactly from six numbers, the rows of a record: the weight; cosine and sine
     of the mean angle; the sums of the phases along the mean, and of the phases of twice the angles along and across it.
     """
 
-    def merge_rests(self, measures: Tensor, pulls: Tensor, factor: float | Tensor = 1.0) -> tuple[Tensor, Tensor]:
+    def merge_rests(self, measures: Tensor, weights: Tensor, factor: float | Tensor = 1.0) -> tuple[Tensor, Tensor]:
         """K rest angles by their first two trigonometric moments; arguments as in the base class."""
         c, s = measures.cos(), measures.sin()
-        weight, *sums = ((pulls * moment).sum(-2) for moment in (torch.ones_like(c), c, s, c * c - s * s, 2 * c * s))
+        weight, *sums = ((weights * moment).sum(-2) for moment in (torch.ones_like(c), c, s, c * c - s * s, 2 * c * s))
         some = weight > 0
         weight, x, y, x2, y2 = (torch.where(some, moment, 0) for moment in (weight, *sums))
         squared = x * x + y * y
@@ -351,10 +351,10 @@ class PeriodicTerm(Term):
             return None
         return _of_angle(self._name(), n, self.kernel_measure, self.kernel_gradient)
 
-    def on_one_branch(self, measures: Tensor, pulls: Tensor) -> Tensor:
+    def on_one_branch(self, measures: Tensor, weights: Tensor) -> Tensor:
         """Bring angles within half a turn of their weighted mean. *Shape:* ``(..., K, M)`` each."""
         with torch.no_grad():
-            mean = torch.atan2((pulls * measures.sin()).sum(-2, True), (pulls * measures.cos()).sum(-2, True))
+            mean = torch.atan2((weights * measures.sin()).sum(-2, True), (weights * measures.cos()).sum(-2, True))
         return mean + wrap_angle(measures - mean)
 
 
@@ -393,8 +393,8 @@ def square() -> Potential:
         value: real
 
     @wp.func
-    def moments(q: real, pull: real):
-        return pull * vec3(real(1.0), q, q * q)
+    def moments(q: real, w: real):
+        return w * vec3(real(1.0), q, q * q)
 
     @wp.func
     def merge_rests(m: vec3, factor: real):
@@ -450,8 +450,8 @@ def periodic() -> Potential:
         across: real
 
     @wp.func
-    def moments(q: vec2, pull: real):
-        return pull * vec5(real(1.0), q[0], q[1], q[0] * q[0] - q[1] * q[1], real(2.0) * q[0] * q[1])
+    def moments(q: vec2, w: real):
+        return w * vec5(real(1.0), q[0], q[1], q[0] * q[0] - q[1] * q[1], real(2.0) * q[0] * q[1])
 
     @wp.func
     def merge_rests(m: vec5, factor: real):

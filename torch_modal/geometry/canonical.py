@@ -53,8 +53,8 @@ def placed(points: FloatArray, faces: IntArray) -> tuple[FloatArray, FloatArray,
     last = int(np.abs(skewness).argmin())
     axes[last] = np.cross(axes[last - 2], axes[last - 1])
     scale = CANONICAL_SIZE / length
-    turned = ((points - centre) * scale) @ axes.T
-    return np.round(turned / ROUNDING) * ROUNDING, axes, centre, scale
+    along_axes = ((points - centre) * scale) @ axes.T
+    return np.round(along_axes / ROUNDING) * ROUNDING, axes, centre, scale
 
 
 def in_order(points: FloatArray, faces: IntArray) -> tuple[IntArray, IntArray]:

@@ -37,12 +37,12 @@ class Clusters(nn.Module):
     roots: Tensor
     ancestors: Tensor
 
-    def __init__(self, turns: Tensor, areas: Tensor, ancestors: Tensor, piece: Tensor) -> None:
+    def __init__(self, quaternions: Tensor, areas: Tensor, ancestors: Tensor, piece: Tensor) -> None:
         super().__init__()
         # From the middle of each piece, so that as much turns one way as the other.
-        order = np.lexsort((_from_mean(turns, areas, ancestors, piece), piece))
+        order = np.lexsort((_from_mean(quaternions, areas, ancestors, piece), piece))
         middles = order[np.unique(piece[order], return_index=True)[1]]
-        cluster, roots, parent = _clusters(turns.movedim(-1, 0).numpy(), middles, ancestors[0].numpy())
+        cluster, roots, parent = _clusters(quaternions.movedim(-1, 0).numpy(), middles, ancestors[0].numpy())
         # One more cluster, which does not turn, is the parent of those without.
         generations = [np.append(parent, len(parent))]
         while (generations[-1] != len(parent)).any():
@@ -52,16 +52,16 @@ class Clusters(nn.Module):
         #: By 1, 2, 4, ... generations. *Shape:* ``(J, C + 1)``.
         self.register_buffer("ancestors", torch.from_numpy(np.stack(generations)), persistent=False)
 
-    def forward(self, turns: Tensor, weights: Tensor) -> Tensor:
+    def forward(self, quaternions: Tensor, weights: Tensor) -> Tensor:
         """The weighted means of K rotations. *Shape:* ``(4, B, K, F), (B, K, 1) -> (4, B, F)``."""
-        roots = pick(turns, self.roots)
+        roots = pick(quaternions, self.roots)
         still = torch.zeros_like(roots[..., :1])
         still[0] = 1
         roots = torch.cat([roots, still], -1)
         followed = mean(self._between(pick(roots, self.ancestors[0]), roots), weights)
         for ancestors in self.ancestors:
             followed = product(pick(followed, ancestors), followed)
-        relative = mean(self._between(pick(roots, self.cluster), turns), weights)
+        relative = mean(self._between(pick(roots, self.cluster), quaternions), weights)
         return product(pick(followed, self.cluster), relative)
 
     @staticmethod
@@ -71,16 +71,16 @@ class Clusters(nn.Module):
         return torch.where(between[0] < 0, -between, between)
 
 
-def beyond_a_turn(turns: Tensor, areas: Tensor, ancestors: Tensor, piece: Tensor) -> bool:
+def beyond_a_turn(quaternions: Tensor, areas: Tensor, ancestors: Tensor, piece: Tensor) -> bool:
     """True where parts of a piece turn by more than a full turn from each other. Arguments as for :class:`Clusters`."""
-    areas, off = areas.double(), _from_mean(turns, areas, ancestors, piece)
+    areas, off = areas.double(), _from_mean(quaternions, areas, ancestors, piece)
     beyond = torch.bincount(piece, areas * (off > BEYOND)) > PART_BEYOND * torch.bincount(piece, areas)
     return bool(beyond.any())
 
 
-def _from_mean(turns: Tensor, areas: Tensor, ancestors: Tensor, piece: Tensor) -> Tensor:
+def _from_mean(quaternions: Tensor, areas: Tensor, ancestors: Tensor, piece: Tensor) -> Tensor:
     """Largest angles, of any two shapes, from the mean of the piece, added up along the tree. *Shape:* ``(F,)``."""
-    step = product(conjugate(pick(turns, ancestors[0])), turns)
+    step = product(conjugate(pick(quaternions, ancestors[0])), quaternions)
     winding = 2 * arc(torch.where(step[0] < 0, -step, step))
     for generation in ancestors:
         winding = winding + pick(winding, generation)
@@ -91,7 +91,7 @@ def _from_mean(turns: Tensor, areas: Tensor, ancestors: Tensor, piece: Tensor) -
     return torch.stack(later).amax(0)
 
 
-def _clusters(turns: FloatArray, middles: IntArray, parents: IntArray) -> tuple[IntArray, IntArray, IntArray]:
+def _clusters(quaternions: FloatArray, middles: IntArray, parents: IntArray) -> tuple[IntArray, IntArray, IntArray]:
     """The cluster of each triangle, ``(F,)``; the root of each cluster, and its parent, C where none, ``(C,)`` each."""
     n = len(parents)
     order, before = traversal(np.arange(n), parents, middles, n)
@@ -100,7 +100,7 @@ def _clusters(turns: FloatArray, middles: IntArray, parents: IntArray) -> tuple[
     above: list[int] = []
     for f in order:
         cluster_of_f = -1 if before[f] == n else cluster[before[f]]
-        if cluster_of_f < 0 or _half_spread(turns[f], turns[roots[cluster_of_f]]) > WIDEST / 2:
+        if cluster_of_f < 0 or _half_spread(quaternions[f], quaternions[roots[cluster_of_f]]) > WIDEST / 2:
             above.append(cluster_of_f)
             cluster_of_f = len(roots)
             roots.append(f)

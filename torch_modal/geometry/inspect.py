@@ -56,13 +56,13 @@ def consistent_winding(mesh: Connectivity) -> tuple[IntArray, IntArray, IntArray
         return faces, np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
     pairs = np.stack([np.append(one, one + n_faces), np.append(two + crossed, two + n_faces - crossed)], axis=1)
     label = connected_pieces(pairs, 2 * n_faces)
-    as_is, turned = label[:n_faces], label[n_faces:]
-    non_orientable = as_is == turned
+    as_is, flipped = label[:n_faces], label[n_faces:]
+    non_orientable = as_is == flipped
 
     # Choose the copy with more unchanged faces; on a tie, the one with the first face.
     size = np.bincount(as_is, minlength=label.max() + 1)
-    fewer, equal = size[as_is] < size[turned], size[as_is] == size[turned]
-    flip = ~non_orientable & (fewer | (equal & (as_is > turned)))
+    fewer, equal = size[as_is] < size[flipped], size[as_is] == size[flipped]
+    flip = ~non_orientable & (fewer | (equal & (as_is > flipped)))
     repaired = np.where(flip[:, None], faces[:, ::-1], faces)
     return repaired, np.flatnonzero(flip), np.flatnonzero(non_orientable)
 

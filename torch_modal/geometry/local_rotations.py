@@ -95,11 +95,13 @@ class LocalRotations(nn.Module):
         self.clusters = Clusters(*wound) if beyond_a_turn(*wound) else None
         self._warn_of_tears(wound[0], mesh)
 
-    def _warn_of_tears(self, turns: Tensor, mesh: Connectivity) -> None:
+    def _warn_of_tears(self, quaternions: Tensor, mesh: Connectivity) -> None:
         """Warn where neighbours are a full turn apart with any tree. *Shape:* ``(4, K, F)``."""
         one, other = torch.tensor(mesh.face_neighbours).unbind(1)
-        turns = turns * LocalRotations.sign(self, turns.movedim(0, -1), self.areas.expand(turns.shape[1], -1))
-        torn = ((pick(turns, one) * pick(turns, other)).sum(0) < -cos(ALIKE / 2)).any(0)
+        quaternions = quaternions * LocalRotations.sign(
+            self, quaternions.movedim(0, -1), self.areas.expand(quaternions.shape[1], -1)
+        )
+        torn = ((pick(quaternions, one) * pick(quaternions, other)).sum(0) < -cos(ALIKE / 2)).any(0)
         if float((pick(self.areas, one) + pick(self.areas, other))[torn].sum()) > PART_TORN * float(self.areas.sum()):
             message = (
                 "around the mesh, key-frames turn by a full turn from each other, as a ring does that is twisted: no "
@@ -108,11 +110,11 @@ class LocalRotations(nn.Module):
             warnings.warn(message, MeshWarning, stacklevel=2)
 
     @staticmethod
-    def _tree(turns: Tensor, slenderness: Tensor, mesh: Connectivity) -> tuple[Tensor, Tensor]:
+    def _tree(quaternions: Tensor, slenderness: Tensor, mesh: Connectivity) -> tuple[Tensor, Tensor]:
         """The parent of each triangle, and its piece. *Shape:* ``(4, K, F), (F,) -> (F,)`` each."""
         one, other = torch.tensor(mesh.face_neighbours).unbind(1)
         # Between two shapes, neighbours turn by as much from each other as these rotations of the shapes do.
-        across = product(conjugate(pick(turns, one)), pick(turns, other))
+        across = product(conjugate(pick(quaternions, one)), pick(quaternions, other))
         pairs = ((x[:, None] * across[:, i:]).sum(0).abs() for i, x in enumerate(across.unbind(1)[:-1], 1))
         alike = reduce(torch.minimum, (cosines.amin(0) for cosines in pairs)).clamp_max(1)
         slenderness = torch.minimum(pick(slenderness, one), pick(slenderness, other))
@@ -137,31 +139,35 @@ class LocalRotations(nn.Module):
         # From one of two shapes: the way from a third to a triangle that collapses in one has no bounded gradient.
         start = frames_of(shapes[:, 0] if shapes.shape[1] == 2 else self.reference, self.faces)
         frames = Frames(*(x.unflatten(-2, weights.shape) for x in frames_of(shapes.flatten(0, 1), self.faces)))
-        turns = _quaternion_between(Frames(*(x[..., None, :] for x in start)), frames)
+        quaternions = _quaternion_between(Frames(*(x[..., None, :] for x in start)), frames)
         if self.clusters is None:
-            signs = self.sign(turns.detach().flatten(1, 2).movedim(0, -1), frames.doubled_areas.detach().flatten(0, 1))
+            signs = self.sign(
+                quaternions.detach().flatten(1, 2).movedim(0, -1), frames.doubled_areas.detach().flatten(0, 1)
+            )
             # A triangle that is a point has no frame and a quaternion of 0.5: with the other sign it would make a whole
             # turn, whose axis has no derivative.
-            signs = torch.where(turns.detach().square().sum(0) < 0.5, 1.0, signs.view(turns.shape[1:]))
-            turns = signs * turns
-            turn = mean(self._agree(turns.detach(), weights.detach()) * turns, weights[..., None])
+            signs = torch.where(quaternions.detach().square().sum(0) < 0.5, 1.0, signs.view(quaternions.shape[1:]))
+            quaternions = signs * quaternions
+            mean_quaternion = mean(
+                self._agree(quaternions.detach(), weights.detach()) * quaternions, weights[..., None]
+            )
         else:
-            turn = self.clusters(turns, weights[..., None])
+            mean_quaternion = self.clusters(quaternions, weights[..., None])
         xx, xy, yy = ((weights[..., None] * x).sum(-2) for x in frames[3:])
-        first, second = (rotate(turn, start.world(*side)) for side in transform(xx, xy, xy, yy))
+        first, second = (rotate(mean_quaternion, start.world(*side)) for side in transform(xx, xy, xy, yy))
         return self._edges((first, second), self.areas.expand(len(weights), -1))
 
     def pulls(self, shapes: Tensor, weights: Tensor, poisson: Poisson) -> Tensor:
         """:meth:`Poisson.pulls` of these edge vectors. *Shape:* ``(B, K, V, 3), (B, K) -> (B, V, 3)``."""
         return poisson.pulls(self(shapes, weights))
 
-    def _agree(self, turns: Tensor, weights: Tensor) -> Tensor:
+    def _agree(self, quaternions: Tensor, weights: Tensor) -> Tensor:
         """Signs for the pieces of K shapes, with which they turn the short way from each other.
 
         *Shape:* ``(4, B, K, F), (B, K) -> (B, K, F)``.
         """
         zero = weights.new_zeros(*weights.shape, self.n_pieces)
-        rows = (self.areas * (turns * turn[..., None, :]).sum(0) for turn in turns.unbind(2))
+        rows = (self.areas * (quaternions * one[..., None, :]).sum(0) for one in quaternions.unbind(2))
         products = torch.stack([zero.index_add(-1, self.piece, row) for row in rows], -1).movedim(2, 1)
         return pick(signs_of_mean(products, weights[:, None]).mT, self.piece)
 

@@ -69,21 +69,21 @@ class Poisson(nn.Module):
             self._made = weights, solver
             return solver
 
-    def forward(self, pulls: Tensor, near: Tensor) -> Tensor:
+    def forward(self, right: Tensor, near: Tensor) -> Tensor:
         """The shape that fits target edge vectors, by their :meth:`pulls`, with the centres of the pieces of ``near``.
 
         Unreferenced vertices have the positions of ``near``. *Shape:* ``(..., V, 3), (..., V, 3) -> (..., V, 3)``.
         """
         if torch.compiler.is_exporting():
-            x = solve_exported(self.edges, self.weights, self.free, pulls)
+            x = solve_exported(self.edges, self.weights, self.free, right)
         else:
             # Bound to the current weights: other weights may be in place during the backward solve.
-            x = solve_by(cache(partial(self._solver_of, self.weights)), pulls)
+            x = solve_by(cache(partial(self._solver_of, self.weights)), right)
         return x + self.centres(near - x)
 
-    def or_near(self, pulls: Tensor, near: Tensor) -> Tensor:
+    def or_near(self, right: Tensor, near: Tensor) -> Tensor:
         """:meth:`forward`, and the shape nearby where that is not finite. *Shape:* ``(B, V, 3), (B, V, 3)``."""
-        solved = self(pulls, near)
+        solved = self(right, near)
         finite = solved.detach().sum((1, 2)).isfinite()
         return solved if plain(finite) and finite.all() else torch.where(finite[:, None, None], solved, near)
 

@@ -24,19 +24,19 @@ def mean_pose(to_reference: Tensor, among: Tensor, weights: Tensor) -> tuple[Ten
     Returns:
         The rotations, *shape* ``(B, K, 3, 3)``; the mean of their inverses, *shape* ``(B, 3, 3)``.
     """
-    pulls = weights[..., None, None]
+    factors = weights[..., None, None]
     if weights.shape[1] > 2:
         with torch.no_grad():
-            turns = best_rotation(to_reference)
+            rotations = best_rotation(to_reference)
             for _ in range(ROUNDS):
-                turns = best_rotation(((pulls * turns)[:, :, None] @ among).sum(1))
-        turns = turns.detach()  # forward mode goes through no_grad
+                rotations = best_rotation(((factors * rotations)[:, :, None] @ among).sum(1))
+        rotations = rotations.detach()  # forward mode goes through no_grad
         for _ in range(LAST_ROUNDS):
-            turns = best_rotation(((pulls * turns)[:, :, None] @ among).sum(1))
+            rotations = best_rotation(((factors * rotations)[:, :, None] @ among).sum(1))
     else:
-        turns = torch.cat([torch.eye(3).to(among).expand(len(among), 1, 3, 3), best_rotation(among[:, 0, 1:])], 1)
-    turns = best_rotation((pulls * to_reference @ turns.mT).sum(1))[:, None] @ turns
-    poses = quaternion(turns.mT.movedim((-2, -1), (0, 1)))  # (4, B, K)
+        rotations = torch.cat([torch.eye(3).to(among).expand(len(among), 1, 3, 3), best_rotation(among[:, 0, 1:])], 1)
+    rotations = best_rotation((factors * to_reference @ rotations.mT).sum(1))[:, None] @ rotations
+    poses = quaternion(rotations.mT.movedim((-2, -1), (0, 1)))  # (4, B, K)
     signs = signs_of_mean(torch.einsum("ibk,ibl->bkl", poses, poses).detach(), weights.detach())
     pose = mean((signs * poses)[..., None], weights[..., None]).squeeze(-1)
-    return turns, matrix(pose).movedim(-1, 0)
+    return rotations, matrix(pose).movedim(-1, 0)

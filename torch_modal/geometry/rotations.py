@@ -46,9 +46,9 @@ MEAN_STEPS = 1
 SMALLEST_CURVATURE = 0.1
 
 
-def exp(turn: Tensor) -> Tensor:
+def exp(vector: Tensor) -> Tensor:
     """Rotation matrix of axis times angle in radians (Rodrigues). *Shape:* ``(..., 3) -> (..., 3, 3)``."""
-    return matrix(about(0.5 * turn.movedim(-1, 0))).movedim((0, 1), (-2, -1))
+    return matrix(about(0.5 * vector.movedim(-1, 0))).movedim((0, 1), (-2, -1))
 
 
 def log(rotation: Tensor) -> Tensor:
@@ -105,9 +105,9 @@ def rotate(q: Tensor, v: Tensor) -> Tensor:
     return v + q[0] * twice + cross(q[1:], twice)
 
 
-def rotate_by(turn: Tensor, v: Tensor) -> Tensor:
+def rotate_by(vector: Tensor, v: Tensor) -> Tensor:
     """Vectors rotated by rotation vectors. *Shape:* ``(3, ...), (3, ...) -> (3, ...)``."""
-    return rotate(about(0.5 * turn), v)
+    return rotate(about(0.5 * vector), v)
 
 
 def arc(q: Tensor) -> Tensor:

@@ -52,13 +52,13 @@ class Skin:
         weights, rest, transforms, shapes = (array.double().cpu() for array in arrays)
         centred, here = shapes - shapes.mean(1, keepdim=True), rest - rest.mean(0)
         fits = centred.mT @ here / here.square().sum()
-        steps, turns = best_rotation(centred[1:].mT @ centred[:-1]), [best_rotation(fits[0])]
+        steps, rotations = best_rotation(centred[1:].mT @ centred[:-1]), [best_rotation(fits[0])]
         for fit, step in zip(fits[1:], steps, strict=True):
-            turns.append(best_rotation(fit + FOLLOWED * step @ turns[-1]))
+            rotations.append(best_rotation(fit + FOLLOWED * step @ rotations[-1]))
         bind = torch.eye(4, dtype=torch.float64).repeat(1 + weights.shape[1], 1, 1)
         bind[0, :3, 3], bind[1:, :3, 3] = rest.mean(0), weights.mT @ rest / weights.sum(0)[:, None]
         root = bind[:1].repeat(len(shapes), 1, 1)
-        root[:, :3, :3], root[:, :3, 3] = torch.stack(turns), shapes.mean(1)
+        root[:, :3, :3], root[:, :3, 3] = torch.stack(rotations), shapes.mean(1)
         local = torch.cat([root[:, None], torch.linalg.solve(root[:, None], transforms @ bind[1:])], 1)
         return bind, quaternion(local[..., :3, :3].movedim((2, 3), (0, 1))), local[..., :3, 3]
 

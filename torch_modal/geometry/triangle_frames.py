@@ -142,8 +142,8 @@ def bend(displaced: Sides, reference: Frames) -> tuple[Tensor, Tensor]:
     x_x, y_x, n_x = (_dot(xx * one + xy * other, axis) for axis in axes)
     x_y, y_y, n_y = (_dot(xy * one + yy * other, axis) for axis in axes)
     spin = 0.5 * (y_x - x_y)
-    turn = n_y * axes[0] - n_x * axes[1] + spin * axes[2]
-    return turn, torch.stack([x_x, 0.5 * (x_y + y_x), y_y])
+    rotation = n_y * axes[0] - n_x * axes[1] + spin * axes[2]
+    return rotation, torch.stack([x_x, 0.5 * (x_y + y_x), y_y])
 
 
 def stretch(strain: Tensor, xx: Tensor, xy: Tensor, yy: Tensor) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
@@ -151,32 +151,32 @@ def stretch(strain: Tensor, xx: Tensor, xy: Tensor, yy: Tensor) -> tuple[tuple[T
     return transform(*_product(_exponential(*strain), (xx, xy, yy)))
 
 
-def bent_sides(turn: Tensor, strain: Tensor, reference: Frames) -> Sides:
+def bent_sides(rotation: Tensor, strain: Tensor, reference: Frames) -> Sides:
     """Sides after a bend: stretched in their plane, then turned by the finite rotation of the same axis and angle.
 
     The stretch is the exponential of the strain: shear keeps the area, and no triangle inverts.
 
     Args:
-        turn: Axis times angle, in the coordinates of the shape. *Shape:* ``(3, B, F)``.
+        rotation: Axis times angle, in the coordinates of the shape. *Shape:* ``(3, B, F)``.
         strain: Its entries ``xx, xy, yy`` in the frames. *Shape:* ``(3, B, F)``.
         reference: Frames of the undeformed shape.
     """
     first, second = stretch(strain, *reference[3:])
-    return rotate_by(turn, reference.world(*first)), rotate_by(turn, reference.world(*second))
+    return rotate_by(rotation, reference.world(*first)), rotate_by(rotation, reference.world(*second))
 
 
-def bending_between(reference: Frames, other: Frames, turns: Tensor) -> tuple[Tensor, Tensor]:
+def bending_between(reference: Frames, other: Frames, quaternions: Tensor) -> tuple[Tensor, Tensor]:
     """Rotation and strain from one shape to another: :func:`bent_sides` of it are the sides of the other.
 
     Args:
         reference: Frames of the shape that bends.
         other: Frames of the other.
-        turns: Quaternions from the first frames to the others; their signs tell the way round. *Shape:* ``(4, B, F)``.
+        quaternions: Rotations from the first frames to the others; signs tell the way round. *Shape:* ``(4, B, F)``.
     """
     cos, sin, *entries = _polar(reference, other)
     half = 0.5 * torch.atan2(sin, cos)
-    turn = 2 * arc(product(turns, torch.cat([half.cos()[None], half.sin() * reference.normal])))
-    return turn, torch.stack(_logarithm(*entries))
+    rotation = 2 * arc(product(quaternions, torch.cat([half.cos()[None], half.sin() * reference.normal])))
+    return rotation, torch.stack(_logarithm(*entries))
 
 
 def mirrored_sides(centre: Frames, other: Frames) -> Sides:

@@ -47,8 +47,8 @@ def pierce_nearly(edges_of: FloatArray, through: FloatArray) -> BoolArray:
         at = np.flatnonzero(((above[:, i] & below[:, j]) | (below[:, i] & above[:, j])) & ~pierced)
         start, end = edges_of[at, i], edges_of[at, j]
         rays = through[at] - start[:, None]
-        turns = np.stack([dot(cross(rays[:, k], rays[:, (k + 1) % 3]), end - start) for k in range(3)])
-        pierced[at[(turns > -margin[at]).all(0) | (turns < margin[at]).all(0)]] = True
+        sides = np.stack([dot(cross(rays[:, k], rays[:, (k + 1) % 3]), end - start) for k in range(3)])
+        pierced[at[(sides > -margin[at]).all(0) | (sides < margin[at]).all(0)]] = True
     return pierced
 
 
@@ -84,5 +84,5 @@ def _lone_first(corners: FloatArray, side: FloatArray) -> tuple[FloatArray, Bool
     """Corners rotated so that the one alone on its side comes first, and whether it is above."""
     above = (side > 0).sum(1) == 1
     lone = np.where(above, (side > 0).argmax(1), (side < 0).argmax(1))
-    turned = (lone[:, None] + np.arange(3)) % 3
-    return np.take_along_axis(corners, turned[..., None], 1), above
+    corner_order = (lone[:, None] + np.arange(3)) % 3
+    return np.take_along_axis(corners, corner_order[..., None], 1), above

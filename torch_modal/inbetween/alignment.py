@@ -59,11 +59,11 @@ class KeyframeAlignment(nn.Module):
         #: Of the vertices, adding up to one. *Shape:* ``(V,)``.
         self.register_buffer("weights", weights, persistent=False)
         covariances = (centred[0] * weights[:, None]).mT @ centred
-        turns = torch.cat([torch.eye(3).to(weights)[None], best_rotation(covariances[1:])])
+        rotations = torch.cat([torch.eye(3).to(weights)[None], best_rotation(covariances[1:])])
         #: From the references to the frame, for vectors such as modes. *Shape:* ``(K, 3, 3)``.
-        self.register_buffer("turns", turns, persistent=False)
+        self.register_buffer("turns", rotations, persistent=False)
         #: The references in the frame, turned on to the first. *Shape:* ``(K, V, 3)``.
-        self.register_buffer("references", centred @ turns.mT * scale, persistent=False)
+        self.register_buffer("references", centred @ rotations.mT * scale, persistent=False)
         #: Roots of the weights, and the first reference times these. *Shape:* ``(V,), (3, V)``.
         self.register_buffer("roots", weights.sqrt(), persistent=False)
         self.register_buffer("rooted", (self.reference.mT * self.roots).contiguous(), persistent=False)
@@ -94,8 +94,8 @@ class KeyframeAlignment(nn.Module):
         """
         weights, known = torch.where(weights.isfinite(), weights, 1 / weights.shape[1]), weights.isfinite()
         x, usable = self.checked(keyframes.mT.contiguous())
-        turned, pose = self._align(x, weights)
-        shapes = turned.mT.contiguous()
+        aligned, pose = self._align(x, weights)
+        shapes = aligned.mT.contiguous()
         usable = usable & ~self.mirrored(shapes.detach(), weights)
         return shapes, pose, ((usable | (weights == 0)) & known).all(1)
 
@@ -119,8 +119,8 @@ class KeyframeAlignment(nn.Module):
         rows = (centred * self.roots).flatten(1, 2)
         to_reference = (self.rooted @ rows.mT).unflatten(2, (-1, 3)).transpose(1, 2)  # (B, K, 3, 3)
         among = (rows @ rows.mT).unflatten(2, (-1, 3)).unflatten(1, (-1, 3)).transpose(2, 3)  # (B, K, K, 3, 3)
-        turns, rotation = self.mean_pose(to_reference, among, weights)
-        return turns @ centred, Pose(rotation, (weights[..., None] * centres).sum(1))
+        rotations, rotation = self.mean_pose(to_reference, among, weights)
+        return rotations @ centred, Pose(rotation, (weights[..., None] * centres).sum(1))
 
     def restore(self, x: Tensor, pose: Pose) -> Tensor:
         """Shapes of the frame in the caller's coordinates. *Shape:* ``(B, V, 3)``."""
@@ -135,12 +135,12 @@ class KeyframeAlignment(nn.Module):
         if not self.closed:
             return torch.zeros_like(weights, dtype=torch.bool)
         volumes, heaviest = self.signed_volumes(shapes, self.faces), weights.argmax(1, keepdim=True)
-        turned = volumes * volumes.gather(1, heaviest) < 0
-        if plain(turned) and not turned.any():
-            return turned
+        inverted = volumes * volumes.gather(1, heaviest) < 0
+        if plain(inverted) and not inverted.any():
+            return inverted
         first = shapes.take_along_dim(heaviest[..., None, None], 1).expand_as(shapes)
         heaviest_shapes, others = first.flatten(0, 1), shapes.flatten(0, 1)
-        return turned & looks_mirrored(heaviest_shapes, others, self.faces.long()).view_as(turned)
+        return inverted & looks_mirrored(heaviest_shapes, others, self.faces.long()).view_as(inverted)
 
     def _warn_of_size(self, sizes: Tensor) -> None:
         """Warn, once for each layer, that key-frames and bases seem to be in different units."""

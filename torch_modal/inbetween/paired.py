@@ -89,18 +89,18 @@ class PairedSpace(nn.Module):
         """Energy, gradient and Hessians at ``a``; the similarity is quadratic and part of Gauss-Newton's."""
         ends = self._ends(a, placement)
         first, second = (space.derivatives(a_k, place, second_order) for space, a_k, place in ends)
-        similarity, pull = self._similarity(a, placement)
+        similarity, slope = self._similarity(a, placement)
         value, gradient = first.value + second.value + similarity, torch.cat([first.gradient, second.gradient], -1)
         similar = 2 * placement.mu[:, None, None] * self.gap_gram
         gauss_newton = _block_diagonal(first.gauss_newton, second.gauss_newton) + similar
         curved = _block_diagonal(first.second_order, second.second_order) if second_order else None
-        return Derivatives(value, gradient + pull, gauss_newton, curved, first.resolution + second.resolution)
+        return Derivatives(value, gradient + slope, gauss_newton, curved, first.resolution + second.resolution)
 
     def value_and_gradient(self, a: Tensor, placement: PairedPlacement) -> tuple[Tensor, Tensor]:
         """Energy and gradient at ``a``. *Shape:* ``(B, n) -> (B,), (B, n)``."""
         first, second = (space.value_and_gradient(a_k, place) for space, a_k, place in self._ends(a, placement))
-        similarity, pull = self._similarity(a, placement)
-        return first[0] + second[0] + similarity, torch.cat([first[1], second[1]], -1) + pull
+        similarity, slope = self._similarity(a, placement)
+        return first[0] + second[0] + similarity, torch.cat([first[1], second[1]], -1) + slope
 
     def gradient(self, a: Tensor, placement: PairedPlacement) -> Tensor:
         """Gradient at ``a``, to be differentiated. *Shape:* ``(B, n) -> (B, n)``."""

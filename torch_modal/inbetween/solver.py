@@ -73,15 +73,15 @@ class InBetweenSolver(nn.Module):
 
     def _space(self, modes: Sequence[Tensor], objective: Objective) -> JointSpace | PairedSpace:
         """The space that the modal solve minimises in."""
-        alignment, turns = self.alignment, self.alignment.turns
-        turned = [basis @ turn.mT for basis, turn in zip(modes, turns, strict=True)]
-        coarse = CoarseMesh(alignment.references, self.mesh, objective.coarse_faces, alignment.weights, turned)
+        alignment, rotations = self.alignment, self.alignment.turns
+        aligned_modes = [basis @ rotation.mT for basis, rotation in zip(modes, rotations, strict=True)]
+        coarse = CoarseMesh(alignment.references, self.mesh, objective.coarse_faces, alignment.weights, aligned_modes)
         # The paired space, and steps that are unrolled, are differentiated like any other expression: by torch.
         by_kernels = objective.space == "joint" and self.solver.gradient == "implicit"
         args = coarse, self.fine, self.backend if by_kernels else TorchBackend()
         if objective.space == "joint":
-            return JointSpace(*args, elastic_subspace(turned, alignment, coarse), objective.anchor)
-        first, second = (JointSpace(*args, elastic_subspace([basis], alignment, coarse)) for basis in turned)
+            return JointSpace(*args, elastic_subspace(aligned_modes, alignment, coarse), objective.anchor)
+        first, second = (JointSpace(*args, elastic_subspace([basis], alignment, coarse)) for basis in aligned_modes)
         return PairedSpace(first, second)
 
     def forward(self, samples: Samples) -> InBetweenResult:

@@ -186,10 +186,10 @@ class InBetweenLayer(PreciseModule):
         self._require_own_bases()
         n, item = weights.shape[-1], keyframes.shape[-2:]
         flat = keyframes.to(self.dtype).expand(*lead, n, *item).reshape(-1, n, *item)
-        pulls = weights.to(self.dtype).expand(*lead, n).reshape(-1, n)
-        mu, results = self.mu_of(pulls, lead), []
+        flat_weights = weights.to(self.dtype).expand(*lead, n).reshape(-1, n)
+        mu, results = self.mu_of(flat_weights, lead), []
         for i, (vertices, core) in enumerate(zip(self.vertices, self.cores, strict=True)):
-            samples = Samples(flat[:, :, vertices], pulls, mu, self.stiffness_of(pulls, lead, i))
+            samples = Samples(flat[:, :, vertices], flat_weights, mu, self.stiffness_of(flat_weights, lead, i))
             # Further terms may have parameters of their own.
             results.append(by_chunks(core, samples, samples.keyframes.shape[2], closed=not self.objective.terms))
         return of_bodies(results, self.vertices).unflattened(lead)

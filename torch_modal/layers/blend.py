@@ -83,14 +83,14 @@ class Blend(InBetweenLayer):
     def solve(self, keyframes: Tensor, weights: Tensor) -> InBetweenResult:
         """The shapes, and how each minimisation went, without a warning. Arguments as for :meth:`forward`."""
         lead = self._check(keyframes, weights)
-        pulls = weights
+        normalised = weights
         if torch.finfo(weights.dtype).bits < 32:  # of an autocast model: to more digits, they do not add up to one
-            pulls = weights.to(self.dtype)
-            pulls = pulls / pulls.sum(-1, keepdim=True)
+            normalised = weights.to(self.dtype)
+            normalised = normalised / normalised.sum(-1, keepdim=True)
         x, several = keyframes, weights.shape[-1] > 2
         if several:  # second derivatives pass what goes in, in reverse mode, or what comes out, in forward mode
-            x, pulls = once(x, SECOND), once(pulls, SECOND)
-        result = self.solved(x, pulls, lead)
+            x, normalised = once(x, SECOND), once(normalised, SECOND)
+        result = self.solved(x, normalised, lead)
         shapes = once(result.shapes, SECOND) if several else result.shapes
         return result._replace(shapes=with_exact_keyframes(shapes, keyframes, weights))
 

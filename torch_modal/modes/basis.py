@@ -93,8 +93,8 @@ class ModalBasis:
         In the Euclidean product over all vertices: translations along x, y and z, then rotations about their mean.
         """
         arms = self.reference - self.reference.mean(dim=0)
-        translations, turned = infinitesimal_motions(arms / arms.abs().max()).split(3)  # scaled against overflow
-        rotations = torch.linalg.qr(turned.flatten(1).T).Q.T.view_as(turned)
+        translations, spins = infinitesimal_motions(arms / arms.abs().max()).split(3)  # scaled against overflow
+        rotations = torch.linalg.qr(spins.flatten(1).T).Q.T.view_as(spins)
         return torch.cat([translations / self.n_vertices**0.5, rotations])
 
     def truncate(self, k: int) -> "ModalBasis":

@@ -107,9 +107,9 @@ class Lattice:
         most = connected_pieces(pairs, len(surface.points)).max()
         if (n_pieces := face_connected_pieces(tetrahedra.tets).max()) <= most:
             return tetrahedra
-        turned = lattice(replace(surface, points=surface.points @ TURN.T), self.cube)
-        better = face_connected_pieces(turned.tets).max() < n_pieces
-        return turned._replace(vertices=turned.vertices @ TURN) if better else tetrahedra
+        rotated = lattice(replace(surface, points=surface.points @ TURN.T), self.cube)
+        better = face_connected_pieces(rotated.tets).max() < n_pieces
+        return rotated._replace(vertices=rotated.vertices @ TURN) if better else tetrahedra
 
 
 class Indicator:

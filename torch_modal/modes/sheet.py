@@ -133,6 +133,6 @@ def _vertex_gradients(motions: FloatArray, points: FloatArray, faces: IntArray) 
     moves = [motions[faces[:, corner]] - motions[faces[:, 0]] for corner in (1, 2)]
     # How the normal turns, in the directions of the plane.
     lifts = [np.einsum("fck,fc->fk", move, normals) for move in moves]
-    turned = -sum(hat[:, :, None] * lift[:, None] for hat, lift in zip(hats, lifts, strict=True))
-    gradients = np.einsum("pfck,pfa->fack", np.stack([*moves, turned]), np.stack([*hats, normals]))
+    last_move = -sum(hat[:, :, None] * lift[:, None] for hat, lift in zip(hats, lifts, strict=True))
+    gradients = np.einsum("pfck,pfa->fack", np.stack([*moves, last_move]), np.stack([*hats, normals]))
     return np.moveaxis(((share.T @ gradients.reshape(len(faces), -1)) / total).reshape(n, 3, 3, k), 1, 0)

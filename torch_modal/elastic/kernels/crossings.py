@@ -38,7 +38,7 @@ def meet(a: wp.vec3i, b: wp.vec3i):
 
 
 @wp.func
-def turn(along: vec3, a: vec3, b: vec3):
+def side_of(along: vec3, a: vec3, b: vec3):
     return wp.dot(wp.cross(a, b), along)
 
 
@@ -48,9 +48,9 @@ def through(start: vec3, end: vec3, height: real, end_height: real, margin: real
     result = wp.min(height, end_height) < margin and wp.max(height, end_height) > -margin
     if result:
         along = end - start
-        first = turn(along, a - start, b - start)
-        second = turn(along, b - start, c - start)
-        third = turn(along, c - start, a - start)
+        first = side_of(along, a - start, b - start)
+        second = side_of(along, b - start, c - start)
+        third = side_of(along, c - start, a - start)
         result = wp.min(first, wp.min(second, third)) > -margin or wp.max(first, wp.max(second, third)) < margin
     return result
 

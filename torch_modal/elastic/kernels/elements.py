@@ -381,7 +381,7 @@ def _merge_kernel(f: KernelFunctions, module: "wp.Module") -> dict[str, "wp.Kern
 
     @kernel
     def merge(
-        elements: wp.array[corners], n_vertices: int, x: wp.array[vec3], pulls: wp.array[real], whole: wp.array[real],
+        elements: wp.array[corners], n_vertices: int, x: wp.array[vec3], weights: wp.array[real], whole: wp.array[real],
         stiffness: wp.array[real], start: wp.array[vec3], altitude: real, relative: int, n_shapes: int,
         n_stiffness: int, out: wp.array[record], constant: wp.array[real], threads: int,
     ):  # fmt: skip
@@ -395,9 +395,9 @@ def _merge_kernel(f: KernelFunctions, module: "wp.Module") -> dict[str, "wp.Kern
             usual = real(0.0)
             for r in range(s * n_shapes, (s + 1) * n_shapes):
                 e = edge_vectors(x, r * n_vertices, q)
-                moments_sum += contribution(e, pulls[r], mean_of(whole, r, elements.shape[0]))
+                moments_sum += contribution(e, weights[r], mean_of(whole, r, elements.shape[0]))
                 if relative > 0:
-                    usual += pulls[r] * fullness(e, altitude)
+                    usual += weights[r] * fullness(e, altitude)
             factor = stiffness[place(s * n_stiffness, wp.min(k, n_stiffness - 1))]
             if start:
                 factor *= softness(fullness(edge_vectors(start, s * n_vertices, q), altitude), usual, relative)
@@ -441,9 +441,9 @@ def _merge_back_kernel(f: KernelFunctions, module: "wp.Module") -> "wp.Kernel":
 
     @wp.kernel(module=module)
     def merge(
-        elements: wp.array[corners], n_vertices: int, x: wp.array[vec3], pulls: wp.array[real], whole: wp.array[real],
+        elements: wp.array[corners], n_vertices: int, x: wp.array[vec3], weights: wp.array[real], whole: wp.array[real],
         stiffness: wp.array[real], start: wp.array[vec3], altitude: real, relative: int, n_shapes: int,
-        n_stiffness: int, to_out: wp.array[row], to_x: wp.array[vec3], to_pulls: wp.array[real],
+        n_stiffness: int, to_out: wp.array[row], to_x: wp.array[vec3], to_weights: wp.array[real],
         to_stiffness: wp.array[real], to_start: wp.array[vec3], threads: int,
     ):  # fmt: skip
         """Adds the gradients; the means, and the energy that remains, have none."""
@@ -455,9 +455,9 @@ def _merge_back_kernel(f: KernelFunctions, module: "wp.Module") -> "wp.Kernel":
             usual = real(0.0)
             for r in range(s * n_shapes, (s + 1) * n_shapes):
                 e = edge_vectors(x, r * n_vertices, q)
-                moments_sum += contribution(e, pulls[r], mean_of(whole, r, elements.shape[0]))
+                moments_sum += contribution(e, weights[r], mean_of(whole, r, elements.shape[0]))
                 if relative > 0:
-                    usual += pulls[r] * fullness(e, altitude)
+                    usual += weights[r] * fullness(e, altitude)
             at = place(s * n_stiffness, wp.min(k, n_stiffness - 1))
             at_start = real(1.0)
             soft = real(1.0)
@@ -480,17 +480,17 @@ def _merge_back_kernel(f: KernelFunctions, module: "wp.Module") -> "wp.Kernel":
                 m, g = f.linearise(e)
                 mean = mean_of(whole, r, elements.shape[0])
                 weight = f.weight(e, m, mean)
-                to_m, to_weight, _3 = wp.grad(of_measure)(m, pulls[r] * weight, to_sums)
+                to_m, to_weight, _3 = wp.grad(of_measure)(m, weights[r] * weight, to_sums)
                 of_e, of_m, _4 = wp.grad(weight_of)(e, m, mean)
-                received_weight = pulls[r] * to_weight
+                received_weight = weights[r] * to_weight
                 to_e = received_weight * of_e
                 to_pull = weight * to_weight
                 if to_usual != real(0.0):
                     of_full, _6 = wp.grad(fullness)(e, altitude)
-                    to_e += (pulls[r] * to_usual) * of_full
+                    to_e += (weights[r] * to_usual) * of_full
                     to_pull += to_usual * fullness(e, altitude)
                 add(to_x, r * n_vertices, q, to_e + potential.rate(m, to_m + received_weight * of_m) * g)
-                wp.atomic_add(to_pulls, r, to_pull)
+                wp.atomic_add(to_weights, r, to_pull)
 
     return merge
 

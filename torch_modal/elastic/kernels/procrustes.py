@@ -34,7 +34,7 @@ def to_covariance(covariance: wp.mat33d, to_rotation: wp.mat33d):
 @wp.kernel(enable_backward=False)
 def mean_pose(
     to_reference: wp.array[wp.mat33d], among: wp.array[wp.mat33d], weights: wp.array[wp.vec2d],
-    turns: wp.array[wp.mat33d], pose: wp.array[wp.mat33d],
+    rotations: wp.array[wp.mat33d], pose: wp.array[wp.mat33d],
 ):  # fmt: skip
     """procrustes.mean_pose of two shapes."""
     s = wp.tid()
@@ -42,8 +42,8 @@ def mean_pose(
     onto = best_rotation(among[4 * s + 1])
     back = wp.transpose(onto)
     first = best_rotation(w[0] * to_reference[2 * s] + w[1] * to_reference[2 * s + 1] @ back)
-    turns[2 * s] = first
-    turns[2 * s + 1] = first @ onto
+    rotations[2 * s] = first
+    rotations[2 * s + 1] = first @ onto
     q = quaternion(back)
     half = half_rotation(wp.where(q[0] < real(0.0), -q, q))
     pose[s] = wp.quat_to_matrix(about(w[1] * half)) @ wp.transpose(first)
