@@ -144,7 +144,7 @@ def test_edges_that_are_points_at_rest_weigh_nothing(small_bars: Shapes) -> None
     one, other = case.mesh.edges[0].tolist()
     case.given[1][:, other] = case.given[1][:, one] + 1e-7
     rests = case.rests(*case.given[1:])
-    assert_same_reference(case.fused.reference(rests), rests.reference(case.energy).turned(), 1e-9)
+    assert_same_reference(case.fused.reference(rests), rests.reference(case.energy).transpose(), 1e-9)
     assert_alike(gradients(case.by_warp, case.given), gradients(case.by_torch, case.given), 1e-6)
 
 
@@ -262,7 +262,7 @@ class TestModal:
             return shell.reference(RestShapes(*given[:2], given[2:]))
 
         def by_torch(*given: Tensor) -> Reference:
-            return RestShapes(*given[:2], given[2:]).reference(case.energy).turned()
+            return RestShapes(*given[:2], given[2:]).reference(case.energy).transpose()
 
         def flat(run: Any) -> Any:
             return lambda *given: torch.cat([part.flatten() for part in run(*given).records])

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from torch_modal.elastic.backend import TorchBackend
 from torch_modal.elastic.energy import AssembledTerm, Energy, RestShapes
-from torch_modal.elastic.modal import Derivatives, ModalEnergy, Placement
+from torch_modal.elastic.modal import Derivatives, Placement
 from torch_modal.elastic.shell import N_SHELL_TERMS
 from torch_modal.elastic.steps import FineEnergy
 from torch_modal.inbetween.coarse import CoarseMesh
@@ -105,12 +105,13 @@ class JointSpace(nn.Module):
 
     def value(self, a: Tensor, placement: Sequence[Placement]) -> Tensor:
         """Energy at ``a``. *Shape:* ``(..., B, n) -> (..., B)``."""
-        energies = [part.value(a.to(at.base.dtype), at) for part, at in self._each(placement)]
+        energies = [part.value(a.to(at.base.dtype), at) for part, at in zip(self.parts, placement, strict=True)]
         return reduce(torch.add, energies) + 0.5 * self.anchor * a.square().sum(-1)
 
     def derivatives(self, a: Tensor, placement: Sequence[Placement], second_order: bool = True) -> Derivatives:
         """Energy, gradient and Hessians at ``a``. *Shape:* ``(B, n)``."""
-        parts = [part.derivatives(a.to(at.base.dtype), at, second_order) for part, at in self._each(placement)]
+        pairs = zip(self.parts, placement, strict=True)
+        parts = [part.derivatives(a.to(at.base.dtype), at, second_order) for part, at in pairs]
         sums: list[Any] = [None if each[0] is None else reduce(torch.add, each) for each in zip(*parts, strict=True)]
         value, gradient, gauss_newton, *others = sums
         value, eye = value + 0.5 * self.anchor * a.square().sum(-1), torch.eye(a.shape[-1]).to(gauss_newton)
@@ -118,18 +119,16 @@ class JointSpace(nn.Module):
 
     def value_and_gradient(self, a: Tensor, placement: Sequence[Placement]) -> tuple[Tensor, Tensor]:
         """Energy and gradient at ``a``. *Shape:* ``(B, n) -> (B,), (B, n)``."""
-        each = [part.value_and_gradient(a.to(at.base.dtype), at) for part, at in self._each(placement)]
+        pairs = zip(self.parts, placement, strict=True)
+        each = [part.value_and_gradient(a.to(at.base.dtype), at) for part, at in pairs]
         values, gradients = zip(*each, strict=True)
         value = torch.add(reduce(torch.add, values), a.square().sum(-1), alpha=0.5 * self.anchor)
         return value, torch.add(reduce(torch.add, gradients), a, alpha=self.anchor)
 
     def gradient(self, a: Tensor, placement: Sequence[Placement]) -> Tensor:
         """Gradient at ``a``, to be differentiated. *Shape:* ``(B, n) -> (B, n)``."""
-        each = [part.gradient(a.to(at.base.dtype), at) for part, at in self._each(placement)]
+        each = [part.gradient(a.to(at.base.dtype), at) for part, at in zip(self.parts, placement, strict=True)]
         return reduce(torch.add, each) + self.anchor * a
-
-    def _each(self, placement: Sequence[Placement]) -> list[tuple[ModalEnergy, Placement]]:
-        return list(zip(self.parts, placement, strict=True))  # an iterator, torch 2.8 cannot compile
 
 
 def coarse_values(values: Tensor, fine: AssembledTerm, coarse: AssembledTerm, clusters: Tensor, n: int) -> Tensor:
