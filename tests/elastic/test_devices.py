@@ -174,4 +174,4 @@ def test_contacts() -> None:
     with gpu() as mode, torch.no_grad():
         x, contacts = blank(2, 30, 3), Contacts(torch.arange(2, device="cuda"), there(ELEMENTS, mode))
         energy = ContactEnergy(contacts, blank(30), x)
-        assert_there([energy.missing(x), energy.value(x)])
+        assert_there([energy.shortfall(x), energy.value(x)])

@@ -361,7 +361,7 @@ def test_bases_that_do_not_fit(bars: Shapes, small_bars: Shapes) -> None:
         (bars.bases, "between two bases, got 3; Path and Blend take more"),
         (bars.keyframes[0], r"key-frames without modes must be floating-point of shape \(K, V, 3\); got \(164, 3\)"),
         (bars.keyframes[:2].long(), "dtype torch.int64.* convert"),
-        ([bars.bases[0], bars.keyframes[1].numpy()], "those of extract_bases; got ndarray"),
+        ([bars.bases[0], bars.keyframes[1].numpy()], "come from extract_bases; got ndarray"),
         (["open.obj", "fist.obj"], "is a str that is no array of numbers"),
         (None, "is a NoneType that is no array of numbers"),
     ):

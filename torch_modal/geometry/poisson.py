@@ -70,7 +70,7 @@ class Poisson(nn.Module):
             return solver
 
     def forward(self, right: Tensor, near: Tensor) -> Tensor:
-        """The shape that fits target edge vectors, by their :meth:`pulls`, with the centres of the pieces of ``near``.
+        """The shape that fits edge vectors (:meth:`pulls`), with the centres of the pieces of ``near``.
 
         Unreferenced vertices have the positions of ``near``. *Shape:* ``(..., V, 3), (..., V, 3) -> (..., V, 3)``.
         """
