@@ -60,15 +60,6 @@ class Linearised(NamedTuple):
     """The second derivative beyond that, if any. *Shape:* ``(B, M)``."""
 
 
-def edge_vectors(rows: Tensor, corners: Tensor) -> Tensor:
-    """Vectors from the first vertex of each element to the others.
-
-    *Shape:* ``(3, ..., V), (n, M) -> (n-1, 3, ..., M)``.
-    """
-    first, *others = (pick(rows, corner) for corner in corners)
-    return torch.stack([other - first for other in others])
-
-
 def _outlasting_buffers(module: nn.Module) -> None:
     """Replace buffers that are inference tensors: terms may have been made in inference mode."""
     for child in module.modules():
@@ -94,8 +85,9 @@ class AssembledTerm(nn.Module):
         self.register_buffer("corners", elements.T.contiguous(), persistent=False)
 
     def edge_vectors(self, rows: Tensor) -> Tensor:
-        """:func:`edge_vectors` of the elements."""
-        return edge_vectors(rows, self.corners)
+        """Vectors from the first vertex of each element to the others. *Shape:* ``(3, ..., V) -> (n-1, 3, ..., M)``."""
+        first, *others = (pick(rows, corner) for corner in self.corners)
+        return torch.stack([other - first for other in others])
 
     def measures(self, edge_vectors: Tensor) -> Tensor:
         """The measures, or their sum for a total. *Shape:* ``(n-1, 3, ..., M) -> (..., M or 1)``."""
