@@ -28,6 +28,9 @@ Made = TypeVar("Made")
 Given = ParamSpec("Given")
 Linear = Callable[[Tensor], Tensor]
 
+#: The dispatch mode of this thread, or None.
+current_dispatch_mode: Callable[[], Any] = _get_current_dispatch_mode
+
 
 def traced(x: Tensor) -> bool:
     """True for a tensor without data (torch.compile, export, fake and meta tensors), so that no kernel can use it."""
@@ -37,11 +40,6 @@ def traced(x: Tensor) -> bool:
 def within_transforms() -> bool:
     """True while a transform of ``torch.func`` or forward-mode differentiation is active in this thread."""
     return torch._C._functorch.peek_interpreter_stack() is not None or forward_ad._current_level >= 0
-
-
-def has_modes_of_thread() -> bool:
-    """True under modes that other threads would not have: transforms, forward mode, dispatch modes."""
-    return within_transforms() or _get_current_dispatch_mode() is not None
 
 
 def transformed(x: Tensor) -> bool:

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from torch_modal import trees
-from torch_modal.autograd import has_modes_of_thread, one_thread, plain
+from torch_modal.autograd import current_dispatch_mode, one_thread, plain, within_transforms
 
 Result = TypeVar("Result")
 
@@ -76,7 +76,8 @@ def run(work: Sequence[Callable[[], Result]]) -> list[Result]:
     An error is raised, and Ctrl-C ends the call, once no thread computes any more. Within such a thread, and where
     torch has one, the functions run one after another.
     """
-    if min(n_threads(), len(work)) < 2 or has_modes_of_thread():
+    # Transforms, forward mode and dispatch modes belong to this thread: others would not have them.
+    if min(n_threads(), len(work)) < 2 or within_transforms() or current_dispatch_mode() is not None:
         with alone():
             return [compute() for compute in work]
     recording, inference = torch.is_grad_enabled(), torch.is_inference_mode_enabled()
@@ -126,7 +127,7 @@ def by_chunks(compute: Callable[[Any], Any], samples: Any, n_vertices: int, clos
         closed: True if no other tensor has gradients. Otherwise the backward pass is torch's, on one thread.
     """
     tensors, tree = trees.leaves(samples), trees.skeleton(samples)
-    if not plain(*tensors) or has_modes_of_thread() or not tensors[0].is_cpu:
+    if not plain(*tensors) or within_transforms() or current_dispatch_mode() is not None or not tensors[0].is_cpu:
         return compute(samples)
     sizes, skeletons = chunk_sizes(len(tensors[0]), n_vertices), []
 
