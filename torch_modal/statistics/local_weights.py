@@ -11,7 +11,6 @@ from torch import Tensor
 from torch_modal.autograd import recorded
 from torch_modal.elastic.steps import conjugate_gradients
 from torch_modal.geometry.rigid import RigidMotion, best_fit, centroid, infinitesimal_motions
-from torch_modal.statistics.fitting import levenberg_marquardt
 from torch_modal.statistics.variation import Variation
 
 # Standard deviation, in sizes of the shape, of exact points from shapes of local weights, which have one of one: no
