@@ -51,7 +51,7 @@ class Step(torch.nn.Module):
     def forward(self, x: Tensor, rest: Tensor) -> Tensor:
         lead = x.shape[:-2]
         x, rest = (shape.reshape(-1, *shape.shape[-2:]) for shape in (x, rest))
-        placement = self.step.energy.place(x, self.shell.against(rest))
+        placement = self.step.energy.place(x, self.shell.reference_of(rest))
         a = x.new_zeros(len(x), self.n_modes)
         for _ in range(3):
             a = self.step(a, placement).amplitudes

@@ -32,7 +32,7 @@ Linear = Callable[[Tensor], Tensor]
 current_dispatch_mode: Callable[[], Any] = _get_current_dispatch_mode
 
 
-def traced(x: Tensor) -> bool:
+def is_traced(x: Tensor) -> bool:
     """True for a tensor without data (torch.compile, export, fake and meta tensors), so that no kernel can use it."""
     return torch.compiler.is_compiling() or type(x) not in (Tensor, torch.nn.Parameter) or x.is_meta
 
@@ -42,30 +42,34 @@ def within_transforms() -> bool:
     return torch._C._functorch.peek_interpreter_stack() is not None or forward_ad._current_level >= 0
 
 
-def transformed(x: Tensor) -> bool:
+def is_transformed(x: Tensor) -> bool:
     """True for a wrapper of a ``torch.func`` transform, or a tensor with a tangent of forward-mode differentiation."""
     if torch.func.debug_unwrap(x, recurse=False) is not x:
         return True
     return forward_ad._current_level >= 0 and forward_ad.unpack_dual(x).tangent is not None  # the first alone is fast
 
 
-def plain(*tensors: Tensor) -> bool:
+def is_eager(*tensors: Tensor) -> bool:
     """True for tensors that all have numbers, which are all that there is to them: neither traced nor transformed."""
     if torch.compiler.is_compiling():
         return False
     within = within_transforms()
-    return not any(traced(x) or (within and transformed(x)) for x in tensors)
+    return not any(is_traced(x) or (within and is_transformed(x)) for x in tensors)
 
 
-def mapped(x: Tensor) -> bool:
+def is_vmapped(x: Tensor) -> bool:
     """True where ``vmap`` maps a tensor, so that no number of it is one number."""
     inner = torch.func.debug_unwrap(x, recurse=False)
-    return inner is not x and (torch._C._functorch.is_batchedtensor(x) or mapped(inner))
+    return inner is not x and (torch._C._functorch.is_batchedtensor(x) or is_vmapped(inner))
 
 
 def in_use(index: Tensor, n: int) -> list[int]:
     """The numbers of an index; those that it may have, up to ``n``, where it has no data."""
-    return list(range(n)) if traced(index) else made_outside(lambda index_values: index_values.unique().tolist(), index)
+    return (
+        list(range(n))
+        if is_traced(index)
+        else run_outside_transforms(lambda index_values: index_values.unique().tolist(), index)
+    )
 
 
 def require_numbers(layer: str, x: Tensor) -> None:
@@ -83,12 +87,12 @@ def require_numbers(layer: str, x: Tensor) -> None:
     )
 
 
-def recorded(*tensors: Tensor) -> bool:
+def is_double_backward(*tensors: Tensor) -> bool:
     """True where a backward pass is itself differentiated, which kernels cannot be."""
-    return torch.is_grad_enabled() or any(map(transformed, tensors))
+    return torch.is_grad_enabled() or any(map(is_transformed, tensors))
 
 
-def lasting(make: Callable[Given, Made]) -> Callable[Given, Made]:
+def outside_inference_mode(make: Callable[Given, Made]) -> Callable[Given, Made]:
     """Decorate a function whose results are cached: no gradient is recorded, and no result is an inference tensor.
 
     Autograd rejects inference tensors, so cached tensors must not be created in ``torch.inference_mode()``.
@@ -130,7 +134,7 @@ def full_precision(compute: Callable[Given, Made]) -> Callable[Given, Made]:
     return run
 
 
-def untraced(compute: Callable[Given, Made]) -> Callable[Given, Made]:
+def disable_compile(compute: Callable[Given, Made]) -> Callable[Given, Made]:
     """Decorate a function that ``torch.compile`` calls as it is: to trace its data-dependent steps takes minutes."""
 
     @wraps(compute)
@@ -159,11 +163,11 @@ class Recent:
         return Recent, (self.limit,)  # copies and pickles are empty
 
     def get(self, key: Hashable, make: Callable[[], Made]) -> Made:
-        """The object of a key; computed if it is not in the cache, by :func:`made_outside`."""
+        """The object of a key; computed if it is not in the cache, by :func:`run_outside_transforms`."""
         if key not in self._kept:
             while len(self._kept) >= self.limit:  # before making, so that there are never more
                 self._kept.popitem(last=False)
-            self._kept[key] = made_outside(make)
+            self._kept[key] = run_outside_transforms(make)
         self._kept.move_to_end(key)
         return self._kept[key]  # type: ignore[no-any-return]
 
@@ -187,13 +191,13 @@ def one_thread() -> Iterator[None]:
             torch.set_num_threads(threads)
 
 
-def outlasting(x: Tensor) -> Tensor:
-    """The tensor, or a copy if it is an inference tensor; within :func:`lasting`."""
+def as_normal_tensor(x: Tensor) -> Tensor:
+    """The tensor, or a copy if it is an inference tensor; within :func:`outside_inference_mode`."""
     return x.clone() if x.is_inference() else x
 
 
-@untraced
-def made_outside(make: Callable[..., Made], *seen: Tensor) -> Made:
+@disable_compile
+def run_outside_transforms(make: Callable[..., Made], *seen: Tensor) -> Made:
     """Create an object outside of all transforms of ``torch.func``, to cache it or of numbers.
 
     Args:
@@ -202,9 +206,9 @@ def made_outside(make: Callable[..., Made], *seen: Tensor) -> Made:
     """
     if torch.compiler.is_exporting():  # without the modes that would record it
         with _disable_current_modes(), torch._C.DisableTorchFunction():
-            return lasting(make)(*seen)
+            return outside_inference_mode(make)(*seen)
     if not within_transforms():
-        return lasting(make)(*seen)
+        return outside_inference_mode(make)(*seen)
     made: list[Made] = []
     _Outside.apply(lambda *arguments: made.append(make(*arguments)), torch.empty(0), *seen)
     return made[0]
@@ -215,7 +219,7 @@ class _Outside(torch.autograd.Function):
 
     @staticmethod
     def forward(work: Callable[..., None], nothing: Tensor, *seen: Tensor) -> Tensor:
-        lasting(work)(*seen)
+        outside_inference_mode(work)(*seen)
         return nothing.clone()
 
     @staticmethod
@@ -238,9 +242,9 @@ class _Outside(torch.autograd.Function):
         return _Outside.apply(work, nothing, *first), in_dims[1]
 
 
-def once(x: Tensor, message: str) -> Tensor:
+def forbid_second_derivative(x: Tensor, message: str) -> Tensor:
     """The tensor, through which there are first derivatives; others raise a ``RuntimeError`` of this message."""
-    out: Tensor = x if traced(x) else _Once.apply(x, message, 1)
+    out: Tensor = x if is_traced(x) else _Once.apply(x, message, 1)
     return out
 
 
@@ -274,13 +278,13 @@ class _Once(torch.autograd.Function):
         return result
 
 
-def applied(function: Any, *arguments: Any) -> Any:
+def apply_function(function: Any, *arguments: Any) -> Any:
     """``function.apply`` of a :class:`torch.autograd.Function` with ``setup_context``.
 
     Without recording it calls ``forward`` directly: torch inspects the signature at every call, which takes as long as
     a small kernel.
     """
-    alone = not torch.is_grad_enabled() and plain(*(value for value in arguments if isinstance(value, Tensor)))
+    alone = not torch.is_grad_enabled() and is_eager(*(value for value in arguments if isinstance(value, Tensor)))
     return function.forward(*arguments) if alone else function.apply(*arguments)
 
 
@@ -308,20 +312,22 @@ class _LinearMap(torch.autograd.Function):
 
 #: A linear map of a tensor, with all derivatives and transforms, from a map and its transpose without any. Both take
 #: further dimensions in front, which ``vmap`` adds.
-linear_map: Callable[[Linear, Linear, Tensor], Tensor] = partial(applied, _LinearMap)
+linear_map: Callable[[Linear, Linear, Tensor], Tensor] = partial(apply_function, _LinearMap)
 
 
-def pushed(function: Callable[..., Any], inputs: Sequence[Tensor], tangents: Sequence[Tensor | None]) -> Any:
+def jvp_by_transposing(
+    function: Callable[..., Any], inputs: Sequence[Tensor], tangents: Sequence[Tensor | None]
+) -> Any:
     """The Jacobian of a function times tangents, None for zero, as the transpose of its gradient.
 
     Within ``torch.autograd.forward_ad``, torch has no other forward mode, but reverse mode.
     """
     output, back = torch.func.vjp(function, *inputs)[:2]
     zeros = torch.zeros_like(output) if isinstance(output, Tensor) else tuple(map(torch.zeros_like, output))
-    return transposed(back, zeros, inputs, tangents)
+    return apply_transpose(back, zeros, inputs, tangents)
 
 
-def transposed(
+def apply_transpose(
     linear: Callable[..., Sequence[Tensor]], zeros: Any, inputs: Sequence[Tensor], tangents: Sequence[Tensor | None]
 ) -> Any:
     """The transpose of a linear function, times tangents of what it gives, None for zero.
@@ -353,7 +359,7 @@ def broadcast_shapes(*shapes: Sequence[int]) -> torch.Size:
     return torch.broadcast_tensors(*(torch.empty((), device="meta").expand(shape) for shape in shapes))[0].shape
 
 
-def flattened(n: int, in_dims: Sequence[int | None], tensors: Sequence[Any]) -> list[Tensor]:
+def merge_vmapped(n: int, in_dims: Sequence[int | None], tensors: Sequence[Any]) -> list[Tensor]:
     """Tensors under ``vmap`` as one larger batch: the mapped dimension is merged with the first."""
     flat = []
     for tensor, dim in zip(tensors, in_dims, strict=True):

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from torch_modal import trees
-from torch_modal.autograd import current_dispatch_mode, one_thread, plain, within_transforms
+from torch_modal.autograd import current_dispatch_mode, is_eager, one_thread, within_transforms
 
 Result = TypeVar("Result")
 
@@ -127,12 +127,12 @@ def by_chunks(compute: Callable[[Any], Any], samples: Any, n_vertices: int, clos
         closed: True if no other tensor has gradients. Otherwise the backward pass is torch's, on one thread.
     """
     tensors, tree = trees.leaves(samples), trees.skeleton(samples)
-    if not plain(*tensors) or within_transforms() or current_dispatch_mode() is not None or not tensors[0].is_cpu:
+    if not is_eager(*tensors) or within_transforms() or current_dispatch_mode() is not None or not tensors[0].is_cpu:
         return compute(samples)
     sizes, skeletons = chunk_sizes(len(tensors[0]), n_vertices), []
 
     def result(chunk: Sequence[Tensor]) -> list[Tensor]:
-        output = compute(trees.filled(tree, chunk))
+        output = compute(trees.fill(tree, chunk))
         skeletons.append(trees.skeleton(output))
         return trees.leaves(output)
 
@@ -148,7 +148,7 @@ def by_chunks(compute: Callable[[Any], Any], samples: Any, n_vertices: int, clos
             output = _Chunks.apply(results, sizes, *tensors)
         else:
             output = [_join(each) for each in zip(*(outputs for _, outputs in results(*tensors)), strict=True)]
-    return trees.filled(skeletons[0], output)
+    return trees.fill(skeletons[0], output)
 
 
 class _Chunks(torch.autograd.Function):

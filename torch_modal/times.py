@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from torch_modal.arrays import FloatArray
-from torch_modal.autograd import made_outside, traced
+from torch_modal.autograd import is_traced, run_outside_transforms
 
 
 def check_times(
@@ -87,8 +87,8 @@ def locate_times(
         differences = times - t.detach()[:, None]
         to_nearest = differences.gather(1, differences.abs().argmin(1, keepdim=True))[:, 0]
         t = t + torch.where(to_nearest.abs() <= 2 * rounding * scale, to_nearest, 0.0)
-    if not traced(t):
-        made_outside(lambda t, times: _require_within(t, times, of), t, times)
+    if not is_traced(t):
+        run_outside_transforms(lambda t, times: _require_within(t, times, of), t, times)
     interval = (torch.searchsorted(times, t.detach().contiguous(), right=True) - 1).clamp(0, len(times) - 2)
     return interval, (t - times[interval]) / (times[interval + 1] - times[interval])
 

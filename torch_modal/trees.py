@@ -16,27 +16,27 @@ def leaves(tree: Any) -> list[Tensor]:
     return [tensor for branch in tree for tensor in leaves(branch)] if isinstance(tree, (tuple, list)) else []
 
 
-def mapped(tree: Any, function: Callable[[Any], Any]) -> Any:
+def map_leaves(tree: Any, function: Callable[[Any], Any]) -> Any:
     """Apply a function to each tensor of a tree; other leaves stay."""
     if isinstance(tree, (Tensor, str)):
         return function(tree)
     if isinstance(tree, (tuple, list)):
-        parts = [mapped(branch, function) for branch in tree]
+        parts = [map_leaves(branch, function) for branch in tree]
         return type(tree)(*parts) if hasattr(tree, "_fields") else type(tree)(parts)
     return tree
 
 
 def skeleton(tree: Any) -> Any:
     """The tree with :data:`HERE` in the places of its tensors."""
-    return mapped(tree, lambda _: HERE)
+    return map_leaves(tree, lambda _: HERE)
 
 
-def filled(tree: Any, tensors: Iterable[Tensor]) -> Any:
+def fill(tree: Any, tensors: Iterable[Tensor]) -> Any:
     """Replace the tensors of a tree or skeleton, in order."""
     each = iter(tensors)
-    return mapped(tree, lambda _: next(each))
+    return map_leaves(tree, lambda _: next(each))
 
 
 def rows(tree: Any, samples: Tensor | slice) -> Any:
     """Pick some of the samples."""
-    return mapped(tree, lambda tensor: tensor[samples])
+    return map_leaves(tree, lambda tensor: tensor[samples])

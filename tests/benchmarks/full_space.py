@@ -95,7 +95,7 @@ def full_space(
     both = Rest(*(tuple(torch.stack(each, -2) for each in zip(*own, strict=True)) for own in zip(*rests, strict=True)))
     reference = energy.merge_rests(both, torch.stack([1 - at_t, at_t], -1), stiffness)
     if example_based:
-        reference = energy.against(_interpolated(energy, rests[0], rests[1], t), stiffness)
+        reference = energy.reference_of(_interpolated(energy, rests[0], rests[1], t), stiffness)
     fixed = torch.zeros(len(first), dtype=torch.bool) if fixed is None else fixed
     start_rows = x.T[:, None].contiguous()
     rows, energies, stagnated = _minimise(energy, faces, start_rows, reference, fixed, max_steps)

@@ -50,7 +50,7 @@ class WarpedModes:
 
     def amplitudes(self, shapes: Tensor) -> Tensor:
         """Amplitudes whose gradients are nearest to those of shapes. *Shape:* ``(B, V, 3) -> (B, k)``."""
-        own, turns = self.own, self.rotations.turns(self.basis.reference.expand_as(shapes), shapes)
+        own, turns = self.own, self.rotations.quaternions(self.basis.reference.expand_as(shapes), shapes)
         turn, strain = bending_between(own, frames_of(shapes, self.faces), turns)
         moved = []
         for (x, y), rest in zip(stretch(strain, *own[3:]), self.sides, strict=True):

@@ -54,7 +54,7 @@ def fine_meshes(levels: int, n_proxy: int, picture: Path | None) -> list[str]:
 
     def carried() -> Tensor:
         between = by_proxy(*proxy.keyframes, 0.5)
-        return proxy.carried(torch.stack([proxy.keyframes[0], between, proxy.keyframes[1]]), [0, 2], keyframes)
+        return proxy.carry(torch.stack([proxy.keyframes[0], between, proxy.keyframes[1]]), [0, 2], keyframes)
 
     with torch.no_grad():
         (found, own_time), (full, whole_time) = timed(carried), timed(lambda: whole(*keyframes, 0.5))

@@ -11,9 +11,9 @@ of all rounds, so that what else a machine does slows all sides. In-betweens, wi
 without; making a layer is over the set-up of their shape space. ``--before`` names the folder of another checkout, for
 example of an earlier commit, which each column is then compared with. Bases are there before the clock starts, but for
 ``--parts first``: from two new key-frames to a sequence with nothing cached, on the clock. ``--parts batches`` compares
-batches, forward and with their gradients, with single calls, and a GPU with the CPU beside it; ``--parts blends`` a blend
-of six key-frames with a pair. ``--parts threads`` compares two threads with one, in turns, on the clock: more rounds find
-the quiet moments of a machine.
+batches, forward and with their gradients, with single calls, and a GPU with the CPU of the same machine; ``--parts
+blends`` a blend of six key-frames with a pair. ``--parts threads`` compares two threads with one, in turns, on the
+clock: more rounds find the quiet moments of a machine.
 """
 
 import argparse

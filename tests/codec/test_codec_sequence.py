@@ -168,7 +168,7 @@ def test_other_frames_are_fitted_beside_the_same_path(encoded: tm.ModalSequence,
         encoded.fit(motion[:1], 9.0)
 
 
-def test_cycle(bars: Shapes) -> None:
+def test_frames_of_a_cycle_are_encoded_and_decoded(bars: Shapes) -> None:
     basis = bars.bases[0]
     times = torch.tensor([0.0, 2.0, 4.0, 6.0]).double()
     decoder = tm.ModalDecoder(bars.keyframes, bars.faces, times, basis.reference, basis.modes)

@@ -13,7 +13,7 @@ from torch_modal.completion.gradient import LastSolve
 from torch_modal.completion.pairs import Cloud, Pairs, SampledSurface
 from torch_modal.elastic.steps import FineEnergy
 from torch_modal.elastic.term import Mesh
-from torch_modal.motion.decoder import scaled
+from torch_modal.motion.decoder import scale_modes
 from torch_modal.registration.surface import places_between
 
 
@@ -202,7 +202,7 @@ class TestRefusals:
 
 def test_derivatives_of_modal_bending(tube):
     x, faces, _ = tube
-    modes = scaled(tm.extract_modes(x[0], faces, 6).modes, 100.0)
+    modes = scale_modes(tm.extract_modes(x[0], faces, 6).modes, 100.0)
     bending = ModalBending(100 * x[0], faces, modes)
     pose = bending.still()
     pose.amplitudes += torch.linspace(-3, 3, 6)

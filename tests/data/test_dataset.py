@@ -62,7 +62,7 @@ def assert_same(found: list[dict[str, Any]], expected: list[dict[str, Any]]) -> 
             assert torch.equal(torch.as_tensor(mine[name]), torch.as_tensor(its[name])), name
 
 
-def test_samples(root: Path, bars: Shapes) -> None:
+def test_a_dataset_gives_samples_of_all_its_sets(root: Path, bars: Shapes) -> None:
     data = dataset(root, faces=True)
     assert len(data) == N_SETS * PER_SET
     assert [Path(path).name for path in data.sets] == ["a", "b", "small"]
@@ -348,7 +348,7 @@ def test_only_the_last_sets_stay_open(root: Path, monkeypatch: pytest.MonkeyPatc
     assert len(pickle.dumps(data)) < 4000
 
 
-def test_refuses(root: Path, tmp_path: Path) -> None:
+def test_what_a_dataset_refuses(root: Path, tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match="no stored key-frame set in"):
         tm.ShapeDataset(tmp_path)
     with pytest.raises(FileNotFoundError, match="no folder"):

@@ -8,7 +8,7 @@ import torch
 from conftest import Shapes
 
 import torch_modal as tm
-from torch_modal.data.stored import Motion
+from torch_modal.data.stored import KeyframeTimes
 
 F64 = torch.float64
 TIMES = (0.0, 0.5, 2.0, 3.0, 4.5)
@@ -30,19 +30,19 @@ def largest(x: torch.Tensor) -> float:
 
 # ------------------------------------------------------------------------------------------------------------ times
 def test_neighbours_in_time() -> None:
-    assert Motion(range(4), 4).neighbours.tolist() == [[1, 1], [0, 2], [1, 3], [2, 2]]
-    assert Motion(range(5), 4, cyclic=True).neighbours.tolist() == [[3, 1], [0, 2], [1, 3], [2, 0]]
-    assert Motion(range(2), 2).neighbours.tolist() == [[1, 1], [0, 0]]
+    assert KeyframeTimes(range(4), 4).neighbours.tolist() == [[1, 1], [0, 2], [1, 3], [2, 2]]
+    assert KeyframeTimes(range(5), 4, cyclic=True).neighbours.tolist() == [[3, 1], [0, 2], [1, 3], [2, 0]]
+    assert KeyframeTimes(range(2), 2).neighbours.tolist() == [[1, 1], [0, 0]]
 
 
 def test_spans_of_successive_key_frames() -> None:
-    motion = Motion((0, 1, 3, 4), 4)
+    motion = KeyframeTimes((0, 1, 3, 4), 4)
     assert [motion.span(*pair) for pair in ((0, 1), (1, 2), (2, 1), (2, 3))] == [(0, 1), (1, 3), (3, 1), (3, 4)]
     assert motion.span(0, 2) is None and motion.span(0, 3) is None and motion.span(1, 1) is None
-    cycle = Motion((0, 1, 3, 5), 3, cyclic=True)
+    cycle = KeyframeTimes((0, 1, 3, 5), 3, cyclic=True)
     assert [cycle.span(*pair) for pair in ((2, 0), (0, 2), (0, 1))] == [(3, 5), (5, 3), (0, 1)]
     # Two have nobody to be smooth with, whichever way they go round.
-    assert Motion(range(2), 2).span(0, 1) is None and Motion(range(3), 2, cyclic=True).span(0, 1) is None
+    assert KeyframeTimes(range(2), 2).span(0, 1) is None and KeyframeTimes(range(3), 2, cyclic=True).span(0, 1) is None
 
 
 # ----------------------------------------------------------------------------------------------------------- shapes

@@ -122,7 +122,7 @@ def assert_core_runs(core: Any, x: Tensor, stiffness: list[Tensor]) -> None:
     pose = Pose(blank(2, 3, 3), blank(2, 3))
     shapes = core.space.lift(a, rests.shapes)[0] if paired else core.space.lift(a, x)
     assert_there([placement, core.space.derivatives(a, placement), shapes])
-    assert_there([core.alignment.restore(shapes, pose), core.alignment.bring(shapes, pose)])
+    assert_there([core.alignment.to_caller(shapes, pose), core.alignment.to_frame(shapes, pose)])
     reference = rests.reference(core.fine.energy)
     assert_there(reference)
     steps(core.fine.energy, shapes, reference)
@@ -138,7 +138,7 @@ def test_shell_energy(small_bars: Shapes) -> None:
 @pytest.mark.parametrize("backend", ["torch", "warp"])
 @pytest.mark.parametrize("preset", ["accurate", "fast", "paper"])
 @pytest.mark.parametrize("kind", ["InBetween", "InBetween with contact", "MidShape"])
-def test_layers(small_bars: Shapes, kind: str, preset: Any, backend: Any) -> None:
+def test_layers_stay_on_the_gpu(small_bars: Shapes, kind: str, preset: Any, backend: Any) -> None:
     if backend == "warp":
         pytest.importorskip("warp")
     if preset == "paper" and "contact" in kind:
@@ -158,19 +158,19 @@ def test_layers(small_bars: Shapes, kind: str, preset: Any, backend: Any) -> Non
 
 
 @pytest.mark.parametrize("backend", ["torch", "warp"])
-def test_splines(small_bars: Shapes, backend: str) -> None:
+def test_splines_stay_on_the_gpu(small_bars: Shapes, backend: str) -> None:
     """Triangles and poses between key-frames."""
     spline = tm.Path(small_bars.keyframes, small_bars.faces, solver=tm.Solver(backend=backend)).splines[0]
     knots = spline.knots(small_bars.keyframes[None])
     with gpu() as mode, torch.no_grad():
         on_gpu(spline, mode)
-        knots = trees.filled(knots, [there(x, mode) for x in trees.leaves(knots)])
+        knots = trees.fill(knots, [there(x, mode) for x in trees.leaves(knots)])
         u, which = blank(2), torch.zeros(2, dtype=torch.int64, device="cuda")
         assert_there([spline.straight(knots, 1, which, u), spline.pose(knots, 1, which, u)])
-        assert_there(spline.rotations[1].along(spline.trajectory(knots, 1), which, u))
+        assert_there(spline.rotations[1].edges_along(spline.trajectory(knots, 1), which, u))
 
 
-def test_contacts() -> None:
+def test_contact_energies_stay_on_the_gpu() -> None:
     with gpu() as mode, torch.no_grad():
         x, contacts = blank(2, 30, 3), Contacts(torch.arange(2, device="cuda"), there(ELEMENTS, mode))
         energy = ContactEnergy(contacts, blank(30), x)

@@ -128,7 +128,7 @@ def test_local_steps(case: Case) -> None:
 
 
 @torch.no_grad()
-def test_distortion(case: Case) -> None:
+def test_distortion_by_kernels_and_by_torch_agree(case: Case) -> None:
     """Also of needles, whose weights are bounded."""
     i, j, *tips = case.mesh.hinges[0].tolist()
     for x in case.given[1:3]:
@@ -204,10 +204,10 @@ class TestModal:
         given = [a, *trees.leaves(own)]
 
         def by_kernels(a: Tensor, *leaves: Tensor) -> Tensor:
-            return by_kernel.gradient(a, trees.filled(own, leaves))
+            return by_kernel.gradient(a, trees.fill(own, leaves))
 
         def by_torch(a: Tensor, *leaves: Tensor) -> Tensor:
-            return plain.gradient(a, by_kernel.by_torch(trees.filled(own, leaves)))
+            return plain.gradient(a, by_kernel.by_torch(trees.fill(own, leaves)))
 
         assert_alike([by_kernels(*given)], [plain.derivatives(a, truth).gradient], 1e-10)
         found, wanted = (torch.func.vjp(each, *given)[1](direction) for each in (by_kernels, by_torch))
@@ -253,7 +253,7 @@ class TestModal:
         assert by_kernel.derivatives(several, many, second_order=False).second_order is None
 
     @pytest.mark.parametrize("n_shapes", [1, 2, 4])
-    def test_references(self, case: Case, n_shapes: int) -> None:
+    def test_merged_references_by_kernels_and_by_torch_agree(self, case: Case, n_shapes: int) -> None:
         shell, (_, first, second, _, *stiffness) = case.fused, case.given
         shapes = torch.stack([first, second, 0.5 * (first + second), 1.1 * second], 1)[:, :n_shapes]
         weights = torch.tensor([[0.4, 0.7, 0.2, -0.3], [0.1, 0.2, 0.3, 0.4]], dtype=DOUBLE)[:, :n_shapes]
@@ -278,7 +278,7 @@ def turned(rotations: WarpRotations, kind: type[LocalRotations] = WarpRotations)
     poisson = Poisson(mesh, torch.linspace(1, 2, len(mesh.edges), dtype=DOUBLE))
 
     def run(first: Tensor, second: Tensor, t: Tensor) -> Tensor:
-        return kind.pulls(rotations, torch.stack([first, second], 1), torch.stack([1 - t, t], -1), poisson)
+        return kind.right_hand_side(rotations, torch.stack([first, second], 1), torch.stack([1 - t, t], -1), poisson)
 
     return run
 
@@ -342,7 +342,7 @@ class TestRotations:
             found = cubics(torch.stack([rotations.step(before, own), rotations.step(own, after)]), t.new_ones(2), False)
             size = torch.stack(own[3:])
             trajectory = Trajectory(own.e1, own.e2, own.normal, size, *(part[1] for part in found))
-            return kind.along(rotations, trajectory, which, t)
+            return kind.edges_along(rotations, trajectory, which, t)
 
         def by_warp(*given: Tensor) -> Tensor:
             return by(WarpRotations, *given)
@@ -372,7 +372,7 @@ class TestLayers:
 
     @pytest.mark.parametrize("over", ["t", "terms.0.stiffness", "terms.2.stiffness"])
     @pytest.mark.parametrize("preset", ["accurate", "fast"])
-    def test_vmap(self, small_bars: Shapes, preset: Any, over: str) -> None:
+    def test_vmap_over_times_and_stiffnesses(self, small_bars: Shapes, preset: Any, over: str) -> None:
         """Over what not every tensor of a solve depends on; with its gradients, with and without recording."""
         stiffness = {"alpha": torch.tensor(500.0), "beta": torch.tensor(10.0), "gamma": torch.tensor(1e3)}
         objective = replace(PRESETS[preset].objective, **stiffness)

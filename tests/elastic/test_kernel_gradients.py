@@ -68,7 +68,7 @@ def assert_differences(run: Any, given: list[Tensor], h: float = 1e-4, to: float
 def pulls(x: Tensor, faces: Tensor) -> Any:
     rotations = WarpRotations(Connectivity(faces.numpy()), x)
     poisson = Poisson(mesh := Connectivity(faces.numpy()), torch.linspace(1, 2, len(mesh.edges), dtype=DOUBLE))
-    return lambda shapes, weights: rotations.pulls(shapes, weights, poisson)
+    return lambda shapes, weights: rotations.right_hand_side(shapes, weights, poisson)
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.03, 1.0, 3.0])
@@ -105,13 +105,13 @@ def test_on_a_trajectory(small_bars: Shapes) -> None:
     given = [*frame, size, *(0.3 * noise(6, 2, n, seed=seed) for seed in (1, 2, 3)), noise(3).sigmoid()]
 
     def run(*given: Tensor) -> Tensor:
-        return rotations.along(Trajectory(*given[:-1]), which, given[-1])
+        return rotations.edges_along(Trajectory(*given[:-1]), which, given[-1])
 
     assert_differences(run, given)
 
 
 @pytest.mark.parametrize("index", [0, 1], ids=["turns", "pose"])
-def test_poses(index: int) -> None:
+def test_gradients_of_mean_poses(index: int) -> None:
     x = noise(1, 20, 3) * torch.tensor([3.0, 2.0, 1.0]) + 0.3 * noise(3, 2, 20, 3, seed=1)
     x = x @ exp(noise(3, 2, 3, seed=2)).mT
     t = torch.tensor([0.0, 0.3, 1.0], dtype=DOUBLE)
@@ -170,7 +170,7 @@ def test_gradients_in_amplitudes(elastic: Elastic) -> None:
     torch.testing.assert_close(found, wanted, rtol=1e-8, atol=1e-8 * float(wanted.abs().max()))
 
 
-def test_steps(elastic: Elastic) -> None:
+def test_gradients_of_steps_of_all_vertices(elastic: Elastic) -> None:
     x, records = elastic.shapes.mean(1), elastic.reference().records
 
     def run(x: Tensor, *factors: Tensor) -> Tensor:

@@ -26,7 +26,7 @@ from torch_modal.layers.mid_shape import MidShape
 # ----------------------------------------------------------------------------------------------- known solutions
 
 
-def test_rosenbrock() -> None:
+def test_minimum_of_rosenbrock_is_found() -> None:
     solution = minimise(Rosenbrock(), start([-1.2, 1.0], [3.0, -2.0], [1.0, 1.0]), None)
     torch.testing.assert_close(solution.amplitudes, torch.ones(3, 2, dtype=torch.float64), atol=1e-6, rtol=0)
     assert solution.converged.all()

@@ -181,7 +181,7 @@ def test_resolution_is_the_size_of_rounding(bars: Shapes) -> None:
     x = bars.keyframes[:1] * 25
     a = torch.zeros(1, 8, dtype=torch.float64)
     for far in (1e5, 1e7):
-        got = modal.derivatives(a, modal.place(x + far, shell.against(x)), second_order=False)
+        got = modal.derivatives(a, modal.place(x + far, shell.reference_of(x)), second_order=False)
         noise, bound = float(got.gradient.norm()), float(got.resolution)
         assert 0 < noise < 4 * bound
         assert bound < 1e3 * noise

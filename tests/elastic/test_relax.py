@@ -69,7 +69,7 @@ def case(request: pytest.FixtureRequest, small_bars: Shapes) -> Case:
     return Case(small_bars, small_bars.faces if request.param == "closed" else small_bars.faces[6:])
 
 
-def test_gradient(case: Case) -> None:
+def test_gradient_is_that_of_the_energy_of_each_sample(case: Case) -> None:
     got = case.core.fold(case.core.gradient(case.at(case.x)))
     for sample in range(BATCH):
         x = case.x[sample].clone().requires_grad_()

@@ -48,7 +48,7 @@ def test_closed_forms_agree_with_torch_func(surface: tuple[Mesh, Tensor], genera
     for terms in (written, plain):
         energy = Energy(mesh, terms)
         rest = energy.rest(energy.extend(x[:2].movedim(-1, 0)))
-        reference = energy.against(rest, [term.stiffness for term in terms])
+        reference = energy.reference_of(rest, [term.stiffness for term in terms])
         space = ModalEnergy(energy, columns)
         placement = space.place(x[1:3], reference)
         a = 0.1 * torch.ones(2, 6, dtype=DOUBLE)
@@ -190,7 +190,7 @@ class TestAnchors:
         shell = tm.ShellEnergy(bars.faces, terms=(Spring([3], torch.full((1, 3), 30.0, dtype=DOUBLE)),))
         rest, modes = bars.keyframes[:1], bars.bases[0].modes
         energy, a = tm.ModalEnergy(shell, modes), torch.full((1, 8), 0.1, dtype=DOUBLE)
-        placement = energy.place(rest, shell.against(rest))
+        placement = energy.place(rest, shell.reference_of(rest))
         moved = rest + torch.tensordot(a, modes, 1)
         truth = tm.ShellEnergy(bars.faces)(moved, rest) + (moved[:, 3] - 30).square().sum(-1)
         torch.testing.assert_close(energy.value(a, placement), truth)

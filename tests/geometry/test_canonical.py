@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from sheets import cylinder, folded, rectangle
 
 import torch_modal as tm
-from torch_modal.geometry.canonical import ROUNDING, in_order, placed, size
+from torch_modal.geometry.canonical import ROUNDING, in_order, size, to_canonical
 from torch_modal.geometry.decimation import decimate
 from torch_modal.registration.load import load_keyframes
 
@@ -51,10 +51,10 @@ def test_of_no_area_the_size_is_the_diagonal() -> None:
 
 def test_placed_points_are_those_of_the_caller(hand: Mesh) -> None:
     points, faces = hand[0][0], hand[1]
-    own, axes, centre, scale = placed(points, faces)
+    own, axes, centre, scale = to_canonical(points, faces)
     np.testing.assert_allclose(own @ axes / scale + centre, points, atol=ROUNDING / scale)
     assert np.linalg.det(axes) == pytest.approx(1.0)
-    turned = placed(points @ TURN.T * 7.0 + 5.0, shuffled(faces))[0]
+    turned = to_canonical(points @ TURN.T * 7.0 + 5.0, shuffled(faces))[0]
     assert np.abs(turned - own).max() <= ROUNDING
     assert (turned == own).mean() > 0.999
 
@@ -64,13 +64,13 @@ def test_axes_of_symmetric_shapes_are_the_callers() -> None:
     cube = trimesh.creation.box((1.0, 1.0, 1.0)).subdivide()
     for seed in range(5):
         faces = np.random.default_rng(seed).permutation(cube.faces)
-        np.testing.assert_allclose(placed(cube.vertices + 0.1, faces)[1], np.eye(3), atol=1e-9)
+        np.testing.assert_allclose(to_canonical(cube.vertices + 0.1, faces)[1], np.eye(3), atol=1e-9)
     bar = trimesh.creation.box((1.0, 4.0, 1.0))
-    np.testing.assert_allclose(np.abs(placed(bar.vertices, bar.faces)[1][0]), [0, 1, 0], atol=1e-9)
+    np.testing.assert_allclose(np.abs(to_canonical(bar.vertices, bar.faces)[1][0]), [0, 1, 0], atol=1e-9)
 
 
 def test_order_of_faces_follows_from_the_points(hand: Mesh) -> None:
-    points, faces = placed(hand[0][0], hand[1])[0], hand[1]
+    points, faces = to_canonical(hand[0][0], hand[1])[0], hand[1]
     order, expected = in_order(points, faces)
     found = {tuple(np.roll(f, -f.argmin())) for f in order[expected]}
     assert {tuple(np.roll(f, -f.argmin())) for f in faces} == found

@@ -111,7 +111,7 @@ def test_quaternions_of_all_rotations(generator: torch.Generator) -> None:
 # ------------------------------------------------------------------------------------------------------ derivatives
 @pytest.mark.parametrize("angle", [*ANGLES[:-1], math.pi - 1e-3, math.pi, math.pi + 1e-3])
 @pytest.mark.parametrize("function", [exp, lambda w: log(exp(w)), through_quaternions], ids=["exp", "log", "all"])
-def test_gradcheck(function: Callable[[Tensor], Tensor], angle: float) -> None:
+def test_exp_and_log_have_both_derivatives(function: Callable[[Tensor], Tensor], angle: float) -> None:
     start = turns(angle, 3)
     if angle == math.pi:  # away from the cut: on one side of it, differences do not cross it
         start = (1 - 1e-5) * start

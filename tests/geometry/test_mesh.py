@@ -98,7 +98,7 @@ def test_hinge_of_faces_that_wind_against_each_other() -> None:
     assert {k, m} == {1, 3}
 
 
-def test_pieces() -> None:
+def test_vertices_are_grouped_by_connected_pieces() -> None:
     mesh = Connectivity(np.concatenate([TETRAHEDRON + 1, SQUARE + 6]), n_vertices=11)
     assert mesh.vertex_pieces.tolist() == [0, 1, 1, 1, 1, 2, 3, 3, 3, 3, 4]
     assert connected_pieces(np.zeros((0, 2), dtype=np.int64), 3).tolist() == [0, 1, 2]

@@ -134,7 +134,7 @@ def test_most_of_the_area_of_a_piece_says_which_way_it_turns(fused: bool) -> Non
     wanted = torch.cat([angles, angles, angles.flip(0), angles.flip(0)])
     roots = wanted[rotations.ancestors[0] == torch.arange(len(wanted))]
     assert len(roots) == 2 and float(roots.min()) < math.pi < float(roots.max())
-    found = rotations.turns(first[None], second[None])[0, 0]
+    found = rotations.quaternions(first[None], second[None])[0, 0]
     torch.testing.assert_close(found, (0.5 * wanted).cos(), rtol=0, atol=1e-12)
 
 
@@ -148,7 +148,7 @@ def test_triangles_without_area_are_survived(kind: type[LocalRotations], dtype: 
     mesh = Connectivity(faces.numpy())
     rotations = kind(mesh, torch.stack([x_a, x_b]))
     given = [x.requires_grad_() for x in (x_a[None], x_b[None], torch.tensor([0.5], dtype=dtype))]
-    found = rotations.pulls(*pair(*given), Poisson(mesh, torch.ones(len(mesh.edges), dtype=dtype)))
+    found = rotations.right_hand_side(*pair(*given), Poisson(mesh, torch.ones(len(mesh.edges), dtype=dtype)))
     assert found.isfinite().all()
     for gradient in torch.autograd.grad(found.square().sum(), given):
         assert gradient.isfinite().all()
@@ -237,7 +237,7 @@ def test_pieces_that_share_a_vertex_stay_together() -> None:
 
 
 @pytest.mark.parametrize("degrees", [0, 1e-7, 1, 120, 300])
-def test_derivatives(degrees: float, generator: torch.Generator) -> None:
+def test_derivatives_of_local_rotations_where_little_turns(degrees: float, generator: torch.Generator) -> None:
     """Where nothing turns, too: most of a shape does not."""
     (x_a, faces), (x_b, _) = ribbon(0.0, 5), ribbon(math.radians(degrees), 5)
     roughness = 0.0 if degrees == 0 else 0.01
@@ -316,7 +316,7 @@ def test_a_roll_keeps_its_lengths(strip_mesh: Connectivity, kind: type[LocalRota
 
 
 @pytest.mark.parametrize("kind", [LocalRotations, WarpRotations])
-def test_gradients(strip_mesh: Connectivity, kind: type[LocalRotations]) -> None:
+def test_gradients_of_local_rotations_beyond_a_full_turn(strip_mesh: Connectivity, kind: type[LocalRotations]) -> None:
     """Away from where triangles turn by whole turns exactly, and there."""
     rotations = kind(strip_mesh, torch.stack([strip(0), strip(TURNS)]))
     noise = 0.01 * torch.randn(2, len(strip(0)), 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))

@@ -245,7 +245,7 @@ def test_poisson_gives_shapes_back(two_pieces: tuple[Connectivity, torch.Tensor]
     mass = torch.rand(mesh.n_vertices, generator=generator, dtype=F64)
     near = torch.randn(x.shape, generator=generator, dtype=F64)
     for solver, share in ((Poisson(mesh, weights), torch.ones_like(mass)), (Poisson(mesh, weights, mass), mass)):
-        pulls = solver.pulls(edges_of(x, mesh))
+        pulls = solver.right_hand_side(edges_of(x, mesh))
         torch.testing.assert_close(solver(pulls, x.movedim(0, -1)), x.movedim(0, -1))
         found = solver(pulls, near.movedim(0, -1)).movedim(-1, 0)
         torch.testing.assert_close(edges_of(found, mesh), edges_of(x, mesh))

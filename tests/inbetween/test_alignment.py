@@ -95,14 +95,14 @@ def test_points_are_brought_where_shapes_are(frame: tuple[KeyframeAlignment, Coa
     shapes, pose, usable = alignment(moved, torch.tensor([[0.7, 0.3]], dtype=DOUBLE))
     x = shapes[:, 0] + 1
     assert usable.all()
-    torch.testing.assert_close(alignment.bring(alignment.restore(x, pose), pose), x, atol=1e-9, rtol=0)
+    torch.testing.assert_close(alignment.to_frame(alignment.to_caller(x, pose), pose), x, atol=1e-9, rtol=0)
 
 
 def test_all_the_weight_is_the_pose_of_a_key_frame(frame: tuple[KeyframeAlignment, CoarseMesh], moved: Tensor) -> None:
     alignment, _ = frame
     for k, weights in enumerate(torch.eye(2, dtype=DOUBLE)):
         shapes, pose, _ = alignment(moved, weights[None])
-        torch.testing.assert_close(alignment.restore(shapes[:, k], pose), moved[:, k], atol=1e-10, rtol=0)
+        torch.testing.assert_close(alignment.to_caller(shapes[:, k], pose), moved[:, k], atol=1e-10, rtol=0)
 
 
 def test_the_pose_of_two_takes_the_short_way(bars: Shapes, generator: torch.Generator) -> None:
@@ -114,5 +114,5 @@ def test_the_pose_of_two_takes_the_short_way(bars: Shapes, generator: torch.Gene
     step = 0.5 * log(torch.stack([random_rotation(generator) for _ in range(20)]))
     keyframes = torch.stack([x @ first.mT, x @ exp(2 * step).mT @ first.mT], 1)
     shapes, pose, _ = alignment(keyframes, torch.full((20, 2), 0.5, dtype=DOUBLE))
-    found = alignment.restore(shapes[:, 0], pose)
+    found = alignment.to_caller(shapes[:, 0], pose)
     torch.testing.assert_close(found, x @ exp(step).mT @ first.mT, atol=1e-9, rtol=0)

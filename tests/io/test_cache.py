@@ -215,7 +215,7 @@ def test_several_processes_share_the_limit(tmp_path: Path) -> None:
     ("text", "size"),
     [("1000", 1000), ("2k", 2048), ("500M", 500 * 2**20), ("1.5 GiB", 3 * 2**29), ("4GB", 2**32), ("1T", 2**40)],
 )
-def test_sizes(text: str, size: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_limits_of_the_cache_have_units(text: str, size: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("TORCH_MODAL_CACHE_LIMIT", text)
     assert Cache.at(tmp_path).limit == size
 

@@ -529,7 +529,7 @@ def test_mapped_times(name: str, small_bars: Shapes) -> None:
 
 def test_steps_of_one_sample(small_bars: Shapes) -> None:
     made, x = Step(small_bars), small_bars.keyframes
-    placement = made.step.energy.place(x[0], made.shell.against(x[1]))
+    placement = made.step.energy.place(x[0], made.shell.reference_of(x[1]))
     with pytest.raises(ValueError, match=r"amplitudes have the shape \(B, n\).* got \(3,\): .*pass a\[None\]"):
         made.step(torch.zeros(3, dtype=DOUBLE), placement)
 

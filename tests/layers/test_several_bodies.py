@@ -12,7 +12,7 @@ from torch import Tensor
 import torch_modal as tm
 from torch_modal.elastic.minimise import Status
 from torch_modal.geometry.connectivity import Connectivity
-from torch_modal.inbetween.results import InBetweenResult, of_bodies, unminimised
+from torch_modal.inbetween.results import InBetweenResult, join_bodies, trivial_solution
 from torch_modal.modes.basis import ModalBasis
 
 DOUBLE = torch.float64
@@ -155,12 +155,12 @@ def test_status_is_the_worst() -> None:
     results = []
     for own in (first, second):
         x = torch.zeros(len(own), 2, 3, dtype=DOUBLE)
-        known = unminimised(x, torch.tensor(own) == good)
+        known = trivial_solution(x, torch.tensor(own) == good)
         ones = torch.ones(len(own), dtype=DOUBLE)
         changed = {"status": torch.tensor(own), "energy": ones, "gradient_norm": ones, "distortion_ratio": ones}
         changed["start_weights"] = torch.eye(7, 2, dtype=DOUBLE) if own is first else torch.zeros(7, 2, dtype=DOUBLE)
         results.append(InBetweenResult(x, known._replace(**changed)))
-    found = of_bodies(results, [torch.tensor([0, 3]), torch.tensor([1, 2])])
+    found = join_bodies(results, [torch.tensor([0, 3]), torch.tensor([1, 2])])
     assert found.solution.status.tolist() == [good, fell, steps, stalled, invalid, stalled, fell]
     assert bool((found.solution.energy == 2).all() and (found.solution.gradient_norm == 1).all())
     assert found.shapes.shape == (7, 4, 3) and torch.equal(found.solution.start_weights, torch.eye(7, 2, dtype=DOUBLE))

@@ -61,7 +61,7 @@ class TestLatentElasticity:
 
     @pytest.mark.parametrize("spectrum", ["mean", "roots"])
     @pytest.mark.parametrize("step", [None, 1e-2])
-    def test_gradients(
+    def test_gradients_of_latent_elasticity(
         self,
         bars: Shapes,
         decoder: Bending,
@@ -141,6 +141,8 @@ def test_decoders_in_half_precision(bars: Shapes) -> None:
         ),
     ],
 )
-def test_arguments(call: Callable[..., object], words: str, bars: Shapes, decoder: Bending, z: Tensor) -> None:
+def test_arguments_that_latent_losses_refuse(
+    call: Callable[..., object], words: str, bars: Shapes, decoder: Bending, z: Tensor
+) -> None:
     with pytest.raises(ValueError, match=words):
         call(bars.faces, decoder, z)

@@ -46,7 +46,7 @@ def test_rigid_modes_are_the_rigid_motions(basis: ModalBasis) -> None:
     torch.testing.assert_close(basis.rigid_modes[:3], expected)
 
 
-def test_truncate(basis: ModalBasis) -> None:
+def test_a_truncated_basis_has_the_first_modes(basis: ModalBasis) -> None:
     first = basis.truncate(2)
     assert torch.equal(first.modes, basis.modes[:2])
     assert torch.equal(first.eigenvalues, basis.eigenvalues[:2])
@@ -55,7 +55,7 @@ def test_truncate(basis: ModalBasis) -> None:
         basis.truncate(6)
 
 
-def test_to(basis: ModalBasis) -> None:
+def test_a_basis_is_cast_and_moved(basis: ModalBasis) -> None:
     single = basis.to(torch.float32)
     assert {t.dtype for t in (single.reference, single.modes, single.rigid_modes)} == {torch.float32}
     assert basis.modes.dtype == torch.float64

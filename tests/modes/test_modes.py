@@ -14,7 +14,7 @@ from benchmarks.quadratic import quadratic_modes
 from conftest import COARSE
 from solids import as_mesh, box, eigenmodes, lumped_mass, surface, together
 
-from torch_modal.geometry.canonical import placed
+from torch_modal.geometry.canonical import to_canonical
 from torch_modal.keyframes.check import MeshError, MeshWarning
 from torch_modal.modes import carrying, eigen, extract, parallel
 from torch_modal.modes import lattice as lattice_module
@@ -208,7 +208,7 @@ def test_cached_modes_are_the_same_and_not_recomputed(
 
 def filled_with(monkeypatch: pytest.MonkeyPatch, solid: Tetrahedra, like: Mesh) -> None:
     """Have the lattice give these tetrahedra, placed as this surface is."""
-    _, axes, centre, scale = placed(*like)
+    _, axes, centre, scale = to_canonical(*like)
     vertices = ((solid.vertices - centre) * scale) @ axes.T
     monkeypatch.setattr(lattice_module, "lattice", lambda *_: solid._replace(vertices=vertices))
 

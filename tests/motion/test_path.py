@@ -440,7 +440,7 @@ def test_explain_tells_what_is_blended(bars: Shapes, monkeypatch: pytest.MonkeyP
     spline, knots = path.splines[0], path.knots(bars.keyframes[None])
     assert knots is not None
     which = torch.zeros(2, dtype=torch.int64)
-    straight = spline.alignment.restore(spline.straight(knots[0], 0, which, t), spline.pose(knots[0], 0, which, t))
+    straight = spline.alignment.to_caller(spline.straight(knots[0], 0, which, t), spline.pose(knots[0], 0, which, t))
     smooth = path(bars.keyframes, t)
     monkeypatch.setattr(path.distortions[0], "forward", lambda *_: torch.tensor([[2.5e30, 1], [1e30, 1e30]]).double())
     why = path.explain(bars.keyframes, t)

@@ -160,7 +160,7 @@ def test_broken_shapes_stay_alone(bars: Shapes) -> None:
         ({"reference": torch.ones(164, 3)}, "no face of the reference has an area"),
     ],
 )
-def test_arguments(bars: Shapes, change: dict[str, Tensor], words: str) -> None:
+def test_arguments_that_passengers_refuse(bars: Shapes, change: dict[str, Tensor], words: str) -> None:
     given = {"reference": bars.keyframes[0], "faces": bars.faces, "points": torch.zeros(4, 3)} | change
     with pytest.raises(ValueError, match=words):
         tm.Passengers(**given)

@@ -61,13 +61,13 @@ def test_detail_is_that_of_both_ends(rough: tuple[Tensor, Tensor]) -> None:
     for passengers, carrier, x in zip(proxy.passengers, proxy.keyframes, keyframes, strict=False):
         torch.testing.assert_close(passengers(carrier), x, rtol=0, atol=1e-12)
     # From the first to the last, and from there, as in a cycle, to the first.
-    found = proxy.carried(proxy.keyframes[[0, 0, 0, 0]], [0, 2, 4], keyframes[:2])
+    found = proxy.carry(proxy.keyframes[[0, 0, 0, 0]], [0, 2, 4], keyframes[:2])
     own, other = (passengers(proxy.keyframes[0]) for passengers in proxy.passengers)
     torch.testing.assert_close(found[[1, 3]], 0.5 * (own + other).expand(2, -1, -1))
 
 
 @pytest.mark.parametrize("proxy", [-1, 20, 0.5])
-def test_sizes(bars: Shapes, proxy: float) -> None:
+def test_sizes_of_a_proxy_that_are_refused(bars: Shapes, proxy: float) -> None:
     with pytest.raises(ValueError, match="at least 100"):
         tm.subdivide(bars.keyframes, bars.faces, proxy=proxy)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="bases belong to the whole mesh"):

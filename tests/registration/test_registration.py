@@ -395,7 +395,9 @@ def test_doubtful_key_frames_are_refused(files: list[Path], tmp_path: Path) -> N
         tm.load_keyframes([files[0], other], register=True, progress=False)
 
 
-def test_command(files: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str], found: tm.Registration) -> None:
+def test_register_command_writes_the_registered_mesh(
+    files: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str], found: tm.Registration
+) -> None:
     out = tmp_path / "wrapped.obj"
     command = ["register", *map(str, files[:2]), "--out", str(out), "--cache-dir", str(tmp_path / "cache")]
     assert cli.main(command) == 0

@@ -82,7 +82,7 @@ def test_two_keyframes_make_two_seconds(tmp_path, options, end):
     assert gltf.accessors[gltf.animations[0].samplers[0].input].max[0] == end
 
 
-def test_npz(tmp_path):
+def test_an_animation_is_written_as_npz(tmp_path):
     path = tm.save_animation(FRAMES, FACES, tmp_path / "a.npz", keyframe_indices=[0, 3], duration=6)
     with np.load(path) as stored:
         np.testing.assert_array_equal(stored["frames"], FRAMES)

@@ -202,7 +202,7 @@ def test_animations_of_others_are_refused(
         read_shapes([path])
 
 
-def test_command(
+def test_view_command_writes_a_page(
     tmp_path: Path,
     ball: tuple[np.ndarray, np.ndarray],
     growing: np.ndarray,
@@ -403,7 +403,7 @@ def test_scrubbing_and_keys(page: Opened) -> None:
     assert page.text("#readout") == "frame 2 / 6"
 
 
-def test_playing(page: Opened) -> None:
+def test_a_page_plays_to_the_end(page: Opened) -> None:
     before = page.script("return torchModal.drawn")
     page.choose("ending", "stop")
     page.click("#play")  # and waits for the end
@@ -412,7 +412,7 @@ def test_playing(page: Opened) -> None:
     assert page.script("return torchModal.drawn") >= before + 3, "it went through frames between"
 
 
-def test_picking(page: Opened, growing: np.ndarray) -> None:
+def test_a_click_picks_a_vertex(page: Opened, growing: np.ndarray) -> None:
     canvas = page.chrome.find_element("id", "canvas").rect
     nearest = int(growing[0, :, 2].argmax())  # straight towards the viewer
     middle = canvas["y"] + canvas["height"] / 2
@@ -451,7 +451,7 @@ def test_dragging_turns_and_does_not_pick(page: Opened) -> None:
     assert (page.pixels() == before).all()
 
 
-def test_trails(page: Opened) -> None:
+def test_picked_vertices_leave_trails(page: Opened) -> None:
     canvas, before = page.chrome.find_element("id", "canvas").rect, page.pixels()
     page.click_at(canvas["x"] + canvas["width"] / 4, canvas["y"] + canvas["height"] / 2)
     page.script("document.querySelectorAll('#picked, .mark').forEach((card) => (card.style.visibility = 'hidden'))")
@@ -462,7 +462,7 @@ def test_trails(page: Opened) -> None:
     assert (page.pixels() != with_trail).any()
 
 
-def test_layouts(page: Opened) -> None:
+def test_sequences_are_shown_side_by_side_and_overlaid(page: Opened) -> None:
     page.seek(6)
     both = page.drawn_area()
     page.click("#sequences button:nth-child(2)")

@@ -306,7 +306,7 @@ def test_existing_pictures_stay_unless_asked_and_nothing_is_left_behind(tmp_path
     assert Image.open(out).format == "PNG"
 
 
-def test_pdf(tmp_path):
+def test_a_picture_is_written_as_pdf(tmp_path):
     path = render_sequence({"": growing(2)}, np.asarray(BALL.faces), tmp_path / "a.pdf", renderer="matplotlib")
     assert path.read_bytes().startswith(b"%PDF")
 

@@ -56,12 +56,12 @@ def select_keyframes(
         MeshError: Frames that cannot be used.
         ValueError: Times or numbers that cannot be used.
     """
-    x, triangles, when = checked_motion(frames, faces, times, cyclic)
+    x, triangles, when = check_motion(frames, faces, times, cyclic)
     modes = extract_modes(x[0], triangles, n_modes, cache_dir=cache_dir, cache=cache).modes
     return Selection(x, triangles, when, cyclic, modes).run(n_keyframes, error, progress)
 
 
-def checked_motion(frames: Any, faces: Any, times: Any, cyclic: bool) -> tuple[Tensor, Tensor, Tensor]:
+def check_motion(frames: Any, faces: Any, times: Any, cyclic: bool) -> tuple[Tensor, Tensor, Tensor]:
     """Checked frames (float64), faces and times; raises as :func:`torch_modal.encode`."""
     shapes, triangles = check_keyframes(frames, faces, min_keyframes=2, warn=False)
     return shapes.detach().cpu().double(), triangles.cpu(), check_times(times, len(shapes), cyclic)

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torch_modal.codec.fit import FittedFrames, fit
-from torch_modal.codec.selection import LARGEST_ERROR, Selection, checked_motion
+from torch_modal.codec.selection import LARGEST_ERROR, Selection, check_motion
 from torch_modal.io.tensors import TensorFile, write_tensors
 from torch_modal.keyframes.arrays import check_tensor
 from torch_modal.keyframes.check import check_keyframes
@@ -216,7 +216,7 @@ def encode(
         MeshError: Frames that cannot be used.
         ValueError: Key-frames, times or numbers that cannot be used.
     """
-    x, triangles, when = checked_motion(frames, faces, times, cyclic)
+    x, triangles, when = check_motion(frames, faces, times, cyclic)
     if isinstance(n_modes, bool) or not isinstance(n_modes, int) or n_modes < 1:
         raise ValueError(f"n_modes must be a whole number of at least 1; got {n_modes!r}")
     if not 0 < error < 1:

@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from torch_modal.arrays import BoolArray, FloatArray
-from torch_modal.autograd import lasting
+from torch_modal.autograd import outside_inference_mode
 from torch_modal.completion.bending import ModalBending, ModalPose
 from torch_modal.completion.energy import PointEnergy
 from torch_modal.completion.gradient import LastSolve, with_gradients
@@ -34,14 +34,14 @@ from torch_modal.elastic.stretch import Stretch
 from torch_modal.elastic.term import Mesh
 from torch_modal.elastic.volume import Volume, encloses
 from torch_modal.errors import MeshWarning
-from torch_modal.geometry.canonical import placed
+from torch_modal.geometry.canonical import to_canonical
 from torch_modal.geometry.rigid import best_fit
 from torch_modal.geometry.triangle_frames import frames_of, mirrored_sides
 from torch_modal.keyframes.arrays import require_units
-from torch_modal.keyframes.check import checked_arrays
+from torch_modal.keyframes.check import check_arrays
 from torch_modal.modes.coarsening import Coarsening, coarsen
 from torch_modal.modes.extract import extract_bases
-from torch_modal.motion.decoder import scaled
+from torch_modal.motion.decoder import scale_modes
 from torch_modal.motion.path import Path
 from torch_modal.progress import Progress, ProgressReport
 from torch_modal.registration.surface import places_between
@@ -199,7 +199,7 @@ def complete(
     return _differentiable(*found, given)
 
 
-@lasting
+@outside_inference_mode
 def _complete(
     whole: Tensor,
     faces: Tensor,
@@ -208,7 +208,7 @@ def _complete(
     progress: Progress,
 ) -> tuple[Completion, "_Completer"]:
     is_template = whole.dim() == 2
-    like, shapes, indices = checked_arrays(whole[None] if is_template else whole, faces)
+    like, shapes, indices = check_arrays(whole[None] if is_template else whole, faces)
     given = checked(observations, shapes.shape[1])
     at = np.zeros(0) if is_template else check_times(times, len(shapes)).numpy()
     solver = _Completer(shapes, torch.from_numpy(indices), at, given)
@@ -232,7 +232,7 @@ class _Completer:
 
     def __init__(self, shapes: FloatArray, faces: Tensor, times: FloatArray, given: list[Observation]) -> None:
         self.faces, self.times, self.n = faces, times, len(given)
-        _, self.axes, self.centre, self.scale = placed(shapes[0], faces.numpy())
+        _, self.axes, self.centre, self.scale = to_canonical(shapes[0], faces.numpy())
         self.whole = torch.from_numpy((shapes - self.centre) @ self.axes.T * self.scale)
         self.template = self.whole[0]
         samples = [self._sample(one, i) for i, one in enumerate(given)]
@@ -244,7 +244,7 @@ class _Completer:
         self.stiffness = ALPHA, BETA, GAMMA if closed else 0.0
         self.fine: FineEnergy = choose("auto").fine_energy(mesh, [Stretch(ALPHA), Bend(BETA), Volume(GAMMA)])
         basis = extract_bases(self.template[None], faces, N_MODES)[0]
-        modes = scaled(basis.modes, 100.0)
+        modes = scale_modes(basis.modes, 100.0)
         self.bending = ModalBending(self.template, faces, modes)
         self.coarse: Coarsening | None = None
         coarse_bending = self.bending
@@ -334,12 +334,12 @@ class _Completer:
 
     def _alike(self, i: int, shapes: Sequence[Tensor]) -> list[tuple[Tensor, ModalPose]]:
         """The shapes that explain most of a frame after a rigid motion: motions repeat."""
-        seen, placed = self._seen(i), []
+        seen, to_canonical = self._seen(i), []
         for x in shapes:
             base = self._coarsened(x)
             pose = self.poses.rigid(base, seen)
-            placed.append((self.poses.score(base, pose, seen), x, pose))
-        return [(x, pose) for _, x, pose in sorted(placed, key=lambda one: one[0])[:N_ALIKE]]
+            to_canonical.append((self.poses.score(base, pose, seen), x, pose))
+        return [(x, pose) for _, x, pose in sorted(to_canonical, key=lambda one: one[0])[:N_ALIKE]]
 
     def _starts(self, t: float, known: list[tuple[float, Tensor]]) -> list[tuple[Tensor, ModalPose]]:
         """Shapes from which a search at a time starts."""

@@ -9,7 +9,7 @@ from scipy.sparse.linalg import LinearOperator, cg
 from torch import Tensor
 
 from torch_modal.arrays import FloatArray, IntArray
-from torch_modal.autograd import recorded
+from torch_modal.autograd import is_double_backward
 from torch_modal.completion.energy import PointEnergy
 from torch_modal.elastic.energy import Energy, RestShapes
 from torch_modal.elastic.steps import TermsTowards, inverse_of_symmetric
@@ -76,7 +76,7 @@ class _ShapesOfPoints(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        if recorded(grad):
+        if is_double_backward(grad):
             raise RuntimeError("completed shapes have first derivatives only; take the gradient without create_graph")
         total = [np.zeros(one.shape) for one in ctx.like]
         for solve, own in zip(ctx.solves, grad.detach().cpu().double().numpy(), strict=True):

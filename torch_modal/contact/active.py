@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torch_modal.autograd import transformed
+from torch_modal.autograd import is_transformed
 from torch_modal.contact.detect import Search
 from torch_modal.elastic.steps import Point
 from torch_modal.elastic.term import Mesh
@@ -27,7 +27,7 @@ STIFFNESS = 3000.0
 
 def refuse_transforms(x: Tensor) -> None:
     """Raise for shapes within transforms of ``torch.func``, or with tangents: the search is not torch's."""
-    if transformed(x):
+    if is_transformed(x):
         raise RuntimeError(
             "shapes with contact have no forward mode, and no transforms of torch.func: take torch.autograd.grad, or "
             "contact=False"

@@ -99,7 +99,7 @@ def push_apart(
         goes_on: True where the motion goes on before the first and after the last key-frame.
     """
     scale = core.alignment.scale
-    seen = torch.cat([ends[1, :1], core.alignment.restore(x, pose), ends[1, 1:]]) * scale
+    seen = torch.cat([ends[1, :1], core.alignment.to_caller(x, pose), ends[1, 1:]]) * scale
     limit = AccelerationLimit(seen, pose.rotation, goes_on)
 
     def in_modes(some: Tensor, contact: ContactEnergy, accelerations: Tensor) -> Tensor:

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from torch_modal.autograd import full_precision, require_numbers, untraced
+from torch_modal.autograd import disable_compile, full_precision, require_numbers
 from torch_modal.data.shape_batch import ShapeBatch, check_labels, check_shapes
 from torch_modal.data.space import ShapeSpace
 from torch_modal.geometry.vectors import vertex_normals
@@ -175,7 +175,7 @@ class ShapeAugmentation(nn.Module):
         batch = ShapeBatch._make(parts)
         return batch._replace(shapes=batch.shapes.to(dtype))
 
-    @untraced
+    @disable_compile
     def forward(
         self,
         *inputs: Tensor | None,

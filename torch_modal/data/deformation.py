@@ -5,7 +5,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torch_modal.autograd import transformed
+from torch_modal.autograd import is_transformed
 from torch_modal.data.augmentation import Parameters, ShapeAugmentation, check_range, draw_normal, draw_uniform
 from torch_modal.data.in_betweens import compute_by_kind
 from torch_modal.data.shape_batch import ShapeBatch
@@ -87,7 +87,7 @@ class RandomModalDeformation(ShapeAugmentation):
         with torch.no_grad():
             scale, deformed = self._scale_to_bound(x.detach(), displacement.detach(), keyframe, space)
         recording = torch.is_grad_enabled() and (x.requires_grad or amplitudes.requires_grad)
-        if not recording and not transformed(x) and not transformed(amplitudes):
+        if not recording and not is_transformed(x) and not is_transformed(amplitudes):
             return deformed
         deformed = deform(x, scale[:, None] * displacement, keyframe, reconstruction)
         # Shapes beyond the bound stay as they were.

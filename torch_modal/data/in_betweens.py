@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from torch_modal.autograd import Recent
-from torch_modal.data.stored import Motion
+from torch_modal.data.stored import KeyframeTimes
 from torch_modal.elastic.implicit import ConvergenceWarning
 from torch_modal.elastic.minimise import Status
 from torch_modal.inbetween.results import InBetweenResult
@@ -28,7 +28,7 @@ FORMAT = "torch_modal.between"
 VERSION = "1"
 
 
-class InBetweens:
+class PairTables:
     """In-betweens of the key-frames of a space, and of shapes near them.
 
     Between two key-frames they are solved once, at even times, and cubics interpolate among these; if the two follow
@@ -47,7 +47,7 @@ class InBetweens:
         bases: list[ModalBasis],
         faces: Tensor,
         settings: Settings,
-        motion: Motion | None,
+        motion: KeyframeTimes | None,
         times: int | None,
         dtype: torch.dtype,
         folder: str | os.PathLike[str] | None,

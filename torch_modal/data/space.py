@@ -8,9 +8,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torch_modal.autograd import Recent, lasting
-from torch_modal.data.in_betweens import InBetweens, read_or_compute, versions
-from torch_modal.data.stored import Motion, StoredSet
+from torch_modal.autograd import Recent, outside_inference_mode
+from torch_modal.data.in_betweens import PairTables, read_or_compute, versions
+from torch_modal.data.stored import KeyframeTimes, StoredSet
 from torch_modal.data.strain import mode_scales
 from torch_modal.geometry.canonical import size
 from torch_modal.geometry.crossings import require_contact
@@ -61,7 +61,7 @@ class ShapeSpace:
             ascend.
     """
 
-    @lasting
+    @outside_inference_mode
     def __init__(
         self,
         bases: ModalBasis | Sequence[ModalBasis],
@@ -84,8 +84,8 @@ class ShapeSpace:
         if self.settings.objective.contact:
             require_contact()
         self.dtype = dtype
-        self.motion = Motion.of(keyframe_times, len(self.bases), cyclic)
-        self.in_betweens = InBetweens(self.bases, self.faces, self.settings, self.motion, times, dtype, folder)
+        self.motion = KeyframeTimes.of(keyframe_times, len(self.bases), cyclic)
+        self.in_betweens = PairTables(self.bases, self.faces, self.settings, self.motion, times, dtype, folder)
         self._keyframes = torch.stack([basis.reference.double() for basis in self.bases])
         length = size(self._keyframes[0].numpy(), self.faces.numpy())
         #: The least precise dtype that can square areas of these shapes.

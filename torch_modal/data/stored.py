@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torch_modal.autograd import lasting
+from torch_modal.autograd import outside_inference_mode
 from torch_modal.io.tensors import TensorFile, write_tensors
 from torch_modal.modes.basis import ModalBasis
 from torch_modal.times import check_times
@@ -28,7 +28,7 @@ TABLE_FILES = "between-*.safetensors"
 _BASIS_FIELDS = tuple(field.name for field in fields(ModalBasis))
 
 
-class Motion:
+class KeyframeTimes:
     """Order and times of the key-frames of a motion.
 
     Args:
@@ -52,7 +52,7 @@ class Motion:
         self.neighbours = both % n_keyframes if cyclic else last - (last - both.abs()).abs()
 
     @classmethod
-    def of(cls, times: Tensor | Sequence[float] | None, n_keyframes: int, cyclic: bool) -> "Motion | None":
+    def of(cls, times: Tensor | Sequence[float] | None, n_keyframes: int, cyclic: bool) -> "KeyframeTimes | None":
         """The motion of key-frames; None without times.
 
         Raises:
@@ -101,7 +101,7 @@ class StoredSet:
         ValueError: The file is damaged, holds something else, or has another format version.
     """
 
-    @lasting
+    @outside_inference_mode
     def __init__(self, folder: str | os.PathLike[str]) -> None:
         self.folder = Path(folder)
         file = _open_file(self.folder)
@@ -177,7 +177,7 @@ def write_set(
             f"{shape[0]} key-frames of {shape[1]} vertices need as many bases and names; got bases of {sizes} vertices "
             f"and {len(names)} names"
         )
-    motion = Motion.of(times, len(keyframes), cyclic)
+    motion = KeyframeTimes.of(times, len(keyframes), cyclic)
     tensors = {"keyframes": keyframes.double(), "faces": faces.long()}
     for i, basis in enumerate(bases):
         tensors |= {f"{i}.{name}": getattr(basis, name) for name in _BASIS_FIELDS}

@@ -2,7 +2,7 @@
 
 import torch
 
-from torch_modal.autograd import lasting
+from torch_modal.autograd import outside_inference_mode
 from torch_modal.elastic.kernels.launch import kernels, launch
 from torch_modal.geometry.closest import leaves
 from torch_modal.geometry.connectivity import Connectivity
@@ -22,7 +22,7 @@ class WarpPairs:
         shapes: One or more. *Shape:* ``(K, V, 3)``.
     """
 
-    @lasting
+    @outside_inference_mode
     def __init__(self, mesh: Connectivity, shapes: FloatArray) -> None:
         self.order = leaves(mesh.faces, shapes)
         self._corners = torch.from_numpy(mesh.faces[self.order]).int()

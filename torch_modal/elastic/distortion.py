@@ -8,7 +8,7 @@ from typing import no_type_check
 import torch
 from torch import Tensor, nn
 
-from torch_modal.autograd import plain
+from torch_modal.autograd import is_eager
 from torch_modal.elastic import bend, stretch
 from torch_modal.elastic.bend import dihedral_angle, is_collapsed
 from torch_modal.elastic.energy import Energy, RestShapes
@@ -122,7 +122,7 @@ class KernelDistortion(Distortion):
     def of_shell(self, shapes: Sequence[Tensor], rests: RestShapes) -> Tensor:
         """Overrides the base class."""
         values = *shapes, rests.shapes, rests.weights, *rests.stiffness[:2]
-        if torch.is_grad_enabled() or not plain(*values):
+        if torch.is_grad_enabled() or not is_eager(*values):
             return super().of_shell(shapes, rests)
         args = [x.double().contiguous() for x in (torch.stack([*shapes]), rests.shapes, rests.weights)]
         stiffness = [x.double().contiguous() for x in self.on_elements(rests.stiffness)]

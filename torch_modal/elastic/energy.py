@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from torch_modal.autograd import lasting
+from torch_modal.autograd import outside_inference_mode
 from torch_modal.elastic.term import Mesh, Term
 from torch_modal.geometry.vectors import pick
 
@@ -65,7 +65,7 @@ def _outlasting_buffers(module: nn.Module) -> None:
     for child in module.modules():
         for name, buffer in child.named_buffers(recurse=False):
             if buffer.is_inference():
-                setattr(child, name, lasting(buffer.clone)())
+                setattr(child, name, outside_inference_mode(buffer.clone)())
 
 
 class AssembledTerm(nn.Module):
@@ -235,7 +235,7 @@ class Energy(nn.Module):
             constant = constant + left.sum(-1)
         return Reference(tuple(records), constant)
 
-    def mixed(self, rest: Rest, weights: Tensor) -> Rest:
+    def mix_rests(self, rest: Rest, weights: Tensor) -> Rest:
         """One rest shape whose measures are weighted sums of the measures of K shapes.
 
         Where weights differ from vertex to vertex, or are far below zero, :meth:`merge_rests` asks for harmonic means.
@@ -251,7 +251,7 @@ class Energy(nn.Module):
             stiffness.append((element_weights * rest_weights).sum(-2).clamp_min(0))
         return Rest(tuple(measures), tuple(stiffness))
 
-    def against(self, rest: Rest, stiffness: Sequence[float | Tensor]) -> Reference:
+    def reference_of(self, rest: Rest, stiffness: Sequence[float | Tensor]) -> Reference:
         """One rest shape as the reference."""
         alone = Rest(*(tuple(values.unsqueeze(-2) for values in each) for each in rest))
         return self.merge_rests(alone, torch.ones_like(rest.measures[0][..., :1]), stiffness)

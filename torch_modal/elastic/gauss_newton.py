@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from torch_modal.autograd import full_precision, untraced
+from torch_modal.autograd import disable_compile, full_precision
 from torch_modal.elastic.minimise import AmplitudeEnergy, Solution, Status, add_ridge
 from torch_modal.elastic.modal import Derivatives
 
@@ -35,7 +35,7 @@ class GaussNewtonStep(nn.Module):
 
         shell = tm.ShellEnergy(faces)
         energy = tm.ModalEnergy(shell, basis.modes)
-        placement = energy.place(start, shell.against(rest))  # both (B, V, 3)
+        placement = energy.place(start, shell.reference_of(rest))  # both (B, V, 3)
         step = tm.GaussNewtonStep(energy)
         a = torch.zeros(len(start), basis.n_modes, dtype=start.dtype)
         for _ in range(10):
@@ -54,7 +54,7 @@ class GaussNewtonStep(nn.Module):
         self.energy = energy
         self.damping = damping
 
-    @untraced
+    @disable_compile
     @full_precision
     def forward(self, a: Tensor, placement: Any) -> Step:
         """Take one step, without a branch that depends on data.

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from torch_modal import trees
-from torch_modal.autograd import applied, flattened, recorded, transposed
+from torch_modal.autograd import apply_function, apply_transpose, is_double_backward, merge_vmapped
 from torch_modal.elastic.gauss_newton import newton
 from torch_modal.elastic.minimise import AmplitudeEnergy, Solution, Status, add_ridge, minimise
 from torch_modal.threads import warn
@@ -34,7 +34,7 @@ class _ArgMin(torch.autograd.Function):
     ) -> tuple[Tensor, ...]:
         method, max_steps, tolerance, _ = limits
         start = usable.new_zeros(len(usable), energy.n_amplitudes, dtype=tensors[0].dtype)
-        solution = method(energy, start, trees.filled(tree, tensors), max_steps, tolerance)
+        solution = method(energy, start, trees.fill(tree, tensors), max_steps, tolerance)
         solution = solution._replace(status=torch.where(usable, solution.status, Status.INVALID))
         return tuple(value for value in solution if value is not None)
 
@@ -51,7 +51,7 @@ class _ArgMin(torch.autograd.Function):
     def jvp(ctx: Any, *tangents: Tensor | None) -> tuple[Tensor | None, ...]:
         amplitudes, _, *tensors = ctx.saved_tensors
         pull_back = _adjoint(ctx.energy, ctx.inverse, ctx.tree, *ctx.saved_tensors)
-        moved = transposed(pull_back, torch.zeros_like(amplitudes), tensors, tangents[4:])
+        moved = apply_transpose(pull_back, torch.zeros_like(amplitudes), tensors, tangents[4:])
         return moved, *(None,) * ctx.n_diagnostics
 
     @staticmethod
@@ -63,7 +63,7 @@ class _ArgMin(torch.autograd.Function):
     def vmap(
         info: Any, in_dims: tuple[Any, ...], energy: AmplitudeEnergy, limits: Any, tree: Any, *tensors: Tensor
     ) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
-        output = _ArgMin.apply(energy, limits, tree, *flattened(info.batch_size, in_dims[3:], tensors))
+        output = _ArgMin.apply(energy, limits, tree, *merge_vmapped(info.batch_size, in_dims[3:], tensors))
         return tuple(value.unflatten(0, (info.batch_size, -1)) for value in output), (0,) * len(output)
 
 
@@ -71,14 +71,14 @@ def _adjoint(
     energy: AmplitudeEnergy, inverse: Inverse, tree: Any, amplitudes: Tensor, status: Tensor, *tensors: Tensor
 ) -> Callable[[Tensor], tuple[Tensor, ...]]:
     """From gradients in the amplitudes, ``(B, n)``, to those in the tensors of the placement: linear."""
-    solve = inverse(energy, amplitudes, trees.filled(tree, tensors), status == Status.CONVERGED)
+    solve = inverse(energy, amplitudes, trees.fill(tree, tensors), status == Status.CONVERGED)
 
     def slope(*tensors: Tensor) -> Tensor:
-        return energy.gradient(amplitudes, trees.filled(tree, tensors))
+        return energy.gradient(amplitudes, trees.fill(tree, tensors))
 
     def pull_back(to_amplitudes: Tensor) -> tuple[Tensor, ...]:
         adjoint = solve(to_amplitudes)
-        if recorded(adjoint, *tensors):
+        if is_double_backward(adjoint, *tensors):
             return tuple(torch.func.vjp(slope, *tensors)[1](-adjoint))
         with torch.enable_grad():  # by kernels, which the tensors of a transform would not reach
             leaves = [x.detach().requires_grad_() for x in tensors]
@@ -138,7 +138,7 @@ def solve_implicit(
         inverse: Gives products with the inverse of the Hessian, with the arguments of :func:`dense_inverse`.
     """
     limits, tree = (method, max_steps, tolerance, inverse), trees.skeleton(placement)
-    return Solution(*applied(_ArgMin, energy, limits, tree, usable, *trees.leaves(placement)))
+    return Solution(*apply_function(_ArgMin, energy, limits, tree, usable, *trees.leaves(placement)))
 
 
 def solve_unrolled(

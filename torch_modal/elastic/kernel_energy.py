@@ -9,7 +9,7 @@ from typing import Any, Literal, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from torch_modal.autograd import plain
+from torch_modal.autograd import is_eager
 from torch_modal.elastic import volume
 from torch_modal.elastic.bend import NEEDLE, NEEDLE_OF_STEPS
 from torch_modal.elastic.energy import AssembledTerm, Energy, Reference, RestShapes
@@ -179,7 +179,7 @@ def by_kernels(energy: Energy, mesh: Mesh) -> list[KernelTerm | None]:
 
 def volumes_by_kernel(x: Tensor, faces: Tensor) -> Tensor:
     """:func:`torch_modal.geometry.rigid.signed_volumes` in one pass, without a gradient; of faces of int32."""
-    if not plain(x):
+    if not is_eager(x):
         return signed_volumes(x, faces)
     shapes = x.detach().double().contiguous()
     sizes = shapes.new_zeros(*x.shape[:-2], 2, 3)

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from torch_modal import trees
-from torch_modal.autograd import plain
+from torch_modal.autograd import is_eager
 from torch_modal.elastic.energy import Energy, Reference, RestShapes
 from torch_modal.elastic.kernel_energy import KernelEnergy, KernelPoint, by_kernels
 from torch_modal.elastic.kernels.function import run_operation
@@ -45,7 +45,7 @@ class KernelFineEnergy(FineEnergy):
         alone = self.further is None and not extra
         tensors = trees.leaves((x, *rests))  # the start may have no gradient where stiffnesses have one
         recorded = torch.is_grad_enabled() and any(value.requires_grad for value in tensors)
-        if not (alone and self.kernels.exact) and (recorded or not plain(*tensors)):
+        if not (alone and self.kernels.exact) and (recorded or not is_eager(*tensors)):
             return super().relax_chunk(x, rests, stages, extra)
         others = [*extra, *([] if self.further is None else [TermsTowards.of_terms(self.further, self.others, rests)])]
         to = self.kernels.reference(rests._replace(stiffness=[rests.stiffness[i] for i in self.own]), x, relative=True)
@@ -58,12 +58,12 @@ class KernelFineEnergy(FineEnergy):
         with torch.no_grad():
             return descend_in_stages(KernelProblem(self.kernels, to, others), x.double().contiguous(), stages).to(x)
 
-    def towards(
+    def descend_towards(
         self, x: Tensor, reference: Reference, n_steps: int, n_products: int, extra: Sequence[FreeEnergy] = ()
     ) -> Tensor:
         """Overrides the base class. Gradients are left to torch."""
-        if self.further is not None or (torch.is_grad_enabled() and x.requires_grad) or not plain(x):
-            return super().towards(x, reference, n_steps, n_products, extra)
+        if self.further is not None or (torch.is_grad_enabled() and x.requires_grad) or not is_eager(x):
+            return super().descend_towards(x, reference, n_steps, n_products, extra)
         problem = KernelProblem(self.kernels, reference.transpose(), extra)
         return descend(problem, x.double().contiguous(), n_steps, n_products).to(x)
 

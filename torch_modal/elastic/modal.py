@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from torch_modal import trees
-from torch_modal.autograd import plain
+from torch_modal.autograd import is_eager
 from torch_modal.elastic.energy import Energy, Linearised, Reference, RestShapes
 from torch_modal.elastic.kernel_energy import KernelEnergy
 from torch_modal.elastic.kernels.function import run_operation
@@ -112,7 +112,7 @@ class ModalEnergy(nn.Module):
 
         Args:
             base: The shape at amplitudes of zero. *Shape:* ``(B, V, 3)``.
-            reference: What is compared with, for example of :meth:`torch_modal.ShellEnergy.against`.
+            reference: What is compared with, for example of :meth:`torch_modal.ShellEnergy.reference_of`.
             anchors: Anchors of the energy's terms; by default the anchors of a :class:`torch_modal.ShellEnergy`.
                 *Shape:* ``(B, P, 3)``.
         """
@@ -241,12 +241,12 @@ class KernelModalEnergy(ModalEnergy):
 
     def by_torch(self, placement: Placement) -> Placement:
         """A placement for torch."""
-        base, reference = trees.mapped(placement, lambda value: value.to(self.columns.dtype))
+        base, reference = trees.map_leaves(placement, lambda value: value.to(self.columns.dtype))
         return super().place(base, reference.transpose())
 
     def _plain(self, placement: Placement) -> Placement | None:
         """The placement for torch; None where it is for kernels."""
-        serves = not torch.is_grad_enabled() and plain(placement.base, *placement.reference.records)
+        serves = not torch.is_grad_enabled() and is_eager(placement.base, *placement.reference.records)
         return None if serves else self.by_torch(placement)
 
     def _shapes(self, a: Tensor, base: Tensor) -> Tensor:
@@ -269,7 +269,7 @@ class KernelModalEnergy(ModalEnergy):
         for_torch = self._plain(placement)
         if for_torch is not None:
             result = super().derivatives(a.to(for_torch.base), for_torch, second_order)
-            return trees.mapped(result, lambda value: value.to(placement.base))
+            return trees.map_leaves(result, lambda value: value.to(placement.base))
         terms = [self.kernels.parts[i] for i in self.kernels.terms]
         rows = max(sum(len(term.elements) for term in terms) + 1, len(self.blocks))
         local = [len(term.elements) * (3 * term.functions.n) ** 2 for term in terms]

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torch_modal.autograd import plain
+from torch_modal.autograd import is_eager
 from torch_modal.elastic.kernels.function import run_operation
 from torch_modal.elastic.kernels.launch import Constants, kernels, launch
 from torch_modal.geometry.connectivity import Connectivity
@@ -49,10 +49,10 @@ class WarpRotations(LocalRotations):
             n_pieces=self.n_pieces,
         )
 
-    def pulls(self, shapes: Tensor, weights: Tensor, poisson: Poisson) -> Tensor:
+    def right_hand_side(self, shapes: Tensor, weights: Tensor, poisson: Poisson) -> Tensor:
         """Overrides the base class."""
         if self.clusters is not None or weights.shape[1] != 2:
-            return super().pulls(shapes, weights, poisson)
+            return super().right_hand_side(shapes, weights, poisson)
         return run_operation(_RightHandSide(self, poisson), shapes, weights)[0].to(shapes)
 
     def turns(self, first: Tensor, second: Tensor) -> Tensor:
@@ -69,14 +69,14 @@ class WarpRotations(LocalRotations):
 
     def sign(self, quaternions: Tensor, areas: Tensor) -> Tensor:
         """Overrides the base class, on a CPU: the walk down the tree is one thread's."""
-        if areas.device.type != "cpu" or not plain(areas):
+        if areas.device.type != "cpu" or not is_eager(areas):
             return super().sign(quaternions, areas)
         rows, weights = quaternions.double().contiguous(), areas.double().contiguous()
         sign, vote = torch.ones_like(weights), weights.new_zeros(len(weights), self.n_pieces)
         launch(kernels("rotations").sign_votes, (len(weights),), [self.constants, rows, weights, sign, vote])
         return sign.to(areas)
 
-    def along(self, trajectory: Trajectory, which: Tensor, t: Tensor) -> Tensor:
+    def edges_along(self, trajectory: Trajectory, which: Tensor, t: Tensor) -> Tensor:
         """Overrides the base class."""
         packed = torch.cat(list(trajectory)).movedim(0, -1)
         return run_operation(_OnTrajectory(self, len(packed)), packed, which, t)[0].movedim(-1, 0).to(trajectory.size)
@@ -107,7 +107,7 @@ class _RightHandSide:
         return gradients
 
     def by_torch(self, shapes: Tensor, weights: Tensor) -> tuple[Tensor, ...]:
-        return (LocalRotations.pulls(self.rotations, shapes, weights, self.poisson),)
+        return (LocalRotations.right_hand_side(self.rotations, shapes, weights, self.poisson),)
 
     def _stiffness(self) -> tuple[Tensor, Tensor]:
         return self.rotations.shares.double(), self.poisson.weights.double()
@@ -146,7 +146,7 @@ class _OnTrajectory:
 
     def by_torch(self, packed: Tensor, which: Tensor, t: Tensor) -> tuple[Tensor, ...]:
         trajectory = Trajectory._make(packed.movedim(-1, 0).split([3, 3, 3, 3, 6, 6, 6]))
-        return (LocalRotations.along(self.rotations, trajectory, which.long(), t).movedim(0, -1),)
+        return (LocalRotations.edges_along(self.rotations, trajectory, which.long(), t).movedim(0, -1),)
 
     def _index(self, packed: Tensor, which: Tensor) -> Tensor:
         first = torch.arange(0, len(packed), max(self.n_pairs, 1), device=which.device)

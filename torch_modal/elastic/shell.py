@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from torch_modal.autograd import broadcast_shapes, lasting
+from torch_modal.autograd import broadcast_shapes, outside_inference_mode
 from torch_modal.elastic.bend import SquaredBend
 from torch_modal.elastic.energy import Energy, Reference, Rest
 from torch_modal.elastic.stretch import Stretch
@@ -66,7 +66,7 @@ class ShellEnergy(nn.Module):
 
     faces: Tensor
 
-    @lasting
+    @outside_inference_mode
     def __init__(
         self,
         faces: Tensor,
@@ -94,9 +94,9 @@ class ShellEnergy(nn.Module):
         """Measures and weights of rest shapes. *Shape:* ``(..., V, 3)``."""
         return self.energy.rest(self._rows(x_rest))
 
-    def against(self, x_rest: Tensor) -> Reference:
+    def reference_of(self, x_rest: Tensor) -> Reference:
         """Rest shapes as references, with the stiffnesses. *Shape:* ``(..., V, 3)``."""
-        return self.energy.against(self.rest(x_rest), self.stiffness)
+        return self.energy.reference_of(self.rest(x_rest), self.stiffness)
 
     def measure(self, x: Tensor) -> Measures:
         """Lengths, angles and volume of shapes. *Shape:* ``(..., V, 3)``."""
@@ -132,7 +132,7 @@ class ShellEnergy(nn.Module):
         Returns:
             *Shape:* ``(...,)``.
         """
-        return self.energy.value(self._rows(x), self.against(x_rest))
+        return self.energy.value(self._rows(x), self.reference_of(x_rest))
 
     @property
     def stiffness(self) -> list[Any]:

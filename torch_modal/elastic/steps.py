@@ -7,7 +7,7 @@ from typing import Any, NamedTuple, Protocol
 import torch
 from torch import Tensor, nn
 
-from torch_modal.autograd import plain
+from torch_modal.autograd import is_eager
 from torch_modal.elastic.energy import Energy, Linearised, Reference, RestShapes, energy_rounding
 from torch_modal.elastic.term import Mesh, Term
 from torch_modal.geometry.canonical import CANONICAL_SIZE
@@ -138,7 +138,7 @@ def descend(problem: Any, x: Tensor, n_steps: int, n_products: int, taken: list[
         at = problem.at(x) if at is None else at
         solution, *kept = problem.newton_direction(at, n_products, taken is not None)
         reached, there = x + solution, None
-        if k < n_steps - 1 and plain(reached):  # the whole step is nearly always the one that is taken
+        if k < n_steps - 1 and is_eager(reached):  # the whole step is nearly always the one that is taken
             there = problem.at(reached)
         after = problem.value(reached) if there is None else there.value
         length = step_length(at.value, at.slope(solution), after, solution.abs().amax((1, 2)))
@@ -167,7 +167,7 @@ def step_length(before: Tensor, slope: Tensor, after: Tensor, largest: Tensor) -
     half, finite = -0.5 * slope, after.isfinite()
     rounding = energy_rounding(before.dtype) * before.detach().abs()
     gap = torch.where(finite, after, before) - before + half - rounding
-    if not torch.is_grad_enabled() and plain(gap) and bool((finite & (gap <= 0)).all()):
+    if not torch.is_grad_enabled() and is_eager(gap) and bool((finite & (gap <= 0)).all()):
         return torch.ones_like(gap)  # nearly always
     surplus = gap.clamp_min(0)
     counts = ((largest / SLIGHT - 1) / 9).clamp(0, 1)
@@ -333,7 +333,7 @@ class FineEnergy(nn.Module):
         terms = TermsTowards(self.energy, rests.reference(self.energy, x, relative=True), rests.anchors)
         return descend_in_stages(SumOfEnergies([terms, *extra]), x, stages)
 
-    def towards(
+    def descend_towards(
         self, x: Tensor, reference: Reference, n_steps: int, n_products: int, extra: Sequence[FreeEnergy] = ()
     ) -> Tensor:
         """Steps of all vertices towards a reference that is known. *Shape:* ``(B, V, 3)``."""

@@ -33,7 +33,7 @@ def own_order(shapes: Sequence[FloatArray], faces: IntArray) -> list[int]:
     return sorted(range(len(shapes)), key=lambda i: (-size(shapes[i], faces), shapes[i].tobytes()))
 
 
-def placed(points: FloatArray, faces: IntArray) -> tuple[FloatArray, FloatArray, FloatArray, float]:
+def to_canonical(points: FloatArray, faces: IntArray) -> tuple[FloatArray, FloatArray, FloatArray, float]:
     """A shape in its principal axes, centred, with a size of 100. *Shape:* ``(V, 3), (F, 3)``.
 
     The signs of the axes follow from the third moments. Undetermined axes and signs, as in symmetric shapes, are close

@@ -9,7 +9,7 @@ import fast_simplification
 import numpy as np
 
 from torch_modal.arrays import FloatArray, IntArray
-from torch_modal.geometry.canonical import CANONICAL_SIZE, in_order, placed
+from torch_modal.geometry.canonical import CANONICAL_SIZE, in_order, to_canonical
 
 # The library keeps its mesh in static memory.
 _NOT_THREAD_SAFE = threading.Lock()
@@ -34,7 +34,7 @@ def decimate(vertices: FloatArray, faces: IntArray, n_faces: int) -> tuple[Float
         degenerate or repeated, *shape* ``(F', 3)``; the collapses in order, the vertex that remains and the one that
         does not, *shape* ``(n, 2)``.
     """
-    points, axes, centre, scale = placed(vertices, faces)
+    points, axes, centre, scale = to_canonical(vertices, faces)
     order, sorted_faces = in_order(points, faces)
     sorted_points, sorted_faces = points[order], sorted_faces.astype(np.int32)
 

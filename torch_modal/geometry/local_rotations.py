@@ -90,7 +90,7 @@ class LocalRotations(nn.Module):
         self.register_buffer("ancestors", torch.stack(ancestors), persistent=False)
         self.register_buffer("piece", piece, persistent=False)
         self.n_edges, self.n_pieces = len(mesh.edges), int(piece.max()) + 1
-        wound = self.wound(every)
+        wound = self.cluster_arguments(every)
         #: For rotations beyond a full turn; None where there are none.
         self.clusters = Clusters(*wound) if beyond_a_turn(*wound) else None
         self._warn_of_tears(wound[0], mesh)
@@ -157,9 +157,9 @@ class LocalRotations(nn.Module):
         first, second = (rotate(mean_quaternion, start.world(*side)) for side in transform(xx, xy, xy, yy))
         return self._edges((first, second), self.areas.expand(len(weights), -1))
 
-    def pulls(self, shapes: Tensor, weights: Tensor, poisson: Poisson) -> Tensor:
-        """:meth:`Poisson.pulls` of these edge vectors. *Shape:* ``(B, K, V, 3), (B, K) -> (B, V, 3)``."""
-        return poisson.pulls(self(shapes, weights))
+    def right_hand_side(self, shapes: Tensor, weights: Tensor, poisson: Poisson) -> Tensor:
+        """:meth:`Poisson.right_hand_side` of these edge vectors. *Shape:* ``(B, K, V, 3), (B, K) -> (B, V, 3)``."""
+        return poisson.right_hand_side(self(shapes, weights))
 
     def _agree(self, quaternions: Tensor, weights: Tensor) -> Tensor:
         """Signs for the pieces of K shapes, with which they turn the short way from each other.
@@ -171,7 +171,7 @@ class LocalRotations(nn.Module):
         products = torch.stack([zero.index_add(-1, self.piece, row) for row in rows], -1).movedim(2, 1)
         return pick(signs_of_mean(products, weights[:, None]).mT, self.piece)
 
-    def wound(self, every: Sequence[Frames]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def cluster_arguments(self, every: Sequence[Frames]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Arguments of :class:`Clusters`, between shapes."""
         areas = torch.cat([x.doubled_areas for x in every]).sum(0)
         return _quaternions_from_first(every), areas, self.ancestors, self.piece
@@ -185,14 +185,14 @@ class LocalRotations(nn.Module):
         growth = [y - x for x, y in zip(a[3:], b[3:], strict=True)]
         return torch.stack([*a.coordinates(2 * arc(self._signed_quaternions(a, b))), *growth])
 
-    def along(self, trajectory: Trajectory, which: Tensor, t: Tensor) -> Tensor:
+    def edges_along(self, trajectory: Trajectory, which: Tensor, t: Tensor) -> Tensor:
         """Edge vectors of shapes on the trajectories of P pairs; of each the pair and the time are given.
 
         *Shape:* ``(B,), (B,) -> (3, B, E)``.
         """
-        return self.bent_along(Trajectory._make(values.index_select(-2, which) for values in trajectory), t)
+        return self.bent_edges_along(Trajectory._make(values.index_select(-2, which) for values in trajectory), t)
 
-    def bent_along(self, trajectory: Trajectory, t: Tensor, bending: Tensor | None = None) -> Tensor:
+    def bent_edges_along(self, trajectory: Trajectory, t: Tensor, bending: Tensor | None = None) -> Tensor:
         """Edge vectors of shapes on trajectories, whose triangles may be strained and turned beforehand.
 
         Trajectories are of one pair, or of a pair for each shape. Bending is in coordinates of the triangles: axis
@@ -219,7 +219,7 @@ class LocalRotations(nn.Module):
         """Edge vectors that the triangles ask for, by area. *Shape:* ``(B, F) -> (3, B, E)``."""
         return edge_means(wanted, areas.repeat(1, 3), self.sides, self.side_signs, self.n_edges)
 
-    def turns(self, first: Tensor, second: Tensor) -> Tensor:
+    def quaternions(self, first: Tensor, second: Tensor) -> Tensor:
         """Quaternions of triangles, whose signs tell the way round. *Shape:* ``(B, V, 3), (B, V, 3) -> (4, B, F)``."""
         return self._signed_quaternions(frames_of(first, self.faces), frames_of(second, self.faces))
 

@@ -8,7 +8,7 @@ from scipy.spatial import KDTree
 from torch import Tensor, nn
 
 from torch_modal.arrays import FloatArray, IntArray
-from torch_modal.autograd import plain
+from torch_modal.autograd import is_eager
 from torch_modal.geometry.connectivity import Connectivity, half_cotangents, vertex_areas
 from torch_modal.geometry.rigid import best_fit
 from torch_modal.geometry.sparse import MAKING, SparseSolver, graph_laplacian, solve_by, solve_exported
@@ -70,7 +70,7 @@ class Poisson(nn.Module):
             return solver
 
     def forward(self, right: Tensor, near: Tensor) -> Tensor:
-        """The shape that fits edge vectors (:meth:`pulls`), with the centres of the pieces of ``near``.
+        """The shape that fits edge vectors (:meth:`right_hand_side`), with the centres of the pieces of ``near``.
 
         Unreferenced vertices have the positions of ``near``. *Shape:* ``(..., V, 3), (..., V, 3) -> (..., V, 3)``.
         """
@@ -81,13 +81,13 @@ class Poisson(nn.Module):
             x = solve_by(cache(partial(self._solver_of, self.weights)), right)
         return x + self.centres(near - x)
 
-    def or_near(self, right: Tensor, near: Tensor) -> Tensor:
+    def forward_or_near(self, right: Tensor, near: Tensor) -> Tensor:
         """:meth:`forward`, and the shape nearby where that is not finite. *Shape:* ``(B, V, 3), (B, V, 3)``."""
         solved = self(right, near)
         finite = solved.detach().sum((1, 2)).isfinite()
-        return solved if plain(finite) and finite.all() else torch.where(finite[:, None, None], solved, near)
+        return solved if is_eager(finite) and finite.all() else torch.where(finite[:, None, None], solved, near)
 
-    def pulls(self, wanted: Tensor) -> Tensor:
+    def right_hand_side(self, wanted: Tensor) -> Tensor:
         """Right-hand side of the system of target edge vectors. *Shape:* ``(3, ..., E) -> (..., V, 3)``."""
         weighted = wanted * self.weights.to(wanted)
         both, ends = torch.cat([-weighted, weighted], -1), self.edges.T.flatten().to(wanted.device)
@@ -155,7 +155,7 @@ class Reconstruction(nn.Module):
         *Shape:* ``(3, B, F), (B, V, 3) -> (B, V, 3)``.
         """
         edges = edge_means(wanted, self.weights.to(near), self.sides, self.signs.to(near), len(self.edges))
-        return self.poisson(self.poisson.pulls(edges), near)
+        return self.poisson(self.poisson.right_hand_side(edges), near)
 
     def forward(self, wanted: Sides, rest: Tensor) -> Tensor:
         """The shape of target sides with the centroid of ``rest``. Unreferenced vertices do not move.

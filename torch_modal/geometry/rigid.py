@@ -5,7 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torch_modal.autograd import traced, transformed
+from torch_modal.autograd import is_traced, is_transformed
 from torch_modal.geometry.rotations import exp, log
 from torch_modal.geometry.vectors import pick
 
@@ -72,7 +72,7 @@ def best_rotation(covariance: Tensor) -> Tensor:
     rotation = u @ vh
     beyond = torch.linalg.det(rotation)[..., None, None] - 1
     rotation = rotation + beyond * u[..., 2:] @ vh[..., 2:, :] + (0 * known).sum((-2, -1), keepdim=True)
-    if not torch.is_grad_enabled() and (traced(covariance) or not transformed(covariance)):
+    if not torch.is_grad_enabled() and (is_traced(covariance) or not is_transformed(covariance)):
         return rotation
     eye = torch.eye(3, dtype=covariance.dtype, device=covariance.device)
     for _ in range(2):

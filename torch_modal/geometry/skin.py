@@ -36,7 +36,7 @@ class Skin:
     @torch.no_grad()
     def shapes(self) -> Tensor:
         """The motion again. *Shape:* ``(T, V, 3)``."""
-        return blended(self.weights, self.transforms[:, :, :3], self.rest.expand(len(self.transforms), -1, -1))
+        return blend_bones(self.weights, self.transforms[:, :, :3], self.rest.expand(len(self.transforms), -1, -1))
 
     @torch.no_grad()
     def tracks(self) -> tuple[Tensor, Tensor, Tensor]:
@@ -63,7 +63,7 @@ class Skin:
         return bind, quaternion(local[..., :3, :3].movedim((2, 3), (0, 1))), local[..., :3, 3]
 
 
-def blended(weights: Tensor, bones: Tensor, points: Tensor) -> Tensor:
+def blend_bones(weights: Tensor, bones: Tensor, points: Tensor) -> Tensor:
     """Points moved by weighted affine maps. *Shape:* ``(V, J), (T, J, 3, 4), (T, V, 3) -> (T, V, 3)``."""
     wide = torch.nn.functional.pad(points, (0, 1), value=1)[..., None]
     return torch.stack(

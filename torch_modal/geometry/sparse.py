@@ -22,7 +22,7 @@ from scipy.sparse.linalg import SuperLU, splu
 from torch import Tensor
 
 from torch_modal.arrays import FloatArray, IntArray
-from torch_modal.autograd import Recent, linear_map, untraced
+from torch_modal.autograd import Recent, disable_compile, linear_map
 
 try:
     import cholespy
@@ -143,7 +143,7 @@ def _cholesky(matrix: sparse.csr_matrix, device: torch.device) -> Solve:
     return solve
 
 
-@untraced
+@disable_compile
 def solve_by(solver: Callable[[], Solve], right: Tensor) -> Tensor:
     """Solve with gradients, which are solves, too. *Shape:* ``(..., V, m) -> (..., V, m)``.
 

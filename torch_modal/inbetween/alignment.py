@@ -6,7 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from torch_modal.autograd import plain
+from torch_modal.autograd import is_eager
 from torch_modal.elastic.backend import TorchBackend
 from torch_modal.errors import MeshWarning
 from torch_modal.geometry.canonical import CANONICAL_SIZE, size
@@ -93,13 +93,13 @@ class KeyframeAlignment(nn.Module):
             Shapes, *shape* ``(B, K, V, 3)``; the pose; *shape* ``(B,)``, bool.
         """
         weights, known = torch.where(weights.isfinite(), weights, 1 / weights.shape[1]), weights.isfinite()
-        x, usable = self.checked(keyframes.mT.contiguous())
+        x, usable = self.replace_unusable(keyframes.mT.contiguous())
         aligned, pose = self._align(x, weights)
         shapes = aligned.mT.contiguous()
-        usable = usable & ~self.mirrored(shapes.detach(), weights)
+        usable = usable & ~self.find_mirrored(shapes.detach(), weights)
         return shapes, pose, ((usable | (weights == 0)) & known).all(1)
 
-    def checked(self, keyframes: Tensor) -> tuple[Tensor, Tensor]:
+    def replace_unusable(self, keyframes: Tensor) -> tuple[Tensor, Tensor]:
         """Replace key-frames that are not finite or have no size by the reference; True for those that are kept.
 
         *Shape:* ``(B, K, 3, V) -> (B, K, 3, V), (B, K)``.
@@ -108,7 +108,7 @@ class KeyframeAlignment(nn.Module):
         sizes = (rows.amax(-1) - rows.amin(-1)).norm(dim=-1) * self.scale
         usable = sizes.isfinite() & (sizes > SMALLEST_SIZE * CANONICAL_SIZE)  # what is not finite has no extent
         self._warn_of_size(sizes)
-        if plain(usable) and usable.all():
+        if is_eager(usable) and usable.all():
             return keyframes, usable
         return torch.where(usable[..., None, None], keyframes, self.reference.mT / self.scale), usable
 
@@ -122,21 +122,21 @@ class KeyframeAlignment(nn.Module):
         rotations, rotation = self.mean_pose(to_reference, among, weights)
         return rotations @ centred, Pose(rotation, (weights[..., None] * centres).sum(1))
 
-    def restore(self, x: Tensor, pose: Pose) -> Tensor:
+    def to_caller(self, x: Tensor, pose: Pose) -> Tensor:
         """Shapes of the frame in the caller's coordinates. *Shape:* ``(B, V, 3)``."""
         return torch.baddbmm(pose.centre[:, None], x, pose.rotation.mT / self.scale)
 
-    def bring(self, points: Tensor, pose: Pose) -> Tensor:
-        """The inverse of :meth:`restore`. *Shape:* ``(B, P, 3)``."""
+    def to_frame(self, points: Tensor, pose: Pose) -> Tensor:
+        """The inverse of :meth:`to_caller`. *Shape:* ``(B, P, 3)``."""
         return (points - pose.centre[:, None]) @ pose.rotation * self.scale
 
-    def mirrored(self, shapes: Tensor, weights: Tensor) -> Tensor:
+    def find_mirrored(self, shapes: Tensor, weights: Tensor) -> Tensor:
         """True for mirror images of the heaviest, of closed surfaces. *Shape:* ``(B, K, V, 3), (B, K) -> (B, K)``."""
         if not self.closed:
             return torch.zeros_like(weights, dtype=torch.bool)
         volumes, heaviest = self.signed_volumes(shapes, self.faces), weights.argmax(1, keepdim=True)
         inverted = volumes * volumes.gather(1, heaviest) < 0
-        if plain(inverted) and not inverted.any():
+        if is_eager(inverted) and not inverted.any():
             return inverted
         first = shapes.take_along_dim(heaviest[..., None, None], 1).expand_as(shapes)
         heaviest_shapes, others = first.flatten(0, 1), shapes.flatten(0, 1)
@@ -144,7 +144,7 @@ class KeyframeAlignment(nn.Module):
 
     def _warn_of_size(self, sizes: Tensor) -> None:
         """Warn, once for each layer, that key-frames and bases seem to be in different units."""
-        if self.size_warned or not plain(sizes):
+        if self.size_warned or not is_eager(sizes):
             return
         ratios = sizes / self.extent
         if bool(((ratios < OTHER_SIZE) & (ratios > 1 / OTHER_SIZE)).all()):

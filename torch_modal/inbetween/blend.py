@@ -35,4 +35,4 @@ class RotationBlend(nn.Module):
         Returns:
             The weighted sum where the mean is not finite. *Shape:* ``(B, V, 3)``.
         """
-        return self.poisson.or_near(self.rotations.pulls(shapes, weights, self.poisson), straight)
+        return self.poisson.forward_or_near(self.rotations.right_hand_side(shapes, weights, self.poisson), straight)

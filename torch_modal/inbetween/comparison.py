@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torch_modal.autograd import plain
+from torch_modal.autograd import is_eager
 from torch_modal.elastic.distortion import Distortion
 from torch_modal.elastic.energy import RestShapes
 from torch_modal.elastic.minimise import Solution, Status
@@ -27,7 +27,7 @@ SLACK_OF_PATHS = 3.0
 MARGIN = 0.5
 
 
-def no_worse(
+def blend_towards_starts(
     x: Tensor, starts: Sequence[Tensor], solution: Solution, distortion: Distortion, rests: RestShapes, slack: float
 ) -> tuple[Tensor, Solution]:
     """Shapes, blended into their starts as far as they have more distortion.
@@ -51,7 +51,7 @@ def no_worse(
     shapes = [x, *starts]
     with torch.no_grad():
         distortions = distortion(shapes, rests)
-    numbers = plain(distortions)
+    numbers = is_eager(distortions)
     # Added to the distortions of the starts: invisible strains make no shape worse.
     slight = distortion.slight(rests.stiffness, x)
     ratio = (distortions[0] / (distortions[1:] + slight)).amax(0)

@@ -8,7 +8,7 @@ from scipy import sparse
 from torch import Tensor, nn
 
 from torch_modal import trees
-from torch_modal.autograd import lasting, made_outside, outlasting, recorded
+from torch_modal.autograd import as_normal_tensor, is_double_backward, outside_inference_mode, run_outside_transforms
 from torch_modal.elastic.energy import AssembledTerm, Energy, Linearised, Reference, energy_rounding
 from torch_modal.elastic.minimise import Solution, Status
 from torch_modal.geometry.canonical import CANONICAL_SIZE
@@ -82,13 +82,13 @@ class FreeVertices(nn.Module):
         return RIDGE * placement[1].records[0][..., 0, :].mean(-1, keepdim=True).clamp_min(1)
 
     # ------------------------------------------------------------------------------------------------ Newton's method
-    @lasting
+    @outside_inference_mode
     def minimise(self, a: Tensor, placement: Placement, max_steps: int, tolerance: float) -> Solution:
         """Newton steps of each sample alone; arguments as for :func:`~torch_modal.elastic.minimise.minimise`.
 
         A sample has converged where a step is below :data:`SMALL_STEP`; the tolerance plays no part.
         """
-        a, placement = trees.mapped((a, placement), outlasting)  # products with the Hessian are gradients
+        a, placement = trees.map_leaves((a, placement), as_normal_tensor)  # products with the Hessian are gradients
         each = [self._descend(a[i : i + 1], trees.rows(placement, slice(i, i + 1)), max_steps) for i in range(len(a))]
         if not each:
             return Solution(a, a.sum(-1), a.sum(-1), *(torch.zeros(0, dtype=torch.int64, device=a.device),) * 2)
@@ -128,7 +128,7 @@ class FreeVertices(nn.Module):
             flat = [x.flatten(0, x.dim() - n) for x, n in zip((a, converged, *tensors), ranks, strict=True)]
             n = max(map(len, flat))  # under vmap, some are shared by all samples
             a, converged, *others = (x.repeat(n // len(x), *[1] * (x.dim() - 1)) for x in flat)
-            place = trees.filled(tree, others)
+            place = trees.fill(tree, others)
             rows = [slice(i, i + 1) for i in range(n)]
             return [
                 self._solver(a[i], trees.rows(place, i), RESIDUAL_OF_GRADIENT)
@@ -138,7 +138,7 @@ class FreeVertices(nn.Module):
             ]
 
         ranks = [x.dim() for x in (a, converged, *tensors)]
-        solvers: list[Solve] = made_outside(make, a, converged, *tensors)
+        solvers: list[Solve] = run_outside_transforms(make, a, converged, *tensors)
 
         def solve_all(right: Tensor) -> Tensor:
             rows = right.flatten(0, -2).split(1)
@@ -146,7 +146,7 @@ class FreeVertices(nn.Module):
 
         def solve(right: Tensor) -> Tensor:
             solution = solve_by(lambda: solve_all, right)
-            if recorded(solution, a, *tensors):
+            if is_double_backward(solution, a, *tensors):
                 # Its derivative is the derivative of the Hessian's product, solved once more.
                 product = torch.func.vjp(lambda a: self.gradient(a, placement), a)[1](solution)[0]
                 solution = solution + solve_by(lambda: solve_all, torch.where(converged[:, None], right - product, 0))

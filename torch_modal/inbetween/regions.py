@@ -194,7 +194,7 @@ class LocalInterpolation(nn.Module):
             if isinstance(summand.term, Bend):  # needles turn over at little cost, and would end where they collapse
                 values = values * fullness(summand.edge_vectors(shapes.movedim(-1, 0)), NEEDLE).prod(1)
             stiffness.append(values)
-        reference = energy.against(Rest(tuple(measures), tuple(w.mean(1) for w in rest.weights)), stiffness)
+        reference = energy.reference_of(Rest(tuple(measures), tuple(w.mean(1) for w in rest.weights)), stiffness)
         results, status = [], torch.full_like(usable, Status.CONVERGED, dtype=torch.int64)
         for x in ends:
             place = x[:, self.used].double(), reference

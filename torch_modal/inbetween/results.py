@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torch_modal.autograd import made_outside, plain, traced, transformed
+from torch_modal.autograd import is_eager, is_traced, is_transformed, run_outside_transforms
 from torch_modal.elastic.implicit import ConvergenceWarning
 from torch_modal.elastic.minimise import Solution, Status
 from torch_modal.inbetween.settings import Solver
@@ -34,7 +34,7 @@ class InBetweenResult(NamedTuple):
     linear_energy: Tensor | None = None
     """The mean energy of linear interpolation. *Shape:* ``(...)``."""
 
-    def unflattened(self, lead: torch.Size) -> "InBetweenResult":
+    def unflatten(self, lead: torch.Size) -> "InBetweenResult":
         """A flat batch with these leading dimensions."""
 
         def each(values: Iterable[Tensor | None]) -> Iterator[Tensor | None]:
@@ -62,14 +62,14 @@ class Samples(NamedTuple):
         return Samples(self.keyframes[some], self.weights[some], self.mu[some], stiffness)
 
 
-def unminimised(x: Tensor, usable: Tensor) -> Solution:
+def trivial_solution(x: Tensor, usable: Tensor) -> Solution:
     """The solution where there is nothing to minimise. *Shape:* ``(B, V, 3), (B,)``."""
     number = x.detach().new_zeros(len(x))
     status = torch.where(usable, Status.CONVERGED, Status.INVALID)
     return Solution(number.new_zeros(len(x), 0), number, number.clone(), torch.zeros_like(status), status)
 
 
-def of_bodies(results: Sequence[InBetweenResult], vertices: Sequence[Any]) -> InBetweenResult:
+def join_bodies(results: Sequence[InBetweenResult], vertices: Sequence[Any]) -> InBetweenResult:
     """Results of bodies as one, from the vertices of each: with the sum of the energies, otherwise the worst of all."""
     if len(results) == 1:
         return results[0]
@@ -90,10 +90,10 @@ def report(solution: Solution, solver: Solver) -> None:
     Raises:
         ConvergenceError: Something did not converge where gradients are recorded, and that is an error.
     """
-    if not traced(solution.status) and solver.gradient == "implicit":
+    if not is_traced(solution.status) and solver.gradient == "implicit":
         forbid = solver.unconverged == "raise" and torch.is_grad_enabled()
         seen = [x for x in (solution.status, solution.distortion_ratio) if x is not None]
-        made_outside(partial(_report, max_steps=solver.max_steps, forbid=forbid), *seen)
+        run_outside_transforms(partial(_report, max_steps=solver.max_steps, forbid=forbid), *seen)
 
 
 def _report(status: Tensor, ratio: Tensor | None = None, *, max_steps: int, forbid: bool) -> None:
@@ -132,12 +132,12 @@ def with_exact_keyframes(shapes: Tensor, keyframes: Tensor, weights: Tensor) -> 
         weights: *Shape:* ``(..., K)``.
     """
     shapes = shapes.to(keyframes.dtype)
-    if plain(weights) and not bool((weights == 1).any()):
+    if is_eager(weights) and not bool((weights == 1).any()):
         return shapes
     alone = (weights != 0).sum(-1, keepdim=True) == 1
     for x, there in zip(keyframes.unbind(-3), ((weights == 1) & alone).unbind(-1), strict=True):
         exactly = x.detach()
-        if torch.is_grad_enabled() or transformed(shapes):
+        if torch.is_grad_enabled() or is_transformed(shapes):
             known = shapes.detach()
             exactly = exactly + torch.where(known.isfinite(), shapes - known, 0)
         shapes = torch.where(there[..., None, None], exactly, shapes)

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from torch_modal.autograd import plain
+from torch_modal.autograd import is_eager
 from torch_modal.elastic.backend import TorchBackend, choose
 from torch_modal.elastic.energy import Energy, RestShapes
 from torch_modal.elastic.gauss_newton import newton
@@ -18,11 +18,11 @@ from torch_modal.elastic.term import Mesh, Term
 from torch_modal.inbetween.alignment import KeyframeAlignment, Pose
 from torch_modal.inbetween.blend import RotationBlend
 from torch_modal.inbetween.coarse import CoarseMesh
-from torch_modal.inbetween.comparison import SLACK, no_worse
+from torch_modal.inbetween.comparison import SLACK, blend_towards_starts
 from torch_modal.inbetween.joint import JointSpace
 from torch_modal.inbetween.paired import PairedSpace
 from torch_modal.inbetween.regions import LocalInterpolation, worst_regions
-from torch_modal.inbetween.results import InBetweenResult, Samples, unminimised
+from torch_modal.inbetween.results import InBetweenResult, Samples, trivial_solution
 from torch_modal.inbetween.settings import Objective, Solver
 from torch_modal.inbetween.subspace import elastic_subspace
 
@@ -94,7 +94,7 @@ class InBetweenSolver(nn.Module):
         shapes, pose, usable = self.alignment(samples.keyframes, weights)
         anchors = self.fine.energy.anchors
         if anchors is not None:
-            anchors = self.alignment.bring(anchors.to(weights).expand(len(weights), -1, -1), pose)
+            anchors = self.alignment.to_frame(anchors.to(weights).expand(len(weights), -1, -1), pose)
         rests = RestShapes(shapes, weights, samples.stiffness, anchors)
         straight = torch.bmm(weights[:, None], shapes.flatten(2)).view_as(shapes[:, 0])
         base = straight if self.blend is None else self.blend(shapes, weights, straight)
@@ -105,10 +105,10 @@ class InBetweenSolver(nn.Module):
         x = self.relax(x, rests)
         # No shape is better for being far from a key-frame with a weight below zero.
         compared = rests._replace(weights=weights.clamp_min(0))
-        x, solution = no_worse(x, [base, straight], solution, self.distortion, compared, SLACK)
+        x, solution = blend_towards_starts(x, [base, straight], solution, self.distortion, compared, SLACK)
         x, solution = self.finish(x, solution, rests)
-        valid, x = solution.status != Status.INVALID, self.alignment.restore(x, pose)
-        x = x if plain(valid) and valid.all() else torch.where(valid[:, None, None], x, torch.nan)
+        valid, x = solution.status != Status.INVALID, self.alignment.to_caller(x, pose)
+        x = x if is_eager(valid) and valid.all() else torch.where(valid[:, None, None], x, torch.nan)
         return InBetweenResult(x, solution)
 
     def finish_paired(self, straight: Tensor, rests: RestShapes, solution: Solution, pose: Pose) -> InBetweenResult:
@@ -120,20 +120,22 @@ class InBetweenSolver(nn.Module):
         x = self.relax((ends[0] + ends[1]) / 2, rests)
         energies = [self.mean_energy(shape.detach(), rests) for shape in (x, straight)]
         valid = (solution.status != Status.INVALID)[:, None, None]
-        first, second, x = (torch.where(valid, self.alignment.restore(y, pose), torch.nan) for y in (*ends, x))
+        first, second, x = (torch.where(valid, self.alignment.to_caller(y, pose), torch.nan) for y in (*ends, x))
         return InBetweenResult(x, solution, first, second, *energies)
 
     def mean_energy(self, x: Tensor, rests: RestShapes) -> Tensor:
         """Mean of Eq. 5 from two key-frames to shapes, on the fine mesh. *Shape:* ``(B, V, 3) -> (B,)``."""
         energy, anchors = self.fine.energy, None if rests.anchors is None else rests.anchors.movedim(-1, 0)
         rows = energy.extend(x.movedim(-1, 0).contiguous(), anchors)
-        each = [energy.against(energy.rest_of(shape.detach()), rests.stiffness) for shape in rests.shapes.unbind(1)]
+        each = [
+            energy.reference_of(energy.rest_of(shape.detach()), rests.stiffness) for shape in rests.shapes.unbind(1)
+        ]
         return (energy.value(rows, each[0]) + energy.value(rows, each[1])).detach() / 2
 
     def minimise_amplitudes(self, base: Tensor, rests: RestShapes, mu: Tensor, usable: Tensor) -> Solution:
         """Amplitudes of least energy in the modal space. *Shape:* of ``mu`` and ``usable`` ``(B,)``."""
         if self.space is None:
-            return unminimised(base, usable)
+            return trivial_solution(base, usable)
         solve: Any = solve_implicit if self.solver.gradient == "implicit" else solve_unrolled
         if self.blend is None and solve is solve_implicit:
             solve = partial(solve_implicit, method=newton)

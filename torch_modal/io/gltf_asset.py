@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.errors import MeshError
-from torch_modal.geometry.skin import blended
+from torch_modal.geometry.skin import blend_bones
 from torch_modal.io.asset import Asset, Material, Part, as_png_or_jpeg
 from torch_modal.io.gltf import ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER, WHITE, Document, Json, world_transforms
 from torch_modal.io.normals import carry_together
@@ -135,7 +135,7 @@ class GltfAsset(Asset):
             by_bone = np.zeros((len(points), half - 1))
             np.add.at(by_bone, (np.arange(len(points))[:, None], joints), weights)
             arrays = (by_bone, bones, np.repeat(points[None], len(bones), axis=0))
-            frames[:, primitive.points] = blended(*map(torch.from_numpy, arrays)).numpy()
+            frames[:, primitive.points] = blend_bones(*map(torch.from_numpy, arrays)).numpy()
         return frames
 
     # ------------------------------------------------------------------------------------------------ the file again

@@ -18,7 +18,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-from torch_modal.autograd import lasting
+from torch_modal.autograd import outside_inference_mode
 from torch_modal.io.files import atomic_write
 
 DIGESTS = "digests"
@@ -79,7 +79,7 @@ class TensorFile:
         self._digests = dict(zip(names, rows, strict=True))
         self.shapes = {name: tuple(self._file.get_slice(name).get_shape()) for name in names}
 
-    @lasting
+    @outside_inference_mode
     def tensor(self, name: str) -> Tensor:
         """One of the tensors; raises ValueError if it is not what was written."""
         tensor: Tensor = self._file.get_tensor(name)
@@ -87,7 +87,7 @@ class TensorFile:
             raise ValueError(f"{self.path} is damaged: its tensor {name!r} is not what was written")
         return tensor
 
-    @lasting
+    @outside_inference_mode
     def tensors(self) -> dict[str, Tensor]:
         """Copies of all tensors, which do not depend on the file."""
         return {name: self.tensor(name).clone() for name in self.shapes}

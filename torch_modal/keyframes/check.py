@@ -60,17 +60,17 @@ def check_keyframes(keyframes: Any, faces: Any, *, min_keyframes: int = 1, warn:
         MeshWarning: At most once per kind of flaw, with the number of places and the first one.
     """
     flaws: list[str] = []
-    positions, mesh = checked_surface(keyframes, faces, min_keyframes, flaws if warn else None)
+    positions, mesh = check_surface(keyframes, faces, min_keyframes, flaws if warn else None)
     for message in flaws:
         warnings.warn(message, MeshWarning, stacklevel=2)
     return Keyframes(positions, torch.tensor(mesh.faces, device=positions.device))
 
 
-def checked_surface(
+def check_surface(
     keyframes: Any, faces: Any, min_keyframes: int = 1, flaws: list[str] | None = None
 ) -> tuple[torch.Tensor, Connectivity]:
     """`check_keyframes` that returns the connectivity instead of the faces, and appends flaws to a list, if given."""
-    positions, shapes, indices = checked_arrays(keyframes, faces, min_keyframes)
+    positions, shapes, indices = check_arrays(keyframes, faces, min_keyframes)
     notes: list[str] = [] if flaws is None else flaws
     mesh, orientable = _repair(indices, shapes.shape[1], notes.append)
     scaled = _check_sizes(shapes, mesh, positions.dtype, notes.append)
@@ -84,7 +84,7 @@ def checked_surface(
     return positions, mesh
 
 
-def checked_arrays(keyframes: Any, faces: Any, min_keyframes: int = 1) -> tuple[torch.Tensor, FloatArray, IntArray]:
+def check_arrays(keyframes: Any, faces: Any, min_keyframes: int = 1) -> tuple[torch.Tensor, FloatArray, IntArray]:
     """Check shapes and values of the arrays; return positions, unchanged and in float64, and faces.
 
     Raises:

@@ -7,17 +7,17 @@ import torch
 from torch import Tensor, nn
 
 from torch_modal.arrays import FloatArray
-from torch_modal.autograd import full_precision, lasting, outlasting, plain, require_numbers
+from torch_modal.autograd import as_normal_tensor, full_precision, is_eager, outside_inference_mode, require_numbers
 from torch_modal.contact.in_between import ContactSolver
 from torch_modal.elastic.term import Mesh
 from torch_modal.elastic.volume import Volume, encloses
 from torch_modal.geometry.bodies import bodies
 from torch_modal.geometry.canonical import own_order
-from torch_modal.inbetween.results import InBetweenResult, Samples, of_bodies
+from torch_modal.inbetween.results import InBetweenResult, Samples, join_bodies
 from torch_modal.inbetween.settings import Settings
 from torch_modal.inbetween.solver import InBetweenSolver
 from torch_modal.keyframes.arrays import as_faces, as_positions, check_tensor
-from torch_modal.keyframes.check import checked_surface
+from torch_modal.keyframes.check import check_surface
 from torch_modal.modes.basis import ModalBasis, checked_bases
 from torch_modal.threads import alone, by_chunks
 
@@ -61,7 +61,7 @@ class PreciseModule(nn.Module):
     built_from: Tensor
     _known: list[int] | None = None  # identities of tensors that are the bases' own
 
-    @lasting
+    @outside_inference_mode
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "PreciseModule":
         """Never below float32."""
 
@@ -88,7 +88,7 @@ class PreciseModule(nn.Module):
             what = ", ".join(f"{name} {tuple(state[name].shape) if name in state else 'missing'}" for name in wrong[:4])
             raise RuntimeError(f"the state does not fit this {type(self).__name__}, which stays as it is: {what}")
         names = [f"{prefix}bases.{i}.reference" for i in range(len(self.bases))]
-        checked_surface([state.get(name, present[name]).double().cpu() for name in names], self.faces.cpu())
+        check_surface([state.get(name, present[name]).double().cpu() for name in names], self.faces.cpu())
 
     def check_shapes(self, *sizes: int | str, **shapes: Tensor) -> None:
         """Raise a ValueError for shapes that do not fit the mesh, sizes of their leading dimensions, or the device."""
@@ -103,7 +103,7 @@ class PreciseModule(nn.Module):
     def _require_own_bases(self) -> None:
         """Raise where ``functional_call`` has replaced the bases, and not what follows from them."""
         seen = [id(x) for basis in self.bases for x in (basis.reference, basis.modes)]
-        if seen == self._known or not plain(marks := self._marks()):
+        if seen == self._known or not is_eager(marks := self._marks()):
             return
         if not torch.allclose(marks.to(self.built_from), self.built_from, 1e-4, 0.0):
             raise RuntimeError(
@@ -127,7 +127,7 @@ class InBetweenLayer(PreciseModule):
         self.terms = nn.ModuleList(self.objective.all_terms())
         mu = self.objective.mu
         if isinstance(mu, Tensor) and not isinstance(mu, nn.Parameter):
-            self.register_buffer("mu", outlasting(mu))
+            self.register_buffer("mu", as_normal_tensor(mu))
         else:
             self.mu = mu
         self.bases = nn.ModuleList(bases)
@@ -135,7 +135,7 @@ class InBetweenLayer(PreciseModule):
         self._build()
         self.register_load_state_dict_post_hook(InBetweenLayer._build)
 
-    @lasting
+    @outside_inference_mode
     @alone()
     def _build(self, _: Any = None) -> None:
         """Build everything that follows from the bases, in float64 on the CPU, then of their dtype and device."""
@@ -143,7 +143,7 @@ class InBetweenLayer(PreciseModule):
         references, modes = (
             [getattr(basis, name).double().cpu() for basis in self.bases] for name in ("reference", "modes")
         )
-        connectivity = checked_surface(references, self.faces.cpu())[1]
+        connectivity = check_surface(references, self.faces.cpu())[1]
         self.faces = torch.tensor(connectivity.faces)
         chosen, several = self.objective, [(slice(None), connectivity)]
         numbers = all(torch.as_tensor(term.stiffness).shape[-1:] in ((), (1,)) for term in self.terms)
@@ -176,7 +176,7 @@ class InBetweenLayer(PreciseModule):
         return self.core.alignment.scale.dtype
 
     @full_precision
-    def solved(self, keyframes: Tensor, weights: Tensor, lead: torch.Size) -> InBetweenResult:
+    def solve_samples(self, keyframes: Tensor, weights: Tensor, lead: torch.Size) -> InBetweenResult:
         """The in-betweens of key-frames and weights that were checked, in the layer's dtype.
 
         *Shape:* ``(*lead, K, V, 3), (*lead, K)``, or ones that expand to these.
@@ -192,7 +192,7 @@ class InBetweenLayer(PreciseModule):
             samples = Samples(flat[:, :, vertices], flat_weights, mu, self.stiffness_of(flat_weights, lead, i))
             # Further terms may have parameters of their own.
             results.append(by_chunks(core, samples, samples.keyframes.shape[2], closed=not self.objective.terms))
-        return of_bodies(results, self.vertices).unflattened(lead)
+        return join_bodies(results, self.vertices).unflatten(lead)
 
     def mu_of(self, like: Tensor, lead: torch.Size) -> Tensor:
         """``mu`` of a flat batch of these leading dimensions. *Shape:* ``(B,)``."""

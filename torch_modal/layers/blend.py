@@ -3,7 +3,13 @@
 import torch
 from torch import Tensor
 
-from torch_modal.autograd import lasting, made_outside, once, traced, untraced
+from torch_modal.autograd import (
+    disable_compile,
+    forbid_second_derivative,
+    is_traced,
+    outside_inference_mode,
+    run_outside_transforms,
+)
 from torch_modal.inbetween.results import InBetweenResult, report, with_exact_keyframes
 from torch_modal.inbetween.settings import Objective, Preset, Solver, settings
 from torch_modal.keyframes.arrays import broadcast_leading, check_tensor
@@ -41,7 +47,7 @@ class Blend(InBetweenLayer):
         ValueError: An argument is not usable, or the objective has contact or the paired space, which are of pairs.
     """
 
-    @lasting
+    @outside_inference_mode
     def __init__(
         self,
         bases: Bases,
@@ -57,7 +63,7 @@ class Blend(InBetweenLayer):
         several = basis_buffers(bases)
         super().__init__(several * 2 if len(several) == 1 else several, faces, chosen)
 
-    @untraced
+    @disable_compile
     def forward(self, keyframes: Tensor, weights: Tensor) -> Tensor:
         """The weighted in-betweens.
 
@@ -79,7 +85,7 @@ class Blend(InBetweenLayer):
         report(result.solution, self.solver)
         return result.shapes
 
-    @untraced
+    @disable_compile
     def solve(self, keyframes: Tensor, weights: Tensor) -> InBetweenResult:
         """The shapes, and how each minimisation went, without a warning. Arguments as for :meth:`forward`."""
         lead = self._check(keyframes, weights)
@@ -89,9 +95,9 @@ class Blend(InBetweenLayer):
             normalised = normalised / normalised.sum(-1, keepdim=True)
         x, several = keyframes, weights.shape[-1] > 2
         if several:  # second derivatives pass what goes in, in reverse mode, or what comes out, in forward mode
-            x, normalised = once(x, SECOND), once(normalised, SECOND)
-        result = self.solved(x, normalised, lead)
-        shapes = once(result.shapes, SECOND) if several else result.shapes
+            x, normalised = forbid_second_derivative(x, SECOND), forbid_second_derivative(normalised, SECOND)
+        result = self.solve_samples(x, normalised, lead)
+        shapes = forbid_second_derivative(result.shapes, SECOND) if several else result.shapes
         return result._replace(shapes=with_exact_keyframes(shapes, keyframes, weights))
 
     def _check(self, keyframes: Tensor, weights: Tensor) -> torch.Size:
@@ -99,8 +105,8 @@ class Blend(InBetweenLayer):
         check_tensor("weights", weights, "...", "K", device=self.bases[0].reference.device)
         self.check_shapes(weights.shape[-1], keyframes=keyframes)
         lead = broadcast_leading(keyframes=keyframes.shape[:-3], weights=weights.shape[:-1])
-        if not traced(weights):
-            made_outside(_check_weights, weights)
+        if not is_traced(weights):
+            run_outside_transforms(_check_weights, weights)
         return lead
 
 

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from torch_modal.autograd import lasting, made_outside, traced, untraced
+from torch_modal.autograd import disable_compile, is_traced, outside_inference_mode, run_outside_transforms
 from torch_modal.geometry.crossings import require_contact
 from torch_modal.inbetween.results import InBetweenResult, report, with_exact_keyframes
 from torch_modal.inbetween.settings import Objective, Preset, Solver, settings
@@ -41,7 +41,7 @@ class InBetween(InBetweenLayer):
         MissingPackageError: ``contact`` without that extra.
     """
 
-    @lasting
+    @outside_inference_mode
     def __init__(
         self,
         bases: Bases,
@@ -65,7 +65,7 @@ class InBetween(InBetweenLayer):
             raise ValueError("the paired space (Eq. 4) is one of modes; pass bases, not key-frames")
         super().__init__(ends * 2 if len(ends) == 1 else ends, faces, chosen)
 
-    @untraced
+    @disable_compile
     def forward(self, x_a: Tensor, x_b: Tensor, t: Tensor | float) -> Tensor:
         """The in-betweens.
 
@@ -89,21 +89,21 @@ class InBetween(InBetweenLayer):
         report(result.solution, self.solver)
         return result.shapes
 
-    @untraced
+    @disable_compile
     def solve(self, x_a: Tensor, x_b: Tensor, t: Tensor | float) -> InBetweenResult:
         """The in-betweens, and how each minimisation went, without a warning. Arguments as for :meth:`forward`."""
         self.check_shapes(x_a=x_a, x_b=x_b)
         times = torch.as_tensor(t, dtype=self.dtype, device=x_a.device)
         hint = "for all times of all pairs pass x_a[:, None] and x_b[:, None]"
         lead = broadcast_leading(hint, x_a=x_a.shape[:-2], x_b=x_b.shape[:-2], t=times.shape)
-        if traced(times):
+        if is_traced(times):
             times = torch.where((times >= 0) & (times <= 1), times, torch.nan)
         else:
-            made_outside(_check_half if self.objective.space == "paired" else _check_times, times)
+            run_outside_transforms(_check_half if self.objective.space == "paired" else _check_times, times)
         dtype = torch.promote_types(x_a.dtype, x_b.dtype)
         keyframes = torch.stack(torch.broadcast_tensors(x_a.to(dtype), x_b.to(dtype)), -3)
         weights = torch.stack([1 - times, times], -1)
-        result = self.solved(keyframes, weights, lead)
+        result = self.solve_samples(keyframes, weights, lead)
         return result._replace(shapes=with_exact_keyframes(result.shapes, keyframes, weights))
 
 

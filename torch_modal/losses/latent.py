@@ -112,7 +112,7 @@ class LatentElasticity(nn.Module):
     def _gram(self, x: Tensor, along: list[Tensor]) -> Tensor:
         """Products of displacements in the Hessian about shapes. *Shape:* ``(B, k, k)``."""
         energy, scale = self.shell.energy, self.shell.scale(x)
-        reference = self.shell.against(scale * x)
+        reference = self.shell.reference_of(scale * x)
         at = energy.linearise(self.shell._rows(scale * x), reference)
         each = [energy.rates(at, self.shell._rows(scale * field)) for field in along]
         gram = x.new_zeros(len(x), len(along), len(along))

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torch_modal.autograd import lasting
+from torch_modal.autograd import outside_inference_mode
 from torch_modal.elastic.energy import Rest
 from torch_modal.elastic.shell import ShellEnergy
 from torch_modal.geometry.canonical import CANONICAL_SIZE
@@ -57,7 +57,7 @@ class ShellLoss(ShellEnergy):
 
     sides: Tensor
 
-    @lasting
+    @outside_inference_mode
     def __init__(
         self, faces: Tensor, alpha: float | Tensor = 1.0, beta: float | Tensor = BEND, gamma: float | Tensor = VOLUME
     ) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from torch_modal.autograd import lasting, outlasting
+from torch_modal.autograd import as_normal_tensor, outside_inference_mode
 from torch_modal.geometry.rigid import infinitesimal_motions
 from torch_modal.io.tensors import TensorFile, write_tensors
 
@@ -57,7 +57,7 @@ class ModalBasis:
     modes: torch.Tensor
     rigid_eigenvalues: torch.Tensor
 
-    @lasting
+    @outside_inference_mode
     def __post_init__(self) -> None:
         shapes = {name: tuple(tensor.shape) for name, tensor in self._tensors().items()}
         v, k = shapes["reference"][:1], shapes["eigenvalues"][:1]
@@ -71,7 +71,7 @@ class ModalBasis:
         if len(kinds) > 1 or not self.reference.is_floating_point():
             raise ValueError(f"the tensors of a basis share one floating-point dtype and one device; got {kinds}")
         for name, tensor in self._tensors().items():
-            object.__setattr__(self, name, outlasting(tensor.detach()))
+            object.__setattr__(self, name, as_normal_tensor(tensor.detach()))
 
     def _tensors(self) -> dict[str, torch.Tensor]:
         return {field.name: getattr(self, field.name) for field in fields(self)}

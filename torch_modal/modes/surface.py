@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.errors import MeshError
-from torch_modal.geometry.canonical import CANONICAL_SIZE, in_order, placed
+from torch_modal.geometry.canonical import CANONICAL_SIZE, in_order, to_canonical
 from torch_modal.geometry.connectivity import vertex_areas
 from torch_modal.geometry.inspect import FLATNESS, principal_extents, signed_volume
 from torch_modal.geometry.vectors import vertex_normals
@@ -74,7 +74,7 @@ class CanonicalSurface:
                 f"all vertices lie on a line: the extents are {extents[0]:.3g}, {extents[1]:.3g} and {extents[2]:.3g}; "
                 "a surface has an area"
             )
-        points, axes, _, scale = placed(points, compact.reshape(-1, 3))
+        points, axes, _, scale = to_canonical(points, compact.reshape(-1, 3))
         order, sorted_faces = in_order(points, compact.reshape(-1, 3))
         ordered = order[sorted_faces]
         # fTetWild keeps the volume with positive winding number, which is empty for an inverted mesh.

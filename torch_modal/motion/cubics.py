@@ -16,7 +16,7 @@ from typing import NamedTuple, TypeVar
 import torch
 from torch import Tensor
 
-from torch_modal.autograd import in_use, mapped
+from torch_modal.autograd import in_use, is_vmapped
 
 # Velocities are cut from this many times the slower one of the steps before and after on, and never reach three times:
 # what stops, stops, and no quantity that grows overshoots (Fritsch and Carlson 1980).
@@ -112,7 +112,7 @@ def evaluate_by_interval(
         everywhere: True to compute all rows of each interval, as where ``vmap`` maps the intervals.
     """
     intervals = in_use(segment, n) or [0]  # of nothing, nothing
-    if everywhere or mapped(segment):
+    if everywhere or is_vmapped(segment):
         place, size = sum((segment == i) * place for place, i in enumerate(intervals)), segment.shape[0]
         order = place * size + torch.arange(size, device=segment.device)
         return [shapes(i, slice(None)) for i in intervals], order

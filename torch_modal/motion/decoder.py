@@ -12,14 +12,14 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from torch_modal.autograd import full_precision, lasting, require_numbers, traced, untraced
+from torch_modal.autograd import disable_compile, full_precision, is_traced, outside_inference_mode, require_numbers
 from torch_modal.elastic.backend import TorchBackend
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.local_rotations import Trajectory
 from torch_modal.geometry.rotations import exp
 from torch_modal.geometry.triangle_frames import Frames, bend, frames_of, sides
 from torch_modal.keyframes.arrays import broadcast_leading, check_tensor
-from torch_modal.keyframes.check import checked_arrays
+from torch_modal.keyframes.check import check_arrays
 from torch_modal.motion.cubics import evaluate_by_interval
 from torch_modal.motion.spline import Knots, Spline
 from torch_modal.times import check_times, locate_times
@@ -68,12 +68,12 @@ class ModalDecoder(nn.Module):
     spline: Spline
     knots: Knots
 
-    @lasting
+    @outside_inference_mode
     def __init__(
         self, keyframes: Tensor, faces: Tensor, times: Tensor | Sequence[float], reference: Tensor, modes: Tensor
     ) -> None:
         super().__init__()
-        keyframes, _, indices = checked_arrays(keyframes, faces, 2)
+        keyframes, _, indices = check_arrays(keyframes, faces, 2)
         check_tensor("reference", reference, *keyframes.shape[1:], finite=True)
         check_tensor("modes", modes, "k", *keyframes.shape[1:], finite=True)
         times = check_times(times, len(keyframes), None)
@@ -83,7 +83,7 @@ class ModalDecoder(nn.Module):
             self.register_buffer(name, x.detach().double().cpu().clone())
         self._build()
         modes = modes.detach().double().cpu()
-        displaced = scaled(modes, self.size)
+        displaced = scale_modes(modes, self.size)
         #: Turn and strain of each triangle by an amplitude of 1. *Shape:* ``(k, 6, F)``.
         self.register_buffer("columns", bending_columns(self.reference, self.faces, displaced))
         #: Displacement of the centres of loose pieces by it, if there are several. *Shape:* ``(k, 3V)``, or none.
@@ -92,7 +92,7 @@ class ModalDecoder(nn.Module):
         self.register_buffer("moves", centres.flatten(1)[:, : centres[0].numel() if several else 0].contiguous())
         self.register_load_state_dict_post_hook(ModalDecoder._build)
 
-    @lasting
+    @outside_inference_mode
     def _build(self, _: Any = None) -> None:
         """Build everything that follows from the key-frames, their times and the reference."""
         keyframes = self.keyframes
@@ -103,14 +103,14 @@ class ModalDecoder(nn.Module):
         self.spline = spline.to(keyframes)
         self.knots = self.spline.knots(keyframes[None])
 
-    @lasting
+    @outside_inference_mode
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "ModalDecoder":
         require_numbers("ModalDecoder", fn(self.keyframes))
         moved = super()._apply(fn, recurse)
         self.knots = self.spline.knots(self.keyframes[None])
         return moved
 
-    @lasting
+    @outside_inference_mode
     def with_keyframes(self, keyframes: Tensor, times: Tensor) -> "ModalDecoder":
         """Decoder with these modes along a path through other key-frames of the same connectivity."""
         other = ModalDecoder.__new__(ModalDecoder)
@@ -128,7 +128,7 @@ class ModalDecoder(nn.Module):
         """Number of amplitudes, k."""
         return len(self.columns)
 
-    @untraced
+    @disable_compile
     @full_precision
     def forward(
         self, amplitudes: Tensor, t: Tensor | float, motions: Tensor | None = None, keyframes: Tensor | None = None
@@ -166,7 +166,7 @@ class ModalDecoder(nn.Module):
                 return self._shapes(knots, i, trajectory, a, u)
             return torch.cat([self._shapes(knots, i, trajectory, a[chunk], u[chunk]) for chunk in rows.split(size)])
 
-        parts, order = evaluate_by_interval(segment, len(self.times) - 1, shapes, traced(segment))
+        parts, order = evaluate_by_interval(segment, len(self.times) - 1, shapes, is_traced(segment))
         x = torch.cat(parts)[order]
         if motions is not None:
             x = apply_motions(x, motions.expand(*lead, 6).reshape(-1, 6), self.size)
@@ -180,14 +180,14 @@ class ModalDecoder(nn.Module):
             straight = straight + (a @ self.moves).unflatten(1, (-1, 3))
         bending = (a @ self.columns.flatten(1)).unflatten(1, (6, -1)).movedim(1, 0)
         x = self.spline(knots, i, which, u, trajectory, straight, bending)
-        return self.spline.alignment.restore(x, self.spline.pose(knots, i, which, u))
+        return self.spline.alignment.to_caller(x, self.spline.pose(knots, i, which, u))
 
     def locate(self, t: Tensor) -> tuple[Tensor, Tensor]:
         """Interval of each time, and its fraction of the interval. *Shape:* ``(B,)``."""
         return locate_times(t, self.times, self.spline.cyclic)
 
 
-def scaled(modes: Tensor, size: Tensor | float) -> Tensor:
+def scale_modes(modes: Tensor, size: Tensor | float) -> Tensor:
     """Modes that move the vertices by :data:`UNIT` of a size in the root mean square. *Shape:* ``(k, V, 3)``."""
     rms = modes.square().sum(-1).mean(1).sqrt().clamp_min(torch.finfo(torch.float64).tiny)
     return modes * (UNIT * size / rms)[:, None, None]

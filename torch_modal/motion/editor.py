@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from torch_modal.autograd import lasting
+from torch_modal.autograd import outside_inference_mode
 from torch_modal.keyframes.arrays import check_tensor
 from torch_modal.motion.path import Path
 from torch_modal.times import fill_times
@@ -24,7 +24,7 @@ class PathEditor:
         ValueError: The key-frames do not fit the path, or ``steps`` is below 1.
     """
 
-    @lasting
+    @outside_inference_mode
     def __init__(self, path: Path, keyframes: Tensor, steps: int = 16) -> None:
         check_tensor("keyframes", keyframes, path.n_keyframes, *path.bases[0].reference.shape)
         if steps < 1:
@@ -50,7 +50,7 @@ class PathEditor:
             raise IndexError(f"there are {len(self.keyframes)} key-frames; got the number {i}")
         self.keyframes[i] = self._check_shape(shape)
 
-    @lasting
+    @outside_inference_mode
     def insert(self, t: float, shape: Tensor | None = None) -> int:
         """Pin the motion at a time: the shape becomes a key-frame.
 
@@ -66,7 +66,7 @@ class PathEditor:
                 changed then.
         """
         if shape is None:
-            shape = lasting(self.path)(self.keyframes, t)
+            shape = outside_inference_mode(self.path)(self.keyframes, t)
         shape = self._check_shape(shape)
         path = self.path.insert(t)
         i = int((path.times[:-1] == self.path.times).cumprod(0).sum())  # up to there, all times are as before
@@ -88,12 +88,12 @@ class PathEditor:
             same = made is not None and torch.equal(made[1][0], needed[0])
             if made is None or not same or not bool(((made[1][1] - needed[1]).abs() <= SLIGHT).all()):
                 times = at[i * self.steps : (i + 1) * self.steps]
-                made = lasting(self.path)(self.keyframes, times), needed
+                made = outside_inference_mode(self.path)(self.keyframes, times), needed
                 self._made[i] = made
             intervals.append(made[0])
         return torch.cat(intervals if self.path.cyclic else [*intervals, self.keyframes[-1:]])
 
-    @lasting
+    @outside_inference_mode
     def _dependencies(self) -> list[tuple[Tensor, Tensor]]:
         """Key-frames and velocities that each interval follows from, in visible units. *Shape:* ``(2, V, 3), (n,)``."""
         path, closed = self.path, torch.cat([self.keyframes, self.keyframes[:1]])

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from torch_modal.autograd import full_precision, lasting, require_numbers, untraced
+from torch_modal.autograd import disable_compile, full_precision, outside_inference_mode, require_numbers
 from torch_modal.contact.active import refuse_transforms
 from torch_modal.contact.in_between import push_apart
 from torch_modal.elastic.backend import choose
@@ -18,11 +18,11 @@ from torch_modal.elastic.term import Mesh
 from torch_modal.geometry.bodies import bodies
 from torch_modal.geometry.crossings import require_contact
 from torch_modal.inbetween.alignment import Pose
-from torch_modal.inbetween.comparison import SLACK_OF_PATHS, no_worse
-from torch_modal.inbetween.results import InBetweenResult, of_bodies, report, unminimised, with_exact_keyframes
+from torch_modal.inbetween.comparison import SLACK_OF_PATHS, blend_towards_starts
+from torch_modal.inbetween.results import InBetweenResult, join_bodies, report, trivial_solution, with_exact_keyframes
 from torch_modal.inbetween.settings import Objective, Preset, Solver, settings
 from torch_modal.keyframes.arrays import as_faces, broadcast_leading
-from torch_modal.keyframes.check import checked_surface
+from torch_modal.keyframes.check import check_surface
 from torch_modal.layers.base import Bases, BasisBuffers, PreciseModule, basis_buffers
 from torch_modal.layers.blend import Blend
 from torch_modal.layers.in_between import InBetween
@@ -73,7 +73,7 @@ class Path(PreciseModule):
     splines: Any
     distortions: Any
 
-    @lasting
+    @outside_inference_mode
     def __init__(
         self,
         bases: Bases,
@@ -125,12 +125,12 @@ class Path(PreciseModule):
         self._build()
         self.register_load_state_dict_post_hook(Path._build)
 
-    @lasting
+    @outside_inference_mode
     def _build(self, _: Any = None) -> None:
         """Build the splines of the bases' references, on their device and in their dtype."""
         like = self.bases[0].reference
         references = torch.stack([basis.reference.double().cpu() for basis in self.bases])
-        connectivity = checked_surface(list(references), self.faces)[1]
+        connectivity = check_surface(list(references), self.faces)[1]
         self.faces = torch.tensor(connectivity.faces)
         backend, alone = choose(self.solver.backend), self.contact or self.objective.terms
         pieces = [(slice(None), connectivity)] if alone else bodies(references.numpy(), connectivity)
@@ -147,7 +147,7 @@ class Path(PreciseModule):
         """The dtype of the computation."""
         return self.splines[0].alignment.scale.dtype  # type: ignore[no-any-return]
 
-    @lasting
+    @outside_inference_mode
     def insert(self, t: float) -> "Path":
         """Motion with one more key-frame, which borrows the modes of the nearer of those around it.
 
@@ -177,7 +177,7 @@ class Path(PreciseModule):
         other = Path(buffers, self.faces, times, self.cyclic, self.scheme or self.smooth, **options)
         return other.to(self.bases[0].reference)
 
-    @untraced
+    @disable_compile
     def forward(self, keyframes: Tensor, t: Tensor | float) -> Tensor:
         """The shapes at given times.
 
@@ -196,7 +196,7 @@ class Path(PreciseModule):
         report(result.solution, self.solver)
         return result.shapes
 
-    @untraced
+    @disable_compile
     def solve(self, keyframes: Tensor, t: Tensor | float) -> InBetweenResult:
         """The shapes, and how each minimisation went, without a warning. Arguments as for :meth:`forward`."""
         flat, which, segment, u, lead = self._flatten(keyframes, t)
@@ -208,7 +208,7 @@ class Path(PreciseModule):
         pairs = torch.tensor(self.pairs, device=segment.device)[segment]
         ends = torch.stack([flat[which, k] for k in pairs.unbind(-1)], 1).to(keyframes.dtype)
         exact = with_exact_keyframes(result.shapes, ends, torch.stack([1 - u, u], -1))
-        return result._replace(shapes=exact).unflattened(lead)
+        return result._replace(shapes=exact).unflatten(lead)
 
     @torch.no_grad()
     @full_precision
@@ -253,7 +253,7 @@ class Path(PreciseModule):
             result = self._separate_contacts(knots, flat, i, which, u, result, n_searched)
         if knots is not None and self.objective.terms:
             x = result.shapes[:, None]  # each is compared with itself
-            result = self.layers[0].solved(x, torch.ones_like(x[..., 0, 0]), u.shape)
+            result = self.layers[0].solve_samples(x, torch.ones_like(x[..., 0, 0]), u.shape)
         return result
 
     def _spline_shapes(
@@ -263,16 +263,18 @@ class Path(PreciseModule):
         weights = torch.stack([1 - u, u], -1)
         if knots is None:
             ends = flat[which][:, list(self.pairs[i])]
-            return self.layers[i].solved(ends, weights, u.shape)  # type: ignore[no-any-return]
+            return self.layers[i].solve_samples(ends, weights, u.shape)  # type: ignore[no-any-return]
         results, stiffness = [], [u.new_full((len(u), 1), value) for value in (ALPHA, BETA)]
         for spline, distortion, body in zip(self.splines, self.distortions, knots, strict=True):
             straight = spline.straight(body, i, which, u)
             x, usable = spline(body, i, which, u, straight=straight), body.usable[which]
             rests = RestShapes(body.shapes[i : i + 2, which].movedim(0, 1), weights, stiffness, None)
-            x, solution = no_worse(x, [straight], unminimised(x, usable), distortion, rests, SLACK_OF_PATHS)
-            shapes = spline.alignment.restore(x, spline.pose(body, i, which, u))
+            x, solution = blend_towards_starts(
+                x, [straight], trivial_solution(x, usable), distortion, rests, SLACK_OF_PATHS
+            )
+            shapes = spline.alignment.to_caller(x, spline.pose(body, i, which, u))
             results.append(InBetweenResult(torch.where(usable[:, None, None], shapes, torch.nan), solution))
-        return of_bodies(results, self.vertices)
+        return join_bodies(results, self.vertices)
 
     def _separate_contacts(
         self, knots: list[Knots] | None, flat: Tensor, i: int, which: Tensor, u: Tensor, result: InBetweenResult, n: int
@@ -294,7 +296,7 @@ class Path(PreciseModule):
             with torch.no_grad():
                 rows = torch.full_like(even, motion, dtype=torch.int64)
                 pose, known, ends = pose_at(rows, even)
-                x = core.alignment.bring(self._spline_shapes(knots, flat, i, rows, even).shapes, pose)
+                x = core.alignment.to_frame(self._spline_shapes(knots, flat, i, rows, even).shapes, pose)
                 if known is None:  # shapes on the spline are compared with themselves
                     known, weights = x[:, None], torch.ones_like(even)[:, None]
                 else:
@@ -306,8 +308,8 @@ class Path(PreciseModule):
                 displacement = push_apart(core, x, even, rests, pose, both, goes_on)
             chosen = torch.nonzero(which == motion).flatten()
             pose = pose_at(which[chosen], u[chosen])[0]
-            pushed, left[chosen] = displacement.apply(core.alignment.bring(result.shapes[chosen], pose), u[chosen])
-            shapes = shapes.index_copy(0, chosen, core.alignment.restore(pushed, pose))
+            pushed, left[chosen] = displacement.apply(core.alignment.to_frame(result.shapes[chosen], pose), u[chosen])
+            shapes = shapes.index_copy(0, chosen, core.alignment.to_caller(pushed, pose))
         return InBetweenResult(shapes, result.solution._replace(n_crossing=left))
 
     def _flatten(self, keyframes: Tensor, t: Tensor | float) -> tuple[Tensor, Tensor, Tensor, Tensor, torch.Size]:

@@ -19,7 +19,7 @@ from torch_modal.geometry.connectivity import merge_seams
 from torch_modal.geometry.inspect import diagonals
 from torch_modal.geometry.rigid import best_rotation
 from torch_modal.geometry.rotations import exp, log, matrix
-from torch_modal.geometry.skin import STEPS, Skin, blended
+from torch_modal.geometry.skin import STEPS, Skin, blend_bones
 from torch_modal.io.write import check_frames
 from torch_modal.times import check_times
 
@@ -272,10 +272,10 @@ def _halfway_errors(skin: Skin, shapes: Tensor) -> Tensor:
     half = exp(0.5 * log(steps))
     played = rotations[:-1, 1:] @ exp(0.5 * log(rotations[:-1, 1:].mT @ rotations[1:, 1:]))
     shift = 0.5 * (shifts[:-1, 1:] + shifts[1:, 1:])[..., None] - played @ middles
-    off = blended(weights, torch.cat([played, shift], 3), rest.expand(len(half), -1, -1))
+    off = blend_bones(weights, torch.cat([played, shift], 3), rest.expand(len(half), -1, -1))
     centres = centres[..., None]
     for turn, middle, x in ((half, centres[:-1], local[:-1]), (half.mT, centres[1:], local[1:])):
-        off -= 0.5 * blended(weights, torch.cat([turn, middle - turn @ middle], 3), x)
+        off -= 0.5 * blend_bones(weights, torch.cat([turn, middle - turn @ middle], 3), x)
     return off
 
 

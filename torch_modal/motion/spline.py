@@ -106,10 +106,10 @@ class Spline(nn.Module):
         one, other = torch.tensor(mesh.face_neighbours).unbind(1)
         for i in range(1, len(times) - 1):
             ends = references[[i, (i + 1) % n]]
-            between = first.wound([frames_of(x[None], first.faces) for x in ends])
+            between = first.cluster_arguments([frames_of(x[None], first.faces) for x in ends])
             plain = first.clusters is None and not beyond_a_turn(*between)
             if plain:
-                turns = first.turns(ends[:1], ends[1:])[:, 0]
+                turns = first.quaternions(ends[:1], ends[1:])[:, 0]
                 plain = bool(((pick(turns, one) * pick(turns, other)).sum(0) >= 0).all())
             self.rotations.append(first if plain else backend.rotations(mesh, ends))
 
@@ -117,7 +117,7 @@ class Spline(nn.Module):
     def knots(self, keyframes: Tensor) -> Knots:
         """The velocities at all key-frames. *Shape:* ``(L, K, V, 3)``."""
         weights, reference = self.alignment.weights, self.alignment.reference
-        x, usable = self.alignment.checked(keyframes.mT)
+        x, usable = self.alignment.replace_unusable(keyframes.mT)
         x = x.mT.movedim(1, 0)
         x = torch.cat([x, x[:1]]) if self.cyclic else x
         centres = centroid(x, weights)
@@ -130,7 +130,7 @@ class Spline(nn.Module):
         rotations = torch.stack(turns).mT
         shapes = self.alignment.scale * centred @ rotations
         every = shapes.detach().movedim(0, 1)
-        usable = usable.all(1) & ~self.alignment.mirrored(every, torch.ones_like(every[..., 0, 0])).any(1)
+        usable = usable.all(1) & ~self.alignment.find_mirrored(every, torch.ones_like(every[..., 0, 0])).any(1)
         durations = self.times.diff()
 
         def fit_cubics(steps: Tensor, dim: int = -1) -> Cubics:
@@ -195,13 +195,13 @@ class Spline(nn.Module):
         trajectory = self.trajectory(knots, i) if trajectory is None else trajectory
         straight = self.straight(knots, i, which, u) if straight is None else straight
         if bending is not None:
-            edges = rotations.bent_along(trajectory, u, bending)
+            edges = rotations.bent_edges_along(trajectory, u, bending)
         elif rotations.clusters is not None:
             ends = knots.shapes[i : i + 2, which].movedim(0, 1)
             edges = rotations(ends, torch.stack([1 - u, u], -1))
         else:
-            edges = rotations.along(trajectory, which, u)
-        return self.poisson.or_near(self.poisson.pulls(edges), straight)
+            edges = rotations.edges_along(trajectory, which, u)
+        return self.poisson.forward_or_near(self.poisson.right_hand_side(edges), straight)
 
     def explain(self, knots: Knots) -> tuple[Tensor, Tensor]:
         """Masks of the velocities that are limited at both ends of each interval, and its :attr:`Explanation.turns`.

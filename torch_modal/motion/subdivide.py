@@ -145,7 +145,7 @@ def subdivide(
             bar.update(int(by_path))
         sequence[-1] = keyframes[-1]
     sequence = sequence[:-1] if cyclic else sequence
-    return carrier.carried(sequence, places, originals) if carrier else sequence
+    return carrier.carry(sequence, places, originals) if carrier else sequence
 
 
 def _follow_path(path: Path, keyframes: Tensor, faces: Tensor, places: Sequence[int]) -> Iterator[Tensor]:

@@ -9,7 +9,7 @@ import torch
 from scipy import sparse
 from torch import Tensor, nn
 
-from torch_modal.autograd import full_precision, lasting, linear_map, traced
+from torch_modal.autograd import full_precision, is_traced, linear_map, outside_inference_mode
 from torch_modal.geometry.rigid import best_rotation
 from torch_modal.geometry.triangle_frames import sides
 from torch_modal.geometry.vectors import cross, inverse, norm
@@ -57,7 +57,7 @@ class Passengers(nn.Module):
     transposed_columns: Tensor
     transposed_values: Tensor
 
-    @lasting
+    @outside_inference_mode
     def __init__(self, reference: Tensor, faces: Tensor, points: Tensor, anchors: Tensor | None = None) -> None:
         super().__init__()
         corners = torch.from_numpy(as_faces(faces))
@@ -99,7 +99,7 @@ class Passengers(nn.Module):
         arrays = (tensor.cpu().numpy() for tensor in (self.values, self.columns, self.starts))
         return sparse.csr_matrix(tuple(arrays), shape=(len(self), len(self.reference)))
 
-    @lasting
+    @outside_inference_mode
     def rebind(self, reference: Tensor, points: Tensor) -> "Passengers":
         """Passengers with these weights for another pose of carrier and points. *Shape:* ``(V, 3), (P, 3)``."""
         passengers = Passengers.__new__(Passengers)
@@ -168,7 +168,7 @@ class Passengers(nn.Module):
 
     def _mix(self, values: Tensor) -> Tensor:
         """Weighted sums over the vertices that points follow. *Shape:* ``(B, V, n) -> (B, P, n)``."""
-        if traced(values):  # sparse products cannot be traced
+        if is_traced(values):  # sparse products cannot be traced
             counts = self.starts.diff().long()
             row = torch.arange(len(self), device=values.device).repeat_interleave(counts, output_size=len(self.values))
             each = values[:, self.columns.long()] * self.values[:, None]

@@ -6,7 +6,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from torch_modal.autograd import lasting
+from torch_modal.autograd import outside_inference_mode
 from torch_modal.modes.coarsening import coarsen
 from torch_modal.passengers.passengers import Passengers
 
@@ -33,7 +33,7 @@ class Proxy:
         passengers: The detail of each key-frame.
     """
 
-    @lasting
+    @outside_inference_mode
     def __init__(self, keyframes: Tensor, faces: Tensor, n_vertices: int) -> None:
         fine = keyframes.detach().double().cpu()
         coarse = coarsen(fine.numpy(), faces.detach().cpu().numpy(), 2 * n_vertices)
@@ -45,7 +45,7 @@ class Proxy:
         self.keyframes = carriers.to(keyframes)
 
     @torch.no_grad()
-    def carried(self, shapes: Tensor, places: Sequence[int], keyframes: Tensor) -> Tensor:
+    def carry(self, shapes: Tensor, places: Sequence[int], keyframes: Tensor) -> Tensor:
         """Add the detail of the key-frames, blended from each to the next, to a sequence of the carrier.
 
         Places are the frame numbers of the key-frames, in a cycle with one more for the first again. *Shape:*

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from torch_modal.autograd import lasting
+from torch_modal.autograd import outside_inference_mode
 from torch_modal.keyframes.arrays import check_tensor
 from torch_modal.statistics.variation import Variation
 
@@ -15,7 +15,7 @@ class Components:
     component of displacements would shear it. There are at most K - 1.
     """
 
-    @lasting
+    @outside_inference_mode
     def __init__(self, variation: Variation, n: int) -> None:
         self._coordinates, self._average, self._origin = variation.coordinates, variation.average, variation.origin
         deviations = variation.deviations

@@ -59,7 +59,7 @@ class BendingCoordinates:
         for x in placed:
             rotations = LocalRotations(self.mesh, torch.stack([self.mean, x.detach()]))
             seen = frames_of(x[None], self.faces)
-            turn, strain = bending_between(self.frames, seen, rotations.turns(self.mean[None], x[None]))
+            turn, strain = bending_between(self.frames, seen, rotations.quaternions(self.mean[None], x[None]))
             turn, strain = turn[:, 0], strain[:, 0].clamp(-MOST_STRAIN, MOST_STRAIN)
             areas = seen.doubled_areas[0]
             flat = ~self._has_area | (areas <= SMALLEST_AREA * areas.mean())

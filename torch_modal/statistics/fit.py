@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torch_modal.autograd import transformed
+from torch_modal.autograd import is_transformed
 from torch_modal.contact.active import Pull
 from torch_modal.keyframes.arrays import broadcast_leading, check_tensor, require_units
 from torch_modal.statistics.local_weights import NOISE, LocalWeights, Observations
@@ -65,7 +65,7 @@ def fit(
             points, vertices = (torch.as_tensor(x).clone() for x in (points, vertices))
             return fit(variation, points, vertices, near, robust, weights, noise)
     points = torch.as_tensor(points)
-    if transformed(points):
+    if is_transformed(points):
         raise RuntimeError("fits have no forward mode, and no transforms of torch.func: take torch.autograd.grad")
     k, v = variation.shapes.shape[:2]
     noise = 0.0 if noise is None else float(noise)

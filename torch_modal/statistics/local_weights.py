@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torch_modal.autograd import recorded
+from torch_modal.autograd import is_double_backward
 from torch_modal.elastic.steps import conjugate_gradients
 from torch_modal.geometry.rigid import RigidMotion, best_fit, centroid, infinitesimal_motions
 from torch_modal.statistics.variation import Variation
@@ -186,7 +186,7 @@ class _FactorsOfPoints(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        if recorded(grad):
+        if is_double_backward(grad):
             raise RuntimeError(
                 "fits have first derivatives only: second ones would lack the elastic steps, which are constants of "
                 "the graph; take the gradient without create_graph"

@@ -107,10 +107,10 @@ class Variation:
         The shape is in the pose of the mean; the springs are an energy at a size of 100. *Shape:* ``(V, 3), (K, V)``.
         """
         energy = self.fine.energy
-        rest = trees.mapped(energy.mixed(self.rest, weights), lambda measure: measure[None])
-        reference = energy.against(rest, self.stiffness)
+        rest = trees.map_leaves(energy.mix_rests(self.rest, weights), lambda measure: measure[None])
+        reference = energy.reference_of(rest, self.stiffness)
         further = [] if springs is None else [springs]
-        return self.fine.towards(self.scale * x[None], reference, n_steps, n_products, further)[0] / self.scale
+        return self.fine.descend_towards(self.scale * x[None], reference, n_steps, n_products, further)[0] / self.scale
 
     # ----------------------------------------------------------------------------------------------------- new members
     def draw(

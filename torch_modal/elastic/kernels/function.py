@@ -6,7 +6,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from torch_modal.autograd import applied, flattened, pushed, recorded, traced
+from torch_modal.autograd import apply_function, is_double_backward, is_traced, jvp_by_transposing, merge_vmapped
 
 
 class Operation(Protocol):
@@ -32,10 +32,10 @@ class Operation(Protocol):
 def run_operation(operation: Operation, *tensors: Tensor) -> tuple[Tensor, ...]:
     """The results of an operation, of tensors of any dtype."""
     tensors = tuple(x.double() for x in tensors)
-    if any(map(traced, tensors)):
+    if any(map(is_traced, tensors)):
         return operation.by_torch(*tensors)
     keep = torch.is_grad_enabled() and any(x.requires_grad for x in tensors)
-    return tuple(applied(_Fused, operation, [] if keep else None, *tensors))
+    return tuple(apply_function(_Fused, operation, [] if keep else None, *tensors))
 
 
 def run_by_torch(operation: Operation, *tensors: Tensor) -> tuple[Tensor, ...]:
@@ -58,13 +58,13 @@ class _Fused(torch.autograd.Function):
     @staticmethod
     def jvp(ctx: Any, *tangents: Tensor | None) -> tuple[Tensor | None, ...]:
         n, run_by_torch = ctx.operation.n_differentiable, ctx.operation.by_torch
-        results = pushed(lambda *tensors: run_by_torch(*tensors)[:n], ctx.saved_tensors, tangents[2:])
+        results = jvp_by_transposing(lambda *tensors: run_by_torch(*tensors)[:n], ctx.saved_tensors, tangents[2:])
         return *results, *[None] * (ctx.operation.n_results - n)
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
         operation, tensors = ctx.operation, ctx.saved_tensors
-        if recorded(*grads, *tensors):
+        if is_double_backward(*grads, *tensors):
             gradients = torch.func.vjp(operation.by_torch, *tensors)[1](grads)
         else:
             detached = [x.detach().contiguous() for x in tensors]
@@ -75,6 +75,6 @@ class _Fused(torch.autograd.Function):
     def vmap(
         info: Any, in_dims: tuple[Any, ...], operation: Operation, kept: list[Any] | None, *tensors: Tensor
     ) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
-        flat = flattened(info.batch_size, in_dims[2:], tensors)
+        flat = merge_vmapped(info.batch_size, in_dims[2:], tensors)
         results = _Fused.apply(operation, None if kept is None else [], *flat)
         return tuple(x.unflatten(0, (info.batch_size, -1)) for x in results), (0,) * len(results)
