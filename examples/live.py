@@ -149,7 +149,7 @@ class Live:
             except ValueError:  # at this time there is one
                 return
             self.edited = {i + (i >= number) for i in self.edited}
-            self.decoder = self.decoder.through(self.editor.keyframes, self.editor.path.times)
+            self.decoder = self.decoder.with_keyframes(self.editor.keyframes, self.editor.path.times)
             self.add_keyframe(number, self.editor.keyframes[number].clone(), self.keyframes[nearest].basis)
         self.changed.set()
 

@@ -1,6 +1,7 @@
-"""Bounds on the size of the package, and on how much code a call runs through.
+"""Bounds on the code of the package, and on how much of it a call runs through.
 
-Who needs more raises the number in the same commit, and says why in its message. Run as a script, it prints today's.
+Docstrings, comments and blank lines cost nothing. A commit that needs more than the slack raises the number and says why in
+its message. Run as a script, this prints today's numbers.
 """
 
 import ast
@@ -21,21 +22,20 @@ import torch
 import torch_modal as tm
 
 BOUNDS = {
-    "lines": 29619,
-    "lines of code": 19047,
-    "files": 199,
-    "functions": 1726,
-    "named tuples": 60,
-    "docstrings that begin with no noun": 7,
-    "functions of in-between": 149,
-    "files of in-between": 30,
-    "functions of in-between, forward and backward": 185,
-    "files of in-between, forward and backward": 30,
+    "lines of code": 18966,
+    "functions": 1718,
+    "docstrings that begin with no noun": 0,
+    "functions of in-between": 150,
+    "files of in-between": 31,
+    "functions of in-between, forward and backward": 186,
+    "files of in-between, forward and backward": 31,
     "functions of subdivide": 164,
-    "files of subdivide": 35,
-    "functions of making a layer": 141,
+    "files of subdivide": 36,
+    "functions of making a layer": 142,
     "files of making a layer": 40,
 }
+SLACK = 0.02
+"""Relative growth that no commit has to explain."""
 
 PACKAGE = Path(tm.__file__).parent
 OPENING = re.compile(r"(What|Whether|Where|The same|As the|Of|How)\b")
@@ -68,14 +68,10 @@ def sizes() -> dict[str, int]:
     texts = [path.read_text(encoding="utf-8") for path in sorted(PACKAGE.rglob("*.py"))]
     trees = [ast.parse(text) for text in texts]
     nodes = [node for tree in trees for node in ast.walk(tree)]
-    bases = [ast.unparse(base) for node in nodes if isinstance(node, ast.ClassDef) for base in node.bases]
     words = [statement.value.value for statement in map(docstring, nodes) if statement is not None]  # type: ignore[attr-defined]
     return {
-        "lines": sum(len(text.splitlines()) for text in texts),
         "lines of code": sum(map(lines_of_code, texts, trees)),
-        "files": len(texts),
         "functions": sum(isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) for node in nodes),
-        "named tuples": sum(base.removeprefix("typing.") == "NamedTuple" for base in bases),
         "docstrings that begin with no noun": sum(OPENING.match(text.strip()) is not None for text in words),
     }
 
@@ -121,7 +117,7 @@ def paths() -> dict[str, int]:
 
 
 def assert_within(found: dict[str, int]) -> None:
-    over = {name: f"{n} of {BOUNDS[name]}" for name, n in found.items() if n > BOUNDS[name]}
+    over = {name: f"{n} of {BOUNDS[name]}" for name, n in found.items() if n > (1 + SLACK) * BOUNDS[name]}
     assert not over
 
 
