@@ -139,7 +139,7 @@ def blends(arguments: argparse.Namespace) -> None:
 
 
 def batches(arguments: argparse.Namespace) -> None:
-    """Time of one in-between in batches at random times, on the clock: on a CPU, and on a GPU beside it."""
+    """Milliseconds of each in-between of batches at random times, on the clock: on a CPU, and on a GPU."""
     times = torch.rand(64, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     devices = ["cpu"] if arguments.device == "cpu" else ["cpu", arguments.device]
 
@@ -159,21 +159,24 @@ def batches(arguments: argparse.Namespace) -> None:
     limit_threads(arguments.threads)
     hand = next(case for case in samples() if "hand" in case.name)
     ends, faces = divided(torch.stack([hand.x_a, hand.x_b]), hand.faces)
-    for case in (hand, Case("divided", KeyframeSet(ends, faces), 0, 1, {})):
-        print(f"{len(case.x_a):,} vertices, {arguments.threads} threads")
-        layers = {device: tm.InBetween(case.bases(), case.faces).to(device) for device in devices}
-        for n in (1, 8, 64):
-            best: list[list[float]] = []
-            for device, layer in layers.items():
-                both, own = torch.stack([case.x_a, case.x_b]).to(device), times[:n].to(device)
-                with torch.no_grad():
-                    forward = clock(lambda: layer(*both, own), device)  # noqa: B023
-                best.append([forward, clock(lambda: trained(layer, both, own), device)])  # noqa: B023
-                told = " and ".join(f"{1e3 * seconds / n:6.1f} ms" for seconds in best[-1])
-                print(f"batch of {n:2d}, {device:<4}: {told} each, without and with gradients", flush=True)
-            if len(devices) > 1:
-                ratios = [cpu / gpu for cpu, gpu in zip(*best, strict=True)]
-                print(f"batch of {n:2d}, cpu over gpu: {ratios[0]:.1f} and {ratios[1]:.1f}", flush=True)
+    gradients = [f"with gradients, {device}" for device in devices]
+    columns = ["vertices", "batch", *devices, *gradients]
+    if len(devices) > 1:
+        columns += ["ratio", "ratio with gradients"]
+    keep = arguments.keep if len(devices) > 1 else None
+    with Table("gpu", columns, keep, timed=columns[2:], labels=2) as table:
+        for case in (hand, Case("divided", KeyframeSet(ends, faces), 0, 1, {})):
+            layers = {device: tm.InBetween(case.bases(), case.faces).to(device) for device in devices}
+            for n in (1, 8, 64):
+                forward, backward = [], []
+                for device, layer in layers.items():
+                    both, own = torch.stack([case.x_a, case.x_b]).to(device), times[:n].to(device)
+                    with torch.no_grad():
+                        forward.append(1e3 * clock(lambda: layer(*both, own), device) / n)  # noqa: B023
+                    backward.append(1e3 * clock(lambda: trained(layer, both, own), device) / n)  # noqa: B023
+                ratios = [cpu / gpu for cpu, gpu in (forward, backward)] if len(devices) > 1 else []
+                cells = [f"{x:.1f}" for x in (*forward, *backward, *ratios)]
+                table.add(f"{len(case.x_a):,}", str(n), *cells)
 
 
 def threads(arguments: argparse.Namespace) -> None:

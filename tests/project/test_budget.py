@@ -1,7 +1,7 @@
 """Bounds on the code of the package, and on how much of it a call runs through.
 
-Docstrings, comments and blank lines cost nothing. A commit that needs more than the slack raises the number and says why in
-its message. Run as a script, this prints today's numbers.
+Docstrings, comments and blank lines cost nothing. A commit that needs more than the slack raises the number and says
+why in its message. Run as a script, this prints today's numbers.
 """
 
 import ast
