@@ -79,8 +79,10 @@ OUTLIERS = 4.0
 
 NEAR = 2.5
 """Distance from an observed point within which a vertex counts as seen, at a size of 100."""
-NEIGHBOURS = 0.45
+NEIGHBOURS = 0.9
 """Confidence of what a neighbour in time saw."""
+HALF_AFTER = 0.02
+"""Motion between neighbours in time, in parts of the diagonal, that halves the confidence of what is half seen."""
 DOUBTFUL = 0.5
 """Part of the points that a shape has to explain."""
 
@@ -93,8 +95,8 @@ class Completion(NamedTuple):
     shapes: Tensor
     """The shapes then. *Shape:* ``(T, V, 3)``."""
     confidence: Tensor
-    """Near 1 where the surface was seen then, about a half where only neighbours in time saw it, near 0 where it is
-    inferred. *Shape:* ``(T, V)``."""
+    """Near 1 where the surface was seen, then or at times nearby, and moves little between its neighbours in time; below
+    a half where it moves far, above all unseen, or is inferred. *Shape:* ``(T, V)``."""
     misses: list[Tensor]
     """Of each observation, in the order given, the distance of its points from the shape. *Shape of each:* ``(n,)``."""
     trust: list[Tensor]
@@ -511,9 +513,7 @@ class _Completer:
                 MeshWarning,
                 stacklevel=4,
             )
-        for order in (range(1, len(x)), range(len(x) - 2, -1, -1)):
-            for i in order:
-                seen[i] = torch.maximum(seen[i], NEIGHBOURS * seen[i - order.step])
+        confidence = self._confidence(x, seen)
         at = [frame.time for frame in self.frames]
         exact = dict(zip(self.times.tolist(), like, strict=False))
         done = [exact.get(t, self._restored(own).to(like)) for t, own in zip(at, x, strict=True)]
@@ -522,7 +522,31 @@ class _Completer:
         stacked = torch.stack([knots[t] for t in times])
         path = Path(stacked, self.faces, times=times) if len(times) > 1 else None
         moments = torch.tensor(at, dtype=torch.float64, device=like.device)
-        return Completion(moments, torch.stack(done), seen.to(like), misses, trust, stacked, path)
+        return Completion(moments, torch.stack(done), confidence.to(like), misses, trust, stacked, path)
+
+    def _confidence(self, x: Tensor, seen: Tensor) -> Tensor:
+        """Confidence from what was seen at each time, there and nearby, and from the motion. *Shape:* ``(T, V)``.
+
+        What moves far between its neighbours in time is less certain.
+        """
+        whole = [(float(t), own, torch.ones_like(own[:, 0])) for t, own in zip(self.times, self.whole, strict=False)]
+        times = {frame.time for frame in self.frames}
+        frames = [(frame.time, *one) for frame, *one in zip(self.frames, x, seen, strict=True)]
+        every = sorted([*frames, *(one for one in whole if one[0] not in times)], key=lambda one: one[0])
+        shapes, near = torch.stack([one[1] for one in every]), torch.stack([one[2] for one in every])
+        for order in (range(1, len(near)), range(len(near) - 2, -1, -1)):
+            for i in order:
+                near[i] = torch.maximum(near[i], NEIGHBOURS * near[i - order.step])
+        half = HALF_AFTER * float((self.template.amax(0) - self.template.amin(0)).norm())
+        confidence = []
+        for i, (t, *_) in enumerate(every):
+            if t in times:
+                others = (
+                    shapes[[j for j in (i - 1, i + 1) if 0 <= j < len(shapes)]] if len(shapes) > 1 else self.whole[:1]
+                )
+                moved = (best_fit(others, shapes[i].expand_as(others)).apply(others) - shapes[i]).norm(dim=-1).mean(0)
+                confidence.append(near[i] * torch.exp2(-(1.5 - seen[len(confidence)]) * moved / half))
+        return torch.stack(confidence)
 
     def _restored(self, x: Tensor) -> Tensor:
         return (x / self.scale) @ torch.from_numpy(self.axes) + torch.from_numpy(self.centre)
