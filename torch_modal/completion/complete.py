@@ -95,8 +95,8 @@ class Completion(NamedTuple):
     shapes: Tensor
     """The shapes then. *Shape:* ``(T, V, 3)``."""
     confidence: Tensor
-    """Near 1 where the surface was seen, then or at times nearby, and moves little between its neighbours in time; below
-    a half where it moves far, above all unseen, or is inferred. *Shape:* ``(T, V)``."""
+    """Near 1 where the surface was seen, then or at times nearby, and moves little between its neighbours in time; low
+    where it moves far, above all unseen, or is inferred. *Shape:* ``(T, V)``."""
     misses: list[Tensor]
     """Of each observation, in the order given, the distance of its points from the shape. *Shape of each:* ``(n,)``."""
     trust: list[Tensor]
@@ -538,15 +538,13 @@ class _Completer:
             for i in order:
                 near[i] = torch.maximum(near[i], NEIGHBOURS * near[i - order.step])
         half = HALF_AFTER * float((self.template.amax(0) - self.template.amin(0)).norm())
-        confidence = []
-        for i, (t, *_) in enumerate(every):
-            if t in times:
-                others = (
-                    shapes[[j for j in (i - 1, i + 1) if 0 <= j < len(shapes)]] if len(shapes) > 1 else self.whole[:1]
-                )
-                moved = (best_fit(others, shapes[i].expand_as(others)).apply(others) - shapes[i]).norm(dim=-1).mean(0)
-                confidence.append(near[i] * torch.exp2(-(1.5 - seen[len(confidence)]) * moved / half))
-        return torch.stack(confidence)
+        confidence = torch.zeros_like(seen)
+        for row, i in enumerate(i for i, one in enumerate(every) if one[0] in times):
+            neighbours = [j for j in (i - 1, i + 1) if 0 <= j < len(shapes)]
+            others = shapes[neighbours] if neighbours else self.whole[:1]
+            moved = (best_fit(others, shapes[i].expand_as(others)).apply(others) - shapes[i]).norm(dim=-1).mean(0)
+            confidence[row] = near[i] * torch.exp2(-(1.5 - seen[row]) * moved / half)
+        return confidence
 
     def _restored(self, x: Tensor) -> Tensor:
         return (x / self.scale) @ torch.from_numpy(self.axes) + torch.from_numpy(self.centre)
