@@ -414,7 +414,7 @@ def test_kernels_and_torch_step_alike(hand: Shapes) -> None:
         layer = tm.InBetween(hand.bases, hand.faces, solver=tm.Solver(backend=backend))
         core = layer.core
         shapes, pose, _ = core.alignment(hand.keyframes.expand(2, -1, -1, -1), weights)
-        x = core.alignment.bring(layer(*hand.keyframes, t), pose)
+        x = core.alignment.to_frame(layer(*hand.keyframes, t), pose)
         search = contact_layer.contact_search(core, shapes[0], 2)
         active, _ = search(x, torch.arange(2))
         assert active.shapes.unique().tolist() == [1]
