@@ -207,10 +207,10 @@ def test_derivatives_of_modal_bending(tube):
     pose = bending.still()
     pose.amplitudes += torch.linspace(-3, 3, 6)
     pose.rotation = torch.linalg.qr(torch.rand(3, 3, dtype=x.dtype)).Q
-    shape, fields = bending.linearised(100 * x[1], pose)
+    shape, fields = bending.linearise(100 * x[1], pose)
     for k in range(12):
         step = 1e-5 * torch.eye(12, dtype=x.dtype)[k]
-        there, back = (bending.shape(100 * x[1], bending.stepped(pose, s * step, shape.mean(0))) for s in (1, -1))
+        there, back = (bending.shape(100 * x[1], bending.step(pose, s * step, shape.mean(0))) for s in (1, -1))
         assert torch.allclose(
             (there - back) / 2e-5, fields[..., k], atol=1e-6 * float(fields[..., k].abs().max()) + 1e-8
         )

@@ -50,7 +50,7 @@ class ModalBending:
         rest = base.T[:, None].contiguous()
         return pose.apply(self.reconstruction(self._sides(base, bending), rest)[:, 0].T)
 
-    def linearised(self, base: Tensor, pose: ModalPose, rigid: bool = False) -> tuple[Tensor, Tensor]:
+    def linearise(self, base: Tensor, pose: ModalPose, rigid: bool = False) -> tuple[Tensor, Tensor]:
         """The deformed shape, and its derivatives in amplitudes, a move and a turn about its centroid.
 
         If rigid, in the last two alone. *Shape:* ``(V, 3), (V, 3, k + 6)``.
@@ -79,8 +79,8 @@ class ModalBending:
         return x, torch.cat([pose.rotation @ fields, motions], -1)
 
     @staticmethod
-    def stepped(pose: ModalPose, step: Tensor, centre: Tensor) -> ModalPose:
-        """A pose after a step in the directions of :meth:`linearised`. *Shape:* ``(k + 6,), (3,)``."""
+    def step(pose: ModalPose, step: Tensor, centre: Tensor) -> ModalPose:
+        """A pose after a step in the directions of :meth:`linearise`. *Shape:* ``(k + 6,), (3,)``."""
         turn, move = exp(step[-3:]), step[-6:-3]
         amplitudes = pose.amplitudes + step[:-6] if len(step) > 6 else pose.amplitudes
         return ModalPose(amplitudes, turn @ pose.rotation, turn @ (pose.move - centre) + centre + move)

@@ -22,7 +22,7 @@ from torch_modal.autograd import outside_inference_mode
 from torch_modal.completion.bending import ModalBending, ModalPose
 from torch_modal.completion.energy import PointEnergy
 from torch_modal.completion.gradient import LastSolve, with_gradients
-from torch_modal.completion.observation import Observation, checked
+from torch_modal.completion.observation import Observation, check_observations
 from torch_modal.completion.pairs import Cloud, Pairs, SampledSurface
 from torch_modal.completion.search import HALF, SOFT, PoseSearch, Seen
 from torch_modal.elastic.backend import choose
@@ -58,8 +58,8 @@ PASSES, N_ALIKE, TRUSTED = 2, 2, 0.34
 """Further searches of the worse half of the frames, each also from so many shapes of other times."""
 
 OWN_OF_CLOUDS, OWN, WHOLE = 0.4, 0.1, 0.1
-"""Weights of the shape by modes, where there are clouds and without, and of whole shapes, in Eq. 5; the rest is that of
-neighbours in time."""
+"""Weights of the shape by modes, where there are clouds and without, and of whole shapes, in Eq. 5; neighbours in
+time have the rest."""
 STIFFNESS, STIFFNESSES = 2.0, (0.5, 15.0)
 """Of a point with a noise of 1, at a size of 100; bounds within which it is adapted where places are known."""
 SWAY = 2.0
@@ -194,11 +194,11 @@ def complete(
     is_template = whole.dim() == 2
     if is_template and times is not None:
         raise ValueError("a template of the shape (V, 3) has no time; pass key-frames (1, V, 3) that have one")
-    found = _complete(whole.detach(), faces, observations, times, progress)
+    completion, solver = _complete(whole.detach(), faces, observations, times, progress)
     given = [one.points for one in observations]
     if not torch.is_grad_enabled() or not any(x.requires_grad for x in given):
-        return found[0]
-    return _differentiable(*found, given)
+        return completion
+    return _differentiable(completion, solver, given)
 
 
 @outside_inference_mode
@@ -211,7 +211,7 @@ def _complete(
 ) -> tuple[Completion, "_Completer"]:
     is_template = whole.dim() == 2
     like, shapes, indices = check_arrays(whole[None] if is_template else whole, faces)
-    given = checked(observations, shapes.shape[1])
+    given = check_observations(observations, shapes.shape[1])
     at = np.zeros(0) if is_template else check_times(times, len(shapes)).numpy()
     solver = _Completer(shapes, torch.from_numpy(indices), at, given)
     with ProgressReport(len(solver.frames) * (4 + ROUNDS), "completing", progress) as report:
@@ -220,13 +220,13 @@ def _complete(
     return solver.result(like), solver
 
 
-def _differentiable(found: Completion, solver: "_Completer", points: Sequence[Tensor]) -> Completion:
+def _differentiable(completion: Completion, solver: "_Completer", points: Sequence[Tensor]) -> Completion:
     """Add gradients in the points to a completion."""
-    exact, at = set(solver.times.tolist()), found.times.tolist()
+    exact, at = set(solver.times.tolist()), completion.times.tolist()
     solves = [None if t in exact else own for t, own in zip(at, solver.solves, strict=True)]
-    shapes = with_gradients(found.shapes, points, solves, solver.axes)
+    shapes = with_gradients(completion.shapes, points, solves, solver.axes)
     rows = torch.tensor([i for i, t in enumerate(sorted(exact | set(at))) if t in at], device=shapes.device)
-    return found._replace(shapes=shapes, knots=found.knots.index_copy(0, rows, shapes))
+    return completion._replace(shapes=shapes, knots=completion.knots.index_copy(0, rows, shapes))
 
 
 class _Completer:
@@ -261,17 +261,17 @@ class _Completer:
         self.solves: list[LastSolve] = []
 
     # ------------------------------------------------------------------------------------------------------- the input
-    def _placed(self, x: Tensor, direction: bool = False) -> FloatArray:
+    def _to_canonical(self, x: Tensor, direction: bool = False) -> FloatArray:
         points = x.detach().cpu().double().numpy()
         return points @ self.axes.T if direction else (points - self.centre) @ self.axes.T * self.scale
 
     def _sample(self, one: Observation, number: int) -> _Sample:
         """An observation at a size of 100; raises where it is in other units."""
-        points, known = self._placed(one.points), self.template[self.faces.unique()]
+        points, known = self._to_canonical(one.points), self.template[self.faces.unique()]
         weights = np.ones(len(points)) if one.weights is None else one.weights.cpu().double().numpy()
         seen: Cloud | Pairs
         if one.is_cloud:
-            normals, view = (None if x is None else self._placed(x, True) for x in (one.normals, one.view))
+            normals, view = (None if x is None else self._to_canonical(x, True) for x in (one.normals, one.view))
             seen = Cloud(points, normals, weights, view)
         else:
             corners, barycentric = one.places()
@@ -285,60 +285,60 @@ class _Completer:
     def search(self, report: ProgressReport) -> None:
         """Modal poses of all frames, outward in time from what is known, and then from those that explain most."""
         n, whole = len(self.frames), list(zip(self.times, self.whole, strict=False))
-        found = dict[int, ModalFit]()
+        fits = dict[int, ModalFit]()
         if not whole:
-            rigid = [self._placed_rigidly(i) for i in range(n)]
+            rigid = [self._place_rigidly(i) for i in range(n)]
             first = int(np.argmin([score for _, score in rigid]))
-            found[first] = self._search(first, [(self.template, rigid[first][0])])
+            fits[first] = self._search(first, [(self.template, rigid[first][0])])
             report.update()
-        self._outward(found, {}, whole, report)
-        bound = float(np.quantile([one.score for one in found.values()], TRUSTED))
-        trusted = {i: one for i, one in found.items() if one.score <= bound}
+        self._outward(fits, {}, whole, report)
+        bound = float(np.quantile([one.score for one in fits.values()], TRUSTED))
+        trusted = {i: one for i, one in fits.items() if one.score <= bound}
         report.update(len(trusted))
-        self._outward(trusted, found, whole, report)
+        self._outward(trusted, fits, whole, report)
         for i in sorted(range(n), key=lambda i: -trusted[i].score):
             others = {j: one for j, one in trusted.items() if j != i}
             if others or whole:
                 again = self._search(i, self._starts(self.frames[i].time, self._known(others, whole)))
                 trusted[i] = min(trusted[i], again, key=lambda one: one.score)
             report.update()
-        found = trusted
+        fits = trusted
         for i in range(n):
-            one = found[i]
-            pose = self.poses.stiffen(self._coarsened(one.base), one.pose, self._seen(i))
+            one = fits[i]
+            pose = self.poses.stiffen(self._coarsen(one.base), one.pose, self._seen(i))
             self.x.append(self.bending.shape(one.base, pose))
             report.update()
 
     def _outward(
         self,
-        found: dict[int, ModalFit],
+        fits: dict[int, ModalFit],
         before: dict[int, ModalFit],
         whole: list[tuple[float, Tensor]],
         report: ProgressReport,
     ) -> None:
         """Add all other frames, those near in time to what is known first; none is worse than it was before."""
-        left = [i for i in range(len(self.frames)) if i not in found]
+        left = [i for i in range(len(self.frames)) if i not in fits]
         while left:
-            known = self._known(found, whole)
+            known = self._known(fits, whole)
             gaps = [min(abs(self.frames[i].time - t) for t, _ in known) for i in left]
             i = left.pop(int(np.argmin(gaps)))
             starts = self._starts(self.frames[i].time, known)
             if before:
                 starts += self._alike(i, [x for _, x in known])
-            found[i] = self._search(i, starts)
+            fits[i] = self._search(i, starts)
             if i in before:
-                found[i] = min(found[i], before[i], key=lambda one: one.score)
+                fits[i] = min(fits[i], before[i], key=lambda one: one.score)
             report.update()
 
-    def _known(self, found: dict[int, ModalFit], whole: list[tuple[float, Tensor]]) -> list[tuple[float, Tensor]]:
+    def _known(self, fits: dict[int, ModalFit], whole: list[tuple[float, Tensor]]) -> list[tuple[float, Tensor]]:
         """Times and shapes of frames, and of whole ones, in the order of time."""
-        return sorted([*whole, *((self.frames[i].time, one.x) for i, one in found.items())], key=lambda one: one[0])
+        return sorted([*whole, *((self.frames[i].time, one.x) for i, one in fits.items())], key=lambda one: one[0])
 
     def _alike(self, i: int, shapes: Sequence[Tensor]) -> list[tuple[Tensor, ModalPose]]:
         """The shapes that explain most of a frame after a rigid motion: motions repeat."""
         seen, to_canonical = self._seen(i), []
         for x in shapes:
-            base = self._coarsened(x)
+            base = self._coarsen(x)
             pose = self.poses.rigid(base, seen)
             to_canonical.append((self.poses.score(base, pose, seen), x, pose))
         return [(x, pose) for _, x, pose in sorted(to_canonical, key=lambda one: one[0])[:N_ALIKE]]
@@ -353,16 +353,16 @@ class _Completer:
             after = int(np.searchsorted(times, t))
             gap = times[after] - times[after - 1]
             base = path(shapes, t)
-            found = [base]
+            bases = [base]
             for shift in SHIFTS:
                 other = path(shapes, float(np.clip(t + shift * gap, times[0], times[-1])))
-                found.append(best_fit(other, base).apply(other))
+                bases.append(best_fit(other, base).apply(other))
         else:
             nearest = np.argsort(np.abs(times - t))
-            found = [shapes[nearest[0]]]
+            bases = [shapes[nearest[0]]]
             if len(known) > 1:
-                found.append(self._beyond(shapes[nearest[1]], shapes[nearest[0]]))
-        return [(x, self.bending.still()) for x in found]
+                bases.append(self._beyond(shapes[nearest[1]], shapes[nearest[0]]))
+        return [(x, self.bending.still()) for x in bases]
 
     def _beyond(self, before: Tensor, last: Tensor) -> Tensor:
         """The shape as far after the last one as that is after the one before."""
@@ -373,27 +373,27 @@ class _Completer:
         middle = last.mean(0)
         return (x - middle) @ motion.rotation.mT + 2 * middle - before.mean(0)
 
-    def _placed_rigidly(self, i: int) -> tuple[ModalPose, float]:
+    def _place_rigidly(self, i: int) -> tuple[ModalPose, float]:
         """The pose of the template in a frame, and how much it leaves unexplained."""
-        seen, base = self._seen(i), self._coarsened(self.template)
+        seen, base = self._seen(i), self._coarsen(self.template)
         pose = self.poses.rigid(base, seen)
         return pose, self.poses.score(base, pose, seen)
 
     def _search(self, i: int, starts: Sequence[tuple[Tensor, ModalPose]]) -> ModalFit:
         """A frame by modes."""
-        own = [(self._coarsened(x), pose) for x, pose in starts]
+        own = [(self._coarsen(x), pose) for x, pose in starts]
         k, pose, score = self.poses.fit(own, self._seen(i))
         base = starts[k][0]
         return ModalFit(self.bending.shape(base, pose), base, pose, score)
 
     def _seen(self, i: int) -> Seen:
         """Observations of a frame, on the coarse mesh."""
-        return self.frames[i].seen([self._restricted(pairs) for pairs in self.frames[i].markers])
+        return self.frames[i].seen([self._restrict(pairs) for pairs in self.frames[i].markers])
 
-    def _coarsened(self, x: Tensor) -> Tensor:
+    def _coarsen(self, x: Tensor) -> Tensor:
         return x if self.coarse is None else torch.from_numpy(self.coarse.restrict(x.numpy()))
 
-    def _restricted(self, pairs: Pairs) -> Pairs:
+    def _restrict(self, pairs: Pairs) -> Pairs:
         """Known places on the coarse mesh."""
         if self.coarse is None:
             return pairs
@@ -417,11 +417,11 @@ class _Completer:
             self.solves = []
             for i, frame in enumerate(self.frames):
                 rests = RestShapes(shapes[i : i + 1], weights[i : i + 1], stiffness)
-                self.solves.append(self._relaxed(frame, x[i : i + 1], rests, steps))
+                self.solves.append(self._relax(frame, x[i : i + 1], rests, steps))
                 report.update(k < ROUNDS)
             x = torch.cat([solve.x for solve in self.solves])
             ratios = [
-                ratio for frame, own in zip(self.frames, x, strict=True) for ratio in self._missed_noise(frame, own)
+                ratio for frame, own in zip(self.frames, x, strict=True) for ratio in self._noise_ratios(frame, own)
             ]
             if ratios:
                 # Points of known places are missed by their noise, neither more nor less (Morozov's discrepancy).
@@ -429,23 +429,23 @@ class _Completer:
                 self.of_known = float(np.clip(self.of_known * factor**2, *STIFFNESSES))
         self.x = list(x)
 
-    def _relaxed(self, frame: _Frame, x: Tensor, rests: RestShapes, steps: tuple[int, int]) -> LastSolve:
+    def _relax(self, frame: _Frame, x: Tensor, rests: RestShapes, steps: tuple[int, int]) -> LastSolve:
         """Steps of all vertices of a frame, with pairs found where they start. *Shape:* ``(1, V, 3)``."""
-        surface, numbers, found = SampledSurface(x[0].numpy(), self.mesh), [], []
+        surface, numbers, springs = SampledSurface(x[0].numpy(), self.mesh), [], []
         for sample in frame.samples:
             seen = sample.seen
             pairs, own = (seen.pairs(surface), STIFFNESS) if isinstance(seen, Cloud) else ([seen], self.of_known)
             stiffness = own / sample.noise**2 * len(sample.observation.points)
             for one in pairs:
                 counts = robust(np.linalg.norm(one.places @ surface.vertices - one.points, axis=1), sample.noise)
-                found.append(one._replace(weights=stiffness * one.weights * counts))
+                springs.append(one._replace(weights=stiffness * one.weights * counts))
                 numbers.append(np.full(len(one.points), sample.number))
-        points = PointEnergy(found)
+        points = PointEnergy(springs)
         x = self.fine.relax(x, rests, (steps,), lambda *_: [points])
         return LastSolve(x, self.fine.energy, rests, points, np.concatenate(numbers))
 
     @staticmethod
-    def _missed_noise(frame: _Frame, x: Tensor) -> list[float]:
+    def _noise_ratios(frame: _Frame, x: Tensor) -> list[float]:
         """Squared distances of points from their known places, over those that their noise explains."""
         off = [np.linalg.norm(own.places @ x.numpy() - own.points, axis=1) for own in frame.markers]
         noises = [one.noise for one in frame.samples if isinstance(one.seen, Pairs)]
@@ -464,7 +464,7 @@ class _Completer:
     def _rests(self) -> tuple[Tensor, Tensor]:
         """Rest shapes of each frame, and their weights: its own by modes, whole ones, and neighbours in time.
 
-        Numbers are those of frames by modes, whole shapes, and frames as they are. *Shape of each:* ``(T, 5)``.
+        Numbers count frames by modes, then whole shapes, then frames as they are. *Shape of each:* ``(T, 5)``.
         """
         n, times = len(self.frames), np.array([frame.time for frame in self.frames])
         whole = np.arange(n, n + len(self.whole))
@@ -499,7 +499,7 @@ class _Completer:
                 counts = agree * robust(off, one.noise)
                 misses[one.number] = torch.from_numpy(off / self.scale).to(like)
                 trust[one.number] = torch.from_numpy(counts).to(like)
-                points = self._placed(one.observation.points)
+                points = self._to_canonical(one.observation.points)
                 gaps, nearest = cKDTree(points).query(surface.vertices, 3)
                 close = (counts[nearest] * np.exp(-0.5 * (gaps / NEAR) ** 2)).max(1)
                 part = float(counts.mean())
@@ -516,7 +516,7 @@ class _Completer:
         confidence = self._confidence(x, seen)
         at = [frame.time for frame in self.frames]
         exact = dict(zip(self.times.tolist(), like, strict=False))
-        done = [exact.get(t, self._restored(own).to(like)) for t, own in zip(at, x, strict=True)]
+        done = [exact.get(t, self._restore(own).to(like)) for t, own in zip(at, x, strict=True)]
         knots = exact | dict(zip(at, done, strict=True))
         times = sorted(knots)
         stacked = torch.stack([knots[t] for t in times])
@@ -546,7 +546,7 @@ class _Completer:
             confidence[row] = near[i] * torch.exp2(-(1.5 - seen[row]) * moved / half)
         return confidence
 
-    def _restored(self, x: Tensor) -> Tensor:
+    def _restore(self, x: Tensor) -> Tensor:
         return (x / self.scale) @ torch.from_numpy(self.axes) + torch.from_numpy(self.centre)
 
 

@@ -61,7 +61,7 @@ def with_gradients(
         shapes: The minimisers, in the caller's coordinates. *Shape:* ``(T, V, 3)``.
         points: Of each observation. *Shape of each:* ``(n, 3)``.
         solves: How each shape was found; None where it is a constant.
-        axes: Turns the caller's coordinates into those of the solves. *Shape:* ``(3, 3)``.
+        axes: Turns the caller's coordinates into the coordinates of the solves. *Shape:* ``(3, 3)``.
     """
     return _ShapesOfPoints.apply(solves, axes, shapes, *points)
 

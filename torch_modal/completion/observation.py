@@ -85,7 +85,7 @@ class Observation:
         if self.vertices is not None and self.corners is not None:
             raise ValueError(f"{self}: markers lie at vertices, or in triangles (corners); got both")
         if not self.is_cloud and (self.normals is not None or self.view is not None):
-            raise ValueError(f"{self}: normals and view are those of clouds; these points have their places already")
+            raise ValueError(f"{self}: normals and view belong to clouds; these points have their places already")
         if self.weights is not None and not (bool((self.weights >= 0).all()) and bool(self.weights.sum() > 0)):
             raise ValueError(f"{self}: weights are 0 or more, and not all 0")
         if self.noise is not None and not 0 < self.noise < torch.inf:
@@ -115,7 +115,7 @@ class Observation:
         return self.vertices[:, None].expand(-1, 3), first
 
 
-def checked(observations: Sequence[Observation], n_vertices: int) -> list[Observation]:
+def check_observations(observations: Sequence[Observation], n_vertices: int) -> list[Observation]:
     """The observations as a list; raises a ValueError where one does not fit the mesh."""
     if isinstance(observations, Observation):
         raise ValueError("observations are a list of torch_modal.Observation; got one alone")

@@ -43,7 +43,7 @@ class Pairs(NamedTuple):
     """Indices of the points among those observed. *Shape:* ``(n,)``."""
 
 
-def featured(points: FloatArray, normals: FloatArray | None) -> FloatArray:
+def join_features(points: FloatArray, normals: FloatArray | None) -> FloatArray:
     """Points with their normals, as places of which near ones are alike. *Shape:* ``(n, 3), (n, 3) -> (n, 6)``."""
     return points if normals is None else np.hstack([points, LEAN * normals])
 
@@ -61,7 +61,7 @@ class SampledSurface(MeshSurface):
     ) -> tuple[IntArray, FloatArray, FloatArray, BoolArray]:
         """Face and coordinates of the place that looks most like each point, the distance, and if normals agree."""
         own = None if normals is None else self.face_normals[self.sample_faces]
-        face = self.sample_faces[cKDTree(featured(self.samples, own)).query(featured(points, normals))[1]]
+        face = self.sample_faces[cKDTree(join_features(self.samples, own)).query(join_features(points, normals))[1]]
         barycentric, distances = closest_on_triangles(points, self.vertices[self.faces[face]])
         agree = np.ones(len(points), bool) if normals is None else dot(self.face_normals[face], normals) > ALIKE
         return face, barycentric, distances, agree
@@ -86,7 +86,7 @@ class Cloud:
     ) -> None:
         self.points, self.normals, self.weights, self.view = points, normals, weights, view
 
-    def thinned(self, n: int) -> "Cloud":
+    def thin(self, n: int) -> "Cloud":
         """So many of the points, chosen at random, always the same."""
         if len(self.points) <= n:
             return self
@@ -100,7 +100,7 @@ class Cloud:
 
     @cached_property
     def _featured(self) -> Any:
-        return cKDTree(featured(self.points, self.normals))
+        return cKDTree(join_features(self.points, self.normals))
 
     @cached_property
     def usual_gap(self) -> float:
@@ -121,13 +121,13 @@ class Cloud:
         normals = None if self.normals is None else self.normals[kept]
         share = self.weights[kept] / self.weights.sum()
         places = places_between(surface.faces[face[kept]], barycentric[kept], n)
-        found = [Pairs(places, self.points[kept], normals, share, kept)]
+        pairs = [Pairs(places, self.points[kept], normals, share, kept)]
         if self.view is None or self.normals is None:
-            return found
+            return pairs
         seen = surface.visible(self.view)
         seen = seen[:: max(1, len(seen) // len(self.points))]
         faces = surface.sample_faces[seen]
-        nearest = self._featured.query(featured(surface.samples[seen], surface.face_normals[faces]))[1]
+        nearest = self._featured.query(join_features(surface.samples[seen], surface.face_normals[faces]))[1]
         agree = dot(surface.face_normals[faces], self.normals[nearest]) > ALIKE
         if released is not None:
             agree &= ~released[surface.faces[faces]].any(1)
@@ -135,17 +135,17 @@ class Cloud:
         if len(seen):
             places = places_between(surface.faces[faces], _PLACES[seen % len(_PLACES)], n)
             share = np.full(len(seen), 1 / len(seen))
-            found.append(Pairs(places, self.points[nearest], self.normals[nearest], share, nearest))
-        return found
+            pairs.append(Pairs(places, self.points[nearest], self.normals[nearest], share, nearest))
+        return pairs
 
-    def missed(self, surface: SampledSurface, unit: float) -> FloatArray:
+    def squared_misses(self, surface: SampledSurface, unit: float) -> FloatArray:
         """Squared distances of the points in a unit; infinite where normals disagree. *Shape:* ``(n,)``."""
         _, _, distances, agree = self.closest(surface)
         return np.where(agree, (distances / unit) ** 2, np.inf)
 
     def score(self, surface: SampledSurface, unit: float) -> float:
         """Part of the cloud that the surface leaves out, and of the visible surface that the cloud leaves out."""
-        off = self.missed(surface, unit)
+        off = self.squared_misses(surface, unit)
         total = float((self.weights * (1 - 1 / (1 + off))).sum() / self.weights.sum())
         if self.view is not None:
             seen = surface.samples[surface.visible(self.view)]
@@ -153,9 +153,9 @@ class Cloud:
             total += float((gap / (1 + gap)).mean()) if len(seen) else 1.0
         return total
 
-    def unexplained(self, surface: SampledSurface, reach: float, least: int) -> list[IntArray]:
+    def unexplained_groups(self, surface: SampledSurface, reach: float, least: int) -> list[IntArray]:
         """Connected groups of points that are far from the surface."""
-        off = np.flatnonzero(self.missed(surface, reach) > 1)
+        off = np.flatnonzero(self.squared_misses(surface, reach) > 1)
         if len(off) < least:
             return []
         pairs = cKDTree(self.points[off]).query_pairs(GAP / 2 * self.usual_gap, output_type="ndarray")

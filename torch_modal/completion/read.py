@@ -25,10 +25,10 @@ def load_observations(
     """Read clouds (PLY), meshes as clouds of their vertices with normals, and markers (CSV): one for each file or time.
 
     Points without finite coordinates are left out. Files of markers name their columns, ``time,vertex,x,y,z``, in the
-    first line. ``times`` are those of the clouds in their order (default: 0, 1, 2, ...), ``options`` are ``noise`` and
-    ``view`` of :class:`torch_modal.Observation`. A ValueError names the file and what to do.
+    first line. ``times`` are the times of the clouds in their order (default: 0, 1, 2, ...), ``options`` are ``noise``
+    and ``view`` of :class:`torch_modal.Observation`. A ValueError names the file and what to do.
     """
-    files, found = [Path(path) for path in paths], []
+    files, observations = [Path(path) for path in paths], []
     clouds = [file for file in files if file.suffix.lower() != ".csv"]
     when = list(range(len(clouds)) if times is None else times)
     if len(when) != len(clouds):
@@ -36,11 +36,11 @@ def load_observations(
         raise ValueError(f"{what}: give one for each cloud or mesh, in their order; CSV files hold their own times")
     for file in files:
         if file in clouds:
-            found.append(Observation(when.pop(0), *_cloud(file), **options))
+            observations.append(Observation(when.pop(0), *_cloud(file), **options))
         else:
             options_here = {**options, "view": None}
-            found += [Observation(t, x, vertices=i, **options_here) for t, i, x in _markers(file, n_vertices)]
-    return found
+            observations += [Observation(t, x, vertices=i, **options_here) for t, i, x in _markers(file, n_vertices)]
+    return observations
 
 
 def _enough(points: Any, name: str) -> Tensor:
@@ -53,7 +53,7 @@ def _cloud(path: Path) -> tuple[Tensor, Tensor | None]:
     """Points and normals. *Shape:* ``(n, 3), (n, 3)``."""
     cloud = PointFile(path) if path.suffix.lower() == ".ply" else None
     if cloud is not None and not cloud.n_faces:
-        normals = cloud.normals if cloud.normals.any() else cloud.normals[:, :0]  # those of splats are zero
+        normals = cloud.normals if cloud.normals.any() else cloud.normals[:, :0]  # zero for splats
         table = np.concatenate([cloud.positions, normals], axis=1)
     else:
         mesh = open_asset(path)

@@ -25,7 +25,7 @@ OF_MOTIONS = 1e-2
 # Largest move of a vertex in one step.
 LARGEST_STEP = 6.0
 
-# Weight of the modes' energy beside what is left unexplained: limbs that crossed explain points as well.
+# Weight of the modes' energy next to what is left unexplained: limbs that crossed explain points as well.
 PRIOR = 3e-5
 # Distance at which half of a miss counts, at least, and at which points are unexplained; parts of a cloud that make a
 # group.
@@ -47,9 +47,9 @@ class Seen(NamedTuple):
     unit: float
     """Distance at which half of a miss counts."""
 
-    def thinned(self, n: int) -> "Seen":
+    def thin(self, n: int) -> "Seen":
         """With so many points of each cloud, chosen at random, always the same."""
-        return self._replace(clouds=[cloud.thinned(n) for cloud in self.clouds])
+        return self._replace(clouds=[cloud.thin(n) for cloud in self.clouds])
 
 
 class PoseSearch:
@@ -89,7 +89,7 @@ class PoseSearch:
         points = np.concatenate([*(cloud.points for cloud in seen.clouds), *(pairs.points for pairs in seen.markers)])
         pose = self.bending.still()
         pose.move = torch.from_numpy(np.median(points, 0)) - base.median(0).values
-        seen = seen.thinned(N_RIGID)
+        seen = seen.thin(N_RIGID)
         for far in np.geomspace(2 * FAR, FAR, STEPS):
             pose, _ = self._step(base, pose, seen, float(far), 1.0, rigid=True)
         return pose
@@ -105,7 +105,7 @@ class PoseSearch:
     ) -> ModalPose:
         """Gauss-Newton steps, each with new pairs, from far to near and from stiff to soft."""
         distances, stiffnesses = np.geomspace(far, NEAR, n_steps), np.geomspace(stiff, seen.soft, n_steps)
-        seen, fields = seen.thinned(N_POINTS), None
+        seen, fields = seen.thin(N_POINTS), None
         for k, (distance, stiffness) in enumerate(zip(distances, stiffnesses, strict=True)):
             known = fields if k % 2 else None
             pose, fields = self._step(base, pose, seen, float(distance), float(stiffness), known=known)
@@ -143,7 +143,7 @@ class PoseSearch:
         """Groups of points that nothing explains, each with the end of a limb that might."""
         surface, limbs = self.surface(base, pose), []
         for cloud in seen.clouds:
-            for group in cloud.unexplained(surface, REACH, max(4, len(cloud.points) // PART_OF_GROUP))[:2]:
+            for group in cloud.unexplained_groups(surface, REACH, max(4, len(cloud.points) // PART_OF_GROUP))[:2]:
                 points = cloud.points[group]
                 away = np.linalg.norm(surface.vertices[self.tips] - points.mean(0), axis=1)
                 nearest = np.argsort(away)[:N_TRIED]
@@ -158,7 +158,7 @@ class PoseSearch:
         limb = self.from_tips[tip] < np.clip(extent, *LIMBS)
         vertices = np.flatnonzero(limb)
         x = self.bending.shape(base, pose).numpy()[vertices]
-        shift, fields, thinned = points.mean(0) - x.mean(0), None, seen.thinned(N_POINTS)
+        shift, fields, thinned = points.mean(0) - x.mean(0), None, seen.thin(N_POINTS)
         for k in range(STEPS // 2):
             nearest = vertices[cKDTree(x + (shift if k == 0 else 0)).query(points)[1]]
             places = sparse.identity(len(limb), format="csr")[nearest]
@@ -186,13 +186,13 @@ class PoseSearch:
         Those of the step before, where they are given, do nearly as well.
         """
         if known is None:
-            x, fields = self.bending.linearised(base, pose, rigid)
+            x, fields = self.bending.linearise(base, pose, rigid)
         else:
             x, fields = self.bending.shape(base, pose), known
         matrix, slope = self._normal_equations(x, fields, pose, seen, far, stiffness, released)
         step = -torch.linalg.solve(matrix, slope)
         largest = float((fields @ step).norm(dim=-1).max()) / LARGEST_STEP
-        return self.bending.stepped(pose, step / max(1.0, largest), x.mean(0)), fields
+        return self.bending.step(pose, step / max(1.0, largest), x.mean(0)), fields
 
     def _normal_equations(
         self,
