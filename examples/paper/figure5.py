@@ -21,7 +21,7 @@ from torch_modal.geometry.canonical import CANONICAL_SIZE
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.inbetween.regions import fitting_error, segments
 from torch_modal.view.drawing import Scene, draw
-from torch_modal.view.picture import BETWEEN_COLOR, ERROR_COLORS, KEYFRAME_COLOR, centred, view_rotation
+from torch_modal.view.picture import BETWEEN_COLOR, ERROR_COLORS, KEYFRAME_COLOR, fit_into_cells, view_rotation
 
 matplotlib.use("Agg")
 from matplotlib import pyplot
@@ -87,7 +87,7 @@ def _draw(
         *((name, x, marked) for name, x in shapes.items()),
     ]
     rotation = view_rotation(ends[0].numpy(), None, None)
-    placed, half = centred(np.stack([x.numpy() @ rotation.T for _, x, _ in cells])[None])
+    placed, half = fit_into_cells(np.stack([x.numpy() @ rotation.T for _, x, _ in cells])[None])
     points = placed[0]
     images = _images(points, np.stack([color for *_, color in cells]), faces, half)
     low, high = (f(points[4:, region], axis=(0, 1)) for f in (np.min, np.max))

@@ -44,7 +44,7 @@ from _sculpt import sculpt
 from make_samples import hand
 from morph_animals import TIMES
 
-SHARED = Path(__file__).parents[2].parent / "shared" / "data"
+SHARED = Path(__file__).resolve().parents[2].parent / "shared" / "data"
 BODIES = {
     "mh-hand": [SHARED / "mh-hand" / f"{n}.obj" for n in ("00-open", "01-half", "02-fist", "03-point", "04-spread")],
     "mh-woman": [SHARED / "mh-woman" / f"{n}.obj" for n in ("00-rest", "02-walk-a", "03-walk-b")],

@@ -324,7 +324,7 @@ class TestParts:
 
     def test_parabolas_add_up_to_one(self, generator: torch.Generator) -> None:
         w, q = (torch.rand(4, 3, generator=generator, dtype=DOUBLE) for _ in range(2))
-        (whole, value), least = Term().merged(q, w)
+        (whole, value), least = Term().merge_rests(q, w)
         at = pulls(0.3, -2.0, 5.0)
         torch.testing.assert_close(whole * (at - value) ** 2 + least, (w * (at - q) ** 2).sum(0))
 

@@ -10,7 +10,7 @@ import pytest
 import scipy.linalg
 import scipy.sparse as sp
 import torch
-from benchmarks.quadratic import quadratic_modes
+from benchmarks.quadratic_tetrahedra import quadratic_modes
 from conftest import COARSE
 from solids import as_mesh, box, eigenmodes, lumped_mass, surface, together
 
