@@ -82,7 +82,7 @@ def main(folder: Path, n_points: int = 1500) -> dict[str, float]:
         keyframe_indices=[],
         view=sample.view,
         colors={"completed": 1 - found.confidence},
-        color_label="0: seen, 1: inferred",
+        color_label="1 - confidence",
         points={"seen": [one.points for one in observations]},
         overwrite=True,
     )

@@ -88,7 +88,7 @@ def run(args: argparse.Namespace) -> None:
             titles=[f"t = {t:.4g}" for t in found.times[chosen].tolist()],
             keyframe_indices=[],
             colors={"completed": 1 - found.confidence[chosen]},
-            color_label="0: seen, 1: inferred",
+            color_label="1 - confidence",
             points={"seen": [torch.cat([o.points for o, n in zip(seen, at, strict=True) if n == i]) for i in chosen]},
             overwrite=args.overwrite,
         )
