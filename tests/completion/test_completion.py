@@ -13,6 +13,7 @@ from torch_modal.completion.gradient import LastSolve
 from torch_modal.completion.pairs import Cloud, Pairs, SampledSurface
 from torch_modal.elastic.steps import FineEnergy
 from torch_modal.elastic.term import Mesh
+from torch_modal.geometry.rigid import best_fit
 from torch_modal.motion.decoder import scale_modes
 from torch_modal.registration.surface import places_between
 
@@ -101,6 +102,12 @@ class TestKeyframesAndScans:
         seen = between.confidence > 0.5
         assert 0.2 < float(seen.double().mean()) < 0.95
         assert 0 <= float(between.confidence.min()) <= float(between.confidence.max()) <= 1
+
+    def test_what_moves_far_is_less_certain(self, tube, between):
+        before, x = tube[0][1], tube[0][2]
+        moved = (best_fit(before, x).apply(before) - x).norm(dim=1)
+        by_ring = torch.stack([moved, between.confidence[1]])[:, :-2].reshape(2, -1, 12).mean(2)
+        assert float(torch.corrcoef(by_ring)[0, 1]) < -0.8
 
 
 class TestTemplateAlone:
@@ -294,7 +301,8 @@ def test_gradients_in_points(tube, kind):
 def test_gradients_of_shapes_are_first_ones_only(tube):
     x, faces, _ = tube
     points = x[1, ::9].clone().requires_grad_()
-    found = tm.complete(x[::2], faces, [tm.Observation(0.5, points, vertices=torch.arange(0, len(x[1]), 9))])
+    one = tm.Observation(0.5, points, vertices=torch.arange(0, len(x[1]), 9))
+    found = tm.complete(x[::2], faces, (each for each in [one]))  # read once
     with pytest.raises(RuntimeError, match="first derivatives only"):
         torch.autograd.grad(found.shapes.sum(), points, create_graph=True)
     with torch.no_grad():

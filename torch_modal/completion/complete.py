@@ -54,8 +54,8 @@ COARSE_FACES = 2500
 SHIFTS = (-0.17, 0.17)
 """Times at which a motion may be instead of where its neighbours say, in parts of the gap between these."""
 
-PASSES, N_ALIKE, TRUSTED = 2, 2, 0.34
-"""Further searches of the worse half of the frames, each also from so many shapes of other times."""
+TRUSTED, N_ALIKE = 0.34, 2
+"""Part of the frames, those that explain most, from which the others are searched again; starts from their shapes."""
 
 OWN_OF_CLOUDS, OWN, WHOLE = 0.4, 0.1, 0.1
 """Weights of the shape by modes, where there are clouds and without, and of whole shapes, in Eq. 5; neighbours in
@@ -194,11 +194,10 @@ def complete(
     is_template = whole.dim() == 2
     if is_template and times is not None:
         raise ValueError("a template of the shape (V, 3) has no time; pass key-frames (1, V, 3) that have one")
-    completion, solver = _complete(whole.detach(), faces, observations, times, progress)
-    given = [one.points for one in observations]
-    if not torch.is_grad_enabled() or not any(x.requires_grad for x in given):
+    completion, solver, points = _complete(whole.detach(), faces, observations, times, progress)
+    if not torch.is_grad_enabled() or not any(x.requires_grad for x in points):
         return completion
-    return _differentiable(completion, solver, given)
+    return _differentiable(completion, solver, points)
 
 
 @outside_inference_mode
@@ -208,7 +207,7 @@ def _complete(
     observations: Sequence[Observation],
     times: Tensor | Sequence[float] | None,
     progress: Progress,
-) -> tuple[Completion, "_Completer"]:
+) -> tuple[Completion, "_Completer", list[Tensor]]:
     is_template = whole.dim() == 2
     like, shapes, indices = check_arrays(whole[None] if is_template else whole, faces)
     given = check_observations(observations, shapes.shape[1])
@@ -217,7 +216,7 @@ def _complete(
     with ProgressReport(len(solver.frames) * (4 + ROUNDS), "completing", progress) as report:
         solver.search(report)
         solver.refine(report)
-    return solver.result(like), solver
+    return solver.result(like), solver, [one.points for one in given]
 
 
 def _differentiable(completion: Completion, solver: "_Completer", points: Sequence[Tensor]) -> Completion:
@@ -287,7 +286,7 @@ class _Completer:
         n, whole = len(self.frames), list(zip(self.times, self.whole, strict=False))
         fits = dict[int, ModalFit]()
         if not whole:
-            rigid = [self._place_rigidly(i) for i in range(n)]
+            rigid = [self._place_rigidly(i, self.template) for i in range(n)]
             first = int(np.argmin([score for _, score in rigid]))
             fits[first] = self._search(first, [(self.template, rigid[first][0])])
             report.update()
@@ -336,12 +335,8 @@ class _Completer:
 
     def _alike(self, i: int, shapes: Sequence[Tensor]) -> list[tuple[Tensor, ModalPose]]:
         """The shapes that explain most of a frame after a rigid motion: motions repeat."""
-        seen, to_canonical = self._seen(i), []
-        for x in shapes:
-            base = self._coarsen(x)
-            pose = self.poses.rigid(base, seen)
-            to_canonical.append((self.poses.score(base, pose, seen), x, pose))
-        return [(x, pose) for _, x, pose in sorted(to_canonical, key=lambda one: one[0])[:N_ALIKE]]
+        placed = [(x, *self._place_rigidly(i, x)) for x in shapes]
+        return [(x, pose) for x, pose, _ in sorted(placed, key=lambda one: one[2])[:N_ALIKE]]
 
     def _starts(self, t: float, known: list[tuple[float, Tensor]]) -> list[tuple[Tensor, ModalPose]]:
         """Shapes from which a search at a time starts."""
@@ -373,9 +368,9 @@ class _Completer:
         middle = last.mean(0)
         return (x - middle) @ motion.rotation.mT + 2 * middle - before.mean(0)
 
-    def _place_rigidly(self, i: int) -> tuple[ModalPose, float]:
-        """The pose of the template in a frame, and how much it leaves unexplained."""
-        seen, base = self._seen(i), self._coarsen(self.template)
+    def _place_rigidly(self, i: int, x: Tensor) -> tuple[ModalPose, float]:
+        """The pose of a shape in a frame, and how much it leaves unexplained."""
+        seen, base = self._seen(i), self._coarsen(x)
         pose = self.poses.rigid(base, seen)
         return pose, self.poses.score(base, pose, seen)
 
