@@ -5,6 +5,7 @@ import copy
 import numpy as np
 import pytest
 import torch
+from terms import Spring
 
 import torch_modal as tm
 from torch_modal.completion.bending import ModalBending
@@ -274,7 +275,7 @@ def test_gradients_in_points(tube, kind):
         return solves[-1]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("torch_modal.completion.complete.LastSolve", keep)
+        patch.setattr("torch_modal.completion.refinement.LastSolve", keep)
         found = tm.complete(x[::2], faces, [seen], times=[0.0, 2.0, 4.0])
     probe = torch.randn(x[1].shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     (slope,) = torch.autograd.grad((found.shapes[0] * probe).sum(), points)
@@ -309,3 +310,51 @@ def test_gradients_of_shapes_are_first_ones_only(tube):
         again = tm.complete(x[::2], faces, [tm.Observation(0.5, points, vertices=torch.arange(0, len(x[1]), 9))])
     assert not again.shapes.requires_grad
     assert torch.equal(again.shapes, found.shapes)
+
+
+def test_times_that_are_off_are_estimated(tube):
+    x, faces, diagonal = tube
+    path, true = tm.Path(x, faces), torch.tensor([0.6, 1.3, 2.7, 3.4], dtype=torch.float64)
+    told = (true + torch.tensor([0.3, -0.1, 0.2, -0.3])).tolist()
+    shapes, noise = path(x, true), 1e-3 * diagonal
+    every = torch.arange(x.shape[1])
+    seen = [tm.Observation(t, one, vertices=every, noise=noise) for t, one in zip(told, shapes, strict=True)]
+    plain, found = (
+        tm.complete(x[::2], faces, seen, times=[0.0, 2.0, 4.0], estimate_times=estimate) for estimate in (False, True)
+    )
+    assert plain.times.tolist() == told
+    assert float((found.times - true).abs().max()) < 0.1
+    assert error(found(true), shapes, diagonal) < 0.5 * error(plain(true), shapes, diagonal)
+
+
+@pytest.mark.parametrize("unit", [1.0, 1000.0])
+def test_terms_take_part_in_the_coordinates_of_the_caller(tube, unit):
+    x, faces, diagonal = unit * tube[0], tube[1], unit * tube[2]
+    seen = [tm.Observation(2.0, x[2, ::5], vertices=torch.arange(x.shape[1])[::5], noise=0.01 * diagonal)]
+    target = x[2, 150] + torch.tensor([0.0, 0.0, 0.05]) * diagonal
+    plain, pulled = (
+        tm.complete(x[[0, 4]], faces, seen, times=[0.0, 4.0], objective=tm.Objective(terms=terms)).shapes[0, 150]
+        for terms in ((), (Spring([150], target[None], 1e5),))
+    )
+    assert float((pulled - target).norm()) < 0.2 * float((plain - target).norm())
+
+
+def test_fingers_are_pushed_apart():
+    pytest.importorskip("ipctk")
+    sample = tm.load_sample("hand")
+    rests, faces = sample.keyframes.double(), sample.faces
+    crossing = tm.Path(rests, faces)(rests, 0.875)
+    seen = [tm.Observation(0.875, crossing[::20], vertices=torch.arange(len(crossing))[::20])]
+    plain, apart = (tm.complete(rests, faces, seen, contact=contact) for contact in (False, True))
+    assert int(tm.self_contacts(plain.shapes, faces, ignore=rests).n_far) > 20
+    assert int(tm.self_contacts(apart.shapes, faces, ignore=rests).n_far) == 0
+    assert apart.path.contact
+    moved = (apart.shapes - plain.shapes).norm(dim=-1)
+    assert float(moved.median()) < 0.02 * float(moved.max()), "more is moved than what touches"
+
+
+def test_two_shapes_for_each_time_are_refused(tube):
+    x, faces, _ = tube
+    seen = [tm.Observation(1.0, x[1], vertices=torch.arange(x.shape[1]))]
+    with pytest.raises(ValueError, match="space='joint'"):
+        tm.complete(x[[0, 4]], faces, seen, objective=tm.Objective(space="paired"))

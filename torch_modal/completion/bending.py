@@ -39,8 +39,8 @@ class ModalBending:
         """No deformation."""
         return ModalPose(self.columns.new_zeros(len(self.columns)), torch.eye(3).double(), torch.zeros(3).double())
 
-    def _sides(self, base: Tensor, bending: Tensor) -> tuple[Tensor, Tensor]:
-        own = frames(sides(base.T[:, None].contiguous(), self.faces))
+    def _sides(self, base: Tensor, bending: Tensor, n_copies: int = 1) -> tuple[Tensor, Tensor]:
+        own = frames(sides(base.T[:, None].contiguous(), self.faces.repeat(n_copies, 1)))
         turn = bending[0] * own.e1[:, 0] + bending[1] * own.e2[:, 0] + bending[2] * own.normal[:, 0]
         return bent_sides(turn[:, None], bending[3:, None], own)
 
@@ -56,17 +56,19 @@ class ModalBending:
         If rigid, in the last two alone. *Shape:* ``(V, 3), (V, 3, k + 6)``.
         """
         rest, n = base.T[:, None].contiguous(), len(base)
-        with torch.enable_grad():
-            bending = torch.einsum("k,kcf->cf", pose.amplitudes, self.columns).requires_grad_()
-            first, second = self._sides(base, bending)
-            ends = () if rigid else torch.cat([first, second])[:, 0]
-            slopes = [torch.autograd.grad(row.sum(), bending, retain_graph=True)[0] for row in ends]
-        x = pose.apply(self.reconstruction((first.detach(), second.detach()), rest)[:, 0].T)
+        bending = torch.einsum("k,kcf->cf", pose.amplitudes, self.columns)
+        if not rigid:
+            # Six copies of all faces, in each of which another coordinate of the sides is differentiated: one backward.
+            copies = bending.repeat(1, 6).requires_grad_()
+            with torch.enable_grad():
+                ends = torch.cat(self._sides(base, copies, 6))[:, 0].view(6, 6, -1).diagonal()
+                slopes = torch.autograd.grad(ends.sum(), copies)[0].view(6, 6, -1).permute(2, 1, 0)
+        x = pose.apply(self.reconstruction(self._sides(base, bending), rest)[:, 0].T)
         motions = infinitesimal_motions(x - x.mean(0)).movedim(0, -1)
         if rigid:
             return x, motions
         # The right-hand side of the Poisson problem at the corners of each face, by its bending.
-        of_first, of_second = torch.stack(slopes).movedim(-1, 0).split(3, 1)  # (F, 3, 6) each
+        of_first, of_second = slopes.split(3, 1)  # (F, 3, 6) each
         one, other, last = self.reconstruction.weights.view(3, -1)[..., None, None]
         corners = [
             -one * of_first - last * of_second,

@@ -111,17 +111,19 @@ class Cloud:
         """:meth:`SampledSurface.most_alike` of its points."""
         return surface.most_alike(self.points, self.normals)
 
-    def pairs(self, surface: SampledSurface, released: BoolArray | None = None) -> list[Pairs]:
-        """Places for the points, and, where the view is known, points for the visible places."""
+    def places(self, surface: SampledSurface, released: BoolArray | None = None) -> Pairs:
+        """The places of the points whose normals agree."""
         face, barycentric, _, agree = self.closest(surface)
-        n = len(surface.vertices)
         if released is not None:
             agree &= ~released[surface.faces[face]].any(1)
         kept = np.flatnonzero(agree)
         normals = None if self.normals is None else self.normals[kept]
-        share = self.weights[kept] / self.weights.sum()
-        places = places_between(surface.faces[face[kept]], barycentric[kept], n)
-        pairs = [Pairs(places, self.points[kept], normals, share, kept)]
+        places = places_between(surface.faces[face[kept]], barycentric[kept], len(surface.vertices))
+        return Pairs(places, self.points[kept], normals, self.weights[kept] / self.weights.sum(), kept)
+
+    def pairs(self, surface: SampledSurface, released: BoolArray | None = None) -> list[Pairs]:
+        """Places for the points, and, where the view is known, points for the visible places."""
+        pairs = [self.places(surface, released)]
         if self.view is None or self.normals is None:
             return pairs
         seen = surface.visible(self.view)
@@ -133,7 +135,7 @@ class Cloud:
             agree &= ~released[surface.faces[faces]].any(1)
         seen, faces, nearest = seen[agree], faces[agree], nearest[agree]
         if len(seen):
-            places = places_between(surface.faces[faces], _PLACES[seen % len(_PLACES)], n)
+            places = places_between(surface.faces[faces], _PLACES[seen % len(_PLACES)], len(surface.vertices))
             share = np.full(len(seen), 1 / len(seen))
             pairs.append(Pairs(places, self.points[nearest], self.normals[nearest], share, nearest))
         return pairs

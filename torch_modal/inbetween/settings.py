@@ -1,13 +1,16 @@
 """Objective, solver and presets: the settings of all in-betweens."""
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
+import torch
 from torch import Tensor
 
 from torch_modal.elastic.backend import names
 from torch_modal.elastic.bend import Bend, SquaredBend
+from torch_modal.elastic.energy import Energy
 from torch_modal.elastic.shell import ALPHA, BETA, GAMMA
 from torch_modal.elastic.stretch import Stretch
 from torch_modal.elastic.term import Term
@@ -165,3 +168,30 @@ def settings(
         what = "mu weighs the similarity" if mu is not None else f"regions={solver.regions} are interpolated"
         raise ValueError(f"{what} of the two shapes of Eq. 4; the joint space has one: preset='paper' has two")
     return Settings(objective, solver)
+
+
+def stiffnesses(terms: Iterable[Term], energy: Energy, like: Tensor, lead: torch.Size, encloses: bool) -> list[Tensor]:
+    """Stiffnesses of terms in a flat batch; that of the volume is 0 where there is none.
+
+    *Shape of each:* ``(B, M)`` or ``(B, 1)``.
+
+    Raises:
+        ValueError: A stiffness has neither one value nor one of each element, or does not broadcast.
+    """
+    flat = []
+    for term, summand in zip(terms, energy.parts, strict=True):
+        values = torch.as_tensor(term.stiffness, dtype=like.dtype, device=like.device)
+        values = values[None] if values.dim() == 0 else values
+        values = values if encloses or not isinstance(term, Volume) else 0 * values
+        n = 1 if term.total else summand.corners.shape[1]
+        try:
+            if values.shape[-1] not in (1, n):
+                raise RuntimeError
+            flat.append(values.expand(*lead, values.shape[-1]).reshape(-1, values.shape[-1]))
+        except RuntimeError:
+            raise ValueError(
+                f"a stiffness of {type(term).__name__} has shape {tuple(values.shape)}; its last dimension counts "
+                f"the {n} elements or is 1, its others broadcast against samples of {tuple(lead)}: one for each "
+                "sample is values[:, None]"
+            ) from None
+    return flat

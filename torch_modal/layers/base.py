@@ -10,11 +10,11 @@ from torch_modal.arrays import FloatArray
 from torch_modal.autograd import as_normal_tensor, full_precision, is_eager, outside_inference_mode, require_numbers
 from torch_modal.contact.in_between import ContactSolver
 from torch_modal.elastic.term import Mesh
-from torch_modal.elastic.volume import Volume, encloses
+from torch_modal.elastic.volume import encloses
 from torch_modal.geometry.bodies import bodies
 from torch_modal.geometry.canonical import own_order
 from torch_modal.inbetween.results import InBetweenResult, Samples, join_bodies
-from torch_modal.inbetween.settings import Settings
+from torch_modal.inbetween.settings import Settings, stiffnesses
 from torch_modal.inbetween.solver import InBetweenSolver
 from torch_modal.keyframes.arrays import as_faces, as_positions, check_tensor
 from torch_modal.keyframes.check import check_surface
@@ -206,20 +206,4 @@ class InBetweenLayer(PreciseModule):
 
     def stiffness_of(self, like: Tensor, lead: torch.Size, body: int = 0) -> list[Tensor]:
         """Stiffnesses of a body in a flat batch, of each term. *Shape of each:* ``(B, M)`` or ``(B, 1)``."""
-        stiffnesses = []
-        for term, summand in zip(self.terms, self.core.fine.energy.parts, strict=True):
-            values = torch.as_tensor(term.stiffness, dtype=like.dtype, device=like.device)
-            values = values[None] if values.dim() == 0 else values
-            values = values if self.encloses[body] or not isinstance(term, Volume) else 0 * values
-            n = 1 if term.total else summand.corners.shape[1]
-            try:
-                if values.shape[-1] not in (1, n):
-                    raise RuntimeError
-                stiffnesses.append(values.expand(*lead, values.shape[-1]).reshape(-1, values.shape[-1]))
-            except RuntimeError:
-                raise ValueError(
-                    f"a stiffness of {type(term).__name__} has shape {tuple(values.shape)}; its last dimension counts "
-                    f"the {n} elements or is 1, its others broadcast against samples of {tuple(lead)}: one for each "
-                    "sample is values[:, None]"
-                ) from None
-        return stiffnesses
+        return stiffnesses(self.terms, self.core.fine.energy, like, lead, self.encloses[body])

@@ -1,0 +1,207 @@
+"""Modal poses of all frames: outward in time from what is known, then between neighbours; and times from them."""
+
+import math
+from collections.abc import Sequence
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from scipy.optimize import minimize_scalar
+from torch import Tensor
+
+from torch_modal.completion.bending import ModalBending, ModalPose
+from torch_modal.completion.frames import CompletionProblem
+from torch_modal.completion.pairs import Pairs
+from torch_modal.completion.search import PoseSearch, Seen
+from torch_modal.geometry.rigid import best_fit
+from torch_modal.geometry.triangle_frames import frames_of, mirrored_sides
+from torch_modal.modes.coarsening import Coarsening, coarsen
+from torch_modal.modes.extract import extract_bases
+from torch_modal.motion.decoder import scale_modes
+from torch_modal.motion.path import Path
+from torch_modal.progress import ProgressReport
+
+N_MODES = 60
+"""Modes of the first shape in which poses are searched."""
+COARSE_FACES = 2500
+"""Faces of the mesh on which they are searched; of fewer, it is the caller's."""
+SHIFTS = (-0.17, 0.17)
+"""Times at which a motion may be instead of where its neighbours say, in parts of the gap between these."""
+TRUSTED, N_ALIKE = 0.34, 2
+"""Part of the frames, those that explain most, from which the others are searched again; starts from their shapes."""
+TIME_ROUNDS, LATEST, UNCHANGED = 6, 0.5, 10.0
+"""Rounds in which times are estimated; the largest change, in parts of the gap between neighbours, and its weight."""
+
+
+class ModalFit(NamedTuple):
+    """A frame by modes."""
+
+    x: Tensor
+    base: Tensor
+    pose: ModalPose
+    score: float
+    """How much it leaves unexplained."""
+
+
+class FramePoses:
+    """Finds modal poses of all frames of a problem."""
+
+    def __init__(self, problem: CompletionProblem) -> None:
+        self.problem, self.frames, self.faces = problem, problem.frames, problem.faces
+        basis = extract_bases(problem.template[None], self.faces, N_MODES)[0]
+        modes = scale_modes(basis.modes, 100.0)
+        self.bending = ModalBending(problem.template, self.faces, modes)
+        self.coarse: Coarsening | None = None
+        coarse_bending = self.bending
+        if len(self.faces) > COARSE_FACES:
+            whole = problem.whole.numpy()
+            self.coarse = coarsen(whole, self.faces.numpy(), COARSE_FACES, range(len(whole)), {})
+            restricted = [torch.from_numpy(self.coarse.restrict(x.numpy())) for x in (problem.template, modes)]
+            coarse_bending = ModalBending(restricted[0], torch.from_numpy(self.coarse.faces), restricted[1])
+        self.poses = PoseSearch(coarse_bending, basis.eigenvalues)
+        #: Times and whole shapes.
+        self.whole = list(zip(problem.times.tolist(), problem.whole, strict=False))
+
+    def search(self, report: ProgressReport) -> list[Tensor]:
+        """Shapes of all frames. *Shape of each:* ``(V, 3)``."""
+        n, fits = len(self.frames), dict[int, ModalFit]()
+        if not self.whole:
+            rigid = [self._place_rigidly(i, self.problem.template) for i in range(n)]
+            first = int(np.argmin([score for _, score in rigid]))
+            fits[first] = self._search(first, [(self.problem.template, rigid[first][0])])
+            report.update()
+        self._outward(fits, {}, report)
+        if not self.whole:
+            before, bound = fits, float(np.quantile([one.score for one in fits.values()], TRUSTED))
+            fits = {i: one for i, one in before.items() if one.score <= bound}
+            report.update(len(fits))
+            self._outward(fits, before, report)
+        for i in sorted(range(n), key=lambda i: -fits[i].score):
+            if known := self._known({j: one for j, one in fits.items() if j != i}):
+                again = self._search(i, self._starts(self.frames[i].time, known))
+                fits[i] = min(fits[i], again, key=lambda one: one.score)
+            report.update()
+        shapes = []
+        for i in range(n):
+            one = fits[i]
+            pose = self.poses.stiffen(self._coarsen(one.base), one.pose, self._seen(i))
+            shapes.append(self.bending.shape(one.base, pose))
+            report.update()
+        return shapes
+
+    def _outward(self, fits: dict[int, ModalFit], before: dict[int, ModalFit], report: ProgressReport) -> None:
+        """Add all other frames, those near in time to what is known first; none is worse than it was before."""
+        left = [i for i in range(len(self.frames)) if i not in fits]
+        while left:
+            known = self._known(fits)
+            gaps = [min(abs(self.frames[i].time - t) for t, _ in known) for i in left]
+            i = left.pop(int(np.argmin(gaps)))
+            starts = self._starts(self.frames[i].time, known)
+            if before:
+                starts += self._alike(i, [x for _, x in known])
+            fits[i] = self._search(i, starts)
+            if i in before:
+                fits[i] = min(fits[i], before[i], key=lambda one: one.score)
+            report.update()
+
+    def _known(self, fits: dict[int, ModalFit]) -> list[tuple[float, Tensor]]:
+        """Times and shapes of frames, and of whole ones, in the order of time."""
+        shapes = [*self.whole, *((self.frames[i].time, one.x) for i, one in fits.items())]
+        return sorted(shapes, key=lambda one: one[0])
+
+    def _alike(self, i: int, shapes: Sequence[Tensor]) -> list[tuple[Tensor, ModalPose]]:
+        """The shapes that explain most of a frame after a rigid motion: motions repeat."""
+        placed = [(x, *self._place_rigidly(i, x)) for x in shapes]
+        return [(x, pose) for x, pose, _ in sorted(placed, key=lambda one: one[2])[:N_ALIKE]]
+
+    def _starts(self, t: float, known: list[tuple[float, Tensor]]) -> list[tuple[Tensor, ModalPose]]:
+        """Shapes from which a search at a time starts."""
+        times, shapes = np.array([time for time, _ in known]), torch.stack([x for _, x in known])
+        if t in times:
+            return [(shapes[int(np.argmin(np.abs(times - t)))], self.bending.still())]
+        if len(known) > 1 and times[0] < t < times[-1]:
+            path = Path(shapes, self.faces, times=times.tolist())
+            after = int(np.searchsorted(times, t))
+            gap = times[after] - times[after - 1]
+            base = path(shapes, t)
+            bases = [base]
+            for shift in SHIFTS:
+                other = path(shapes, float(np.clip(t + shift * gap, times[0], times[-1])))
+                bases.append(best_fit(other, base).apply(other))
+        else:
+            nearest = np.argsort(np.abs(times - t))
+            bases = [shapes[nearest[0]]]
+            if len(known) > 1:
+                bases.append(self._beyond(shapes[nearest[1]], shapes[nearest[0]]))
+        return [(x, self.bending.still()) for x in bases]
+
+    def _beyond(self, before: Tensor, last: Tensor) -> Tensor:
+        """The shape as far after the last one as that is after the one before."""
+        motion = best_fit(before, last)
+        sides = mirrored_sides(frames_of(last[None], self.faces), frames_of(motion.apply(before)[None], self.faces))
+        x = self.bending.reconstruction(sides, last.T[:, None].contiguous())[:, 0].T
+        x = best_fit(x, last).apply(x)
+        middle = last.mean(0)
+        return (x - middle) @ motion.rotation.mT + 2 * middle - before.mean(0)
+
+    def _place_rigidly(self, i: int, x: Tensor) -> tuple[ModalPose, float]:
+        """The pose of a shape in a frame, and how much it leaves unexplained."""
+        seen, base = self._seen(i), self._coarsen(x)
+        pose = self.poses.rigid(base, seen)
+        return pose, self.poses.score(base, pose, seen)
+
+    def _search(self, i: int, starts: Sequence[tuple[Tensor, ModalPose]]) -> ModalFit:
+        """A frame by modes."""
+        coarse = [(self._coarsen(x), pose) for x, pose in starts]
+        k, pose, score = self.poses.fit(coarse, self._seen(i))
+        base = starts[k][0]
+        return ModalFit(self.bending.shape(base, pose), base, pose, score)
+
+    def _seen(self, i: int) -> Seen:
+        """Observations of a frame, on the coarse mesh."""
+        return self.frames[i].seen([self._restrict(pairs) for pairs in self.frames[i].markers])
+
+    def _coarsen(self, x: Tensor) -> Tensor:
+        return x if self.coarse is None else torch.from_numpy(self.coarse.restrict(x.numpy()))
+
+    def _restrict(self, pairs: Pairs) -> Pairs:
+        """Known places on the coarse mesh."""
+        if self.coarse is None:
+            return pairs
+        rows = pairs.places.tocoo()
+        cluster = np.maximum(self.coarse.clusters[rows.col], 0)
+        shape = len(pairs.points), self.coarse.n_vertices
+        return pairs._replace(places=type(rows)((rows.data, (rows.row, cluster)), shape=shape).tocsr())
+
+
+def times_between(problem: CompletionProblem, shapes: list[Tensor]) -> list[float]:
+    """Times at which the path through all other shapes is nearest to each; the first, the last and exact ones stay.
+
+    Args:
+        problem: Has the frames with the times that are known.
+        shapes: Of the frames. *Shape of each:* ``(V, 3)``.
+    """
+    first = [frame.time for frame in problem.frames]
+    times, exact = list(first), problem.times.tolist()
+    for _ in range(TIME_ROUNDS):
+        for i, x in enumerate(shapes):
+            others = [(t, other) for j, (t, other) in enumerate(zip(times, shapes, strict=True)) if j != i]
+            known = sorted([*zip(exact, problem.whole, strict=False), *others], key=lambda one: one[0])
+            axis = np.array([t for t, _ in known])
+            after = int(np.searchsorted(axis, times[i]))
+            if times[i] in exact or not 0 < after < len(axis):
+                continue
+            gap = LATEST * (axis[after] - axis[after - 1])
+            around = slice(max(0, after - 2), after + 2)
+            near = torch.stack([other for _, other in known[around]])
+            path = Path(near, problem.faces, times=axis[around].tolist())
+            cost = partial(_cost_of_time, path, near, x, first[i], gap)
+            bounds = max(axis[after - 1], first[i] - gap), min(axis[after], first[i] + gap)
+            times[i] = float(minimize_scalar(cost, bounds=bounds, method="bounded").x)
+    return times
+
+
+def _cost_of_time(path: Path, knots: Tensor, x: Tensor, t0: float, gap: float, t: float) -> float:
+    """Log-likelihood of a shape at a time, where the path errs by as much as it does at best, and of the change."""
+    return math.log(float((path(knots, t) - x).square().sum())) + UNCHANGED * ((t - t0) / gap) ** 2
