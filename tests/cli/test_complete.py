@@ -66,10 +66,11 @@ def animation(path: Path) -> tuple[dict[str, Any], float]:
 def test_template_and_scans(files: Path, arrived: dict[str, Any], capsys: pytest.CaptureFixture[str]) -> None:
     times = [str(0.5 * i) for i in range(10)]
     argv = ["complete", "template.obj", *SCANS, "--times", *times, "--out", "motion.glb", "--picture", "seen.png"]
-    assert cli.main([*argv, "--noise", "0.01", "--view", "0", "0", "-2"]) == 0
+    assert cli.main([*argv, "--noise", "0.01", "--view", "0", "0", "-2", "--estimate-times"]) == 0
     template, faces = tm.load_keyframes(["template.obj"])
     assert torch.equal(arrived["rests"], template[0]) and torch.equal(arrived["faces"], faces)
     assert arrived["times"] is None and arrived["progress"] is False  # no terminal
+    assert arrived["estimate_times"] is True and arrived["contact"] is False
     observations = arrived["observations"]
     assert [one.time for one in observations] == [0.5 * i for i in range(10)]
     assert {(one.noise, tuple(one.view.tolist())) for one in observations} == {(0.01, (0, 0, -1))}

@@ -22,6 +22,8 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
     text = "when the whole meshes are, the first included (default: that is a template of no time)"
     add("--keyframe-times", nargs="+", type=float, metavar="T", help=text)
     add("--noise", type=positive, metavar="X", help="standard deviation of the points (default: estimated)")
+    add("--estimate-times", action="store_true", help="times between the first and the last are not exact")
+    add("--contact", action="store_true", help="keep parts from passing through each other (extra contact)")
     add("--view", nargs=3, type=float, metavar=("X", "Y", "Z"), help="direction to the camera of the clouds")
     add_output(sub, "what was seen above the result, coloured by its confidence")
     add("--frames", type=number(int, 2), metavar="N", help="evenly in time (default: 1 to 8 for each interval)")
@@ -68,7 +70,15 @@ def run(args: argparse.Namespace) -> None:
     welded = tm.weld_seams(keyframes, faces)
     seen = [one if one.is_cloud else replace(one, vertices=welded.vertex_of[one.vertices]) for one in seen]
     rests = welded.keyframes if times else welded.keyframes[0]
-    found = tm.complete(rests, welded.faces, seen, times=times, progress=not args.quiet and sys.stderr.isatty())
+    found = tm.complete(
+        rests,
+        welded.faces,
+        seen,
+        times=times,
+        estimate_times=args.estimate_times,
+        contact=args.contact,
+        progress=not args.quiet and sys.stderr.isatty(),
+    )
     knots, when = found.path.times if found.path else found.times, found.times
     if len(knots) > 1 and args.frames:
         when = torch.linspace(float(knots[0]), float(knots[-1]), args.frames, dtype=torch.float64)
