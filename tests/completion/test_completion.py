@@ -224,6 +224,18 @@ def test_derivatives_of_modal_bending(tube):
         )
 
 
+def test_no_amplitude_blows_a_shape_up(tube):
+    """Amplitudes are found on a coarse mesh; on the caller's, a triangle may have ten times the strain."""
+    x, faces, diagonal = tube
+    modes = scale_modes(tm.extract_modes(x[0], faces, 6).modes, 100.0)
+    bending = ModalBending(100 * x[0], faces, modes)
+    bending.columns = 10 * bending.columns
+    pose = bending.still()
+    pose.amplitudes += 10
+    shape = bending.shape(100 * x[0], pose)
+    assert float((shape.amax(0) - shape.amin(0)).norm()) < 1000 * diagonal
+
+
 def test_derivatives_of_the_energy_of_points(tube):
     x, faces, _ = tube
     surface = SampledSurface(100 * x[0].numpy(), faces.numpy())

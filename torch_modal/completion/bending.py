@@ -9,6 +9,10 @@ from torch_modal.geometry.rotations import exp
 from torch_modal.geometry.triangle_frames import bent_sides, frames, sides
 from torch_modal.motion.decoder import bending_columns
 
+MOST_STRAIN = 2.0
+"""Bound on the logarithm of a triangle's stretch: on a fine mesh, few triangles of a mode may have far more than on the
+coarse one on which amplitudes are found."""
+
 
 class ModalPose:
     """Amplitudes of modes, then a rigid motion. *Shape:* ``(k,), (3, 3), (3,)``."""
@@ -42,7 +46,7 @@ class ModalBending:
     def _sides(self, base: Tensor, bending: Tensor, n_copies: int = 1) -> tuple[Tensor, Tensor]:
         own = frames(sides(base.T[:, None].contiguous(), self.faces.repeat(n_copies, 1)))
         turn = bending[0] * own.e1[:, 0] + bending[1] * own.e2[:, 0] + bending[2] * own.normal[:, 0]
-        return bent_sides(turn[:, None], bending[3:, None], own)
+        return bent_sides(turn[:, None], bending[3:, None].clamp(-MOST_STRAIN, MOST_STRAIN), own)
 
     def shape(self, base: Tensor, pose: ModalPose) -> Tensor:
         """The deformed shape. *Shape:* ``(V, 3)``."""

@@ -1,4 +1,4 @@
-"""What of each shape was seen, what the points count for, and how certain each vertex is."""
+"""Confidence of completed shapes: what was seen of them, what points count for, how far they move."""
 
 import numpy as np
 import torch

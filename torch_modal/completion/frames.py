@@ -1,4 +1,4 @@
-"""What was seen at each time, at a size of 100 in the axes of the first shape."""
+"""Observations by their times, at a size of 100 in the axes of the first shape."""
 
 from typing import NamedTuple
 
@@ -23,7 +23,7 @@ NOISES = 0.1, 2.0
 """Least noise, and the largest that is estimated, at a size of 100."""
 NOISES_OF_HALF = 3.0
 """Noises of the distance at which half of a miss counts."""
-OUTLIERS = 3.5
+OUTLIERS = 4.0
 """Distance, in standard deviations of the noise, at which a point loses three quarters of its weight."""
 
 

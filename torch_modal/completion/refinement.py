@@ -31,7 +31,7 @@ FOLLOWS, WEIGHTS, REACH = 20, (0.02, 0.5), (15.0, 1.5)
 """Steps in which a shape follows clouds; weights of points next to a vertex's, and the largest distance of a pair, in
 the first and in the last.
 """
-ROUNDS, STEPS, PRODUCTS = 8, 2, 20
+ROUNDS, STEPS, PRODUCTS = 12, 2, 20
 """Rounds of new pairs, in each of which all vertices take steps, each with iterations of conjugate gradients."""
 LAST = (6, 60)
 """Steps after the last round, and their iterations."""

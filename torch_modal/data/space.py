@@ -21,7 +21,7 @@ from torch_modal.inbetween.settings import Objective, Preset, Solver, settings
 from torch_modal.io.cache import content_digest
 from torch_modal.keyframes.check import check_keyframes
 from torch_modal.layers.blend import Blend
-from torch_modal.modes.basis import ModalBasis, checked_bases
+from torch_modal.modes.basis import ModalBasis, check_bases
 from torch_modal.statistics.components import Components
 from torch_modal.statistics.fit import Fitted, fit
 from torch_modal.statistics.variation import Variation
@@ -77,7 +77,7 @@ class ShapeSpace:
         cyclic: bool = False,
         contact: bool | None = None,
     ) -> None:
-        self.bases = [basis.to("cpu") for basis in checked_bases(bases)]
+        self.bases = [basis.to("cpu") for basis in check_bases(bases)]
         # Checks and repairs the faces.
         self.faces = check_keyframes([self.bases[0].reference.double()], faces, warn=False).faces.cpu()
         self.settings = settings(preset, objective, solver, contact)

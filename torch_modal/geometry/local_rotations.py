@@ -204,7 +204,7 @@ class LocalRotations(nn.Module):
         xx, xy, yy = trajectory.size + (straight + bent)[3:]
         flat = torch.zeros_like(xx)
 
-        def placed(x: Tensor, y: Tensor) -> Tensor:
+        def place(x: Tensor, y: Tensor) -> Tensor:
             side = torch.stack([x, y, flat])
             side = side if bending is None else rotate_by(bending[:3], side)
             x, y, z = rotate_by(straight[:3], rotate_by(bent[:3], side))
@@ -213,7 +213,7 @@ class LocalRotations(nn.Module):
         # At a key-frame, the intervals on both sides weigh alike: velocities of edges are continuous.
         areas = torch.lerp(doubled_areas(*trajectory.size), doubled_areas(*(trajectory.size + trajectory.step[3:])), u)
         first, second = transform(xx, xy, xy, yy) if bending is None else stretch(bending[3:], xx, xy, yy)
-        return self._edges((placed(*first), placed(*second)), areas)
+        return self._edges((place(*first), place(*second)), areas)
 
     def _edges(self, wanted: Sides, areas: Tensor) -> Tensor:
         """Edge vectors that the triangles ask for, by area. *Shape:* ``(B, F) -> (3, B, E)``."""

@@ -190,12 +190,12 @@ def mirrored_sides(centre: Frames, other: Frames) -> Sides:
     i_xx, i_xy, i_yy = (2 * v / determinant for v in (1 + u_yy, -u_xy, 1 + u_xx))
     g_xx, g_xy, g_yy = i_xx**2 + i_xy**2, i_xy * (i_xx + i_yy), i_xy**2 + i_yy**2
 
-    def turned_back(x: Tensor, y: Tensor) -> Tensor:
+    def turn_back(x: Tensor, y: Tensor) -> Tensor:
         p, q, r = other.coordinates(centre.world(x, y))
         return centre.world(cos * p + sin * q, cos * q - sin * p) + r * centre.normal
 
     first, second = transform(*_product((g_xx, g_xy, g_yy), centre[3:]))
-    return turned_back(*first), turned_back(*second)
+    return turn_back(*first), turn_back(*second)
 
 
 def _dot(a: Tensor, b: Tensor) -> Tensor:

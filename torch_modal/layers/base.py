@@ -18,7 +18,7 @@ from torch_modal.inbetween.settings import Settings, stiffnesses
 from torch_modal.inbetween.solver import InBetweenSolver
 from torch_modal.keyframes.arrays import as_faces, as_positions, check_tensor
 from torch_modal.keyframes.check import check_surface
-from torch_modal.modes.basis import ModalBasis, checked_bases
+from torch_modal.modes.basis import ModalBasis, check_bases
 from torch_modal.threads import alone, by_chunks
 
 
@@ -50,7 +50,7 @@ def basis_buffers(bases: Bases) -> list[BasisBuffers]:
         x = as_positions(several)
         check_tensor("key-frames without modes", x, "K", "V", 3)
         return [BasisBuffers(shape, shape.new_zeros(0, *shape.shape)) for shape in x]
-    return [b if isinstance(b, BasisBuffers) else BasisBuffers(b.reference, b.modes) for b in checked_bases(several)]
+    return [b if isinstance(b, BasisBuffers) else BasisBuffers(b.reference, b.modes) for b in check_bases(several)]
 
 
 class PreciseModule(nn.Module):

@@ -16,7 +16,7 @@ FORMAT = "torch_modal.basis"
 VERSION = "2"
 
 
-def checked_bases(bases: Any) -> "list[ModalBasis]":
+def check_bases(bases: Any) -> "list[ModalBasis]":
     """One basis or several of one mesh, as a list.
 
     Raises:

@@ -22,8 +22,8 @@ from torch_modal.modes.surface import CanonicalSurface, SurfaceSamples, clearanc
 from torch_modal.modes.tetrahedra import (
     Tetrahedra,
     face_connected_pieces,
-    kept_tetrahedra,
     solid_volumes,
+    submesh,
     tet_volumes,
     without_debris,
 )
@@ -216,7 +216,7 @@ def lattice(surface: CanonicalSurface, cube: float) -> Tetrahedra:
     kept = inside >= LEAST_INSIDE
     kept[owner] = True
     kept = _bridge(tets, kept, np.ones(len(kept), dtype=bool))
-    filled = kept_tetrahedra(Tetrahedra(vertices, tets, np.maximum(inside, LEAST_INSIDE)), kept)
+    filled = submesh(Tetrahedra(vertices, tets, np.maximum(inside, LEAST_INSIDE)), kept)
     return _fit(without_debris(filled), indicator)
 
 
@@ -251,7 +251,7 @@ def _fit(filled: Tetrahedra, indicator: Indicator) -> Tetrahedra:
     inside[placed[filled.tets].all(axis=1)] = 1.0
     kept = _bridge(filled.tets, kept, inside > 0)
     moved = Tetrahedra(vertices, filled.tets, np.maximum(inside, LEAST_INSIDE))
-    fitted = without_debris(kept_tetrahedra(moved, kept))
+    fitted = without_debris(submesh(moved, kept))
     if len(fitted.tets) == 0 or face_connected_pieces(fitted.tets).max() != face_connected_pieces(filled.tets).max():
         return filled
     if solid_volumes(fitted).sum() < LEAST_KEPT * solid_volumes(filled).sum():

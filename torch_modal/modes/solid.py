@@ -14,7 +14,7 @@ from torch_modal.modes.eigen import ElasticBody
 from torch_modal.modes.embedding import N_NEIGHBOURS, find_neighbours, fit_weights
 from torch_modal.modes.stiffness import HessianForm, arap_hessian, mass_matrix
 from torch_modal.modes.surface import CanonicalSurface
-from torch_modal.modes.tetrahedra import Mesher, Tetrahedra, kept_tetrahedra, loose_pieces, small_pieces, solid_volumes
+from torch_modal.modes.tetrahedra import Mesher, Tetrahedra, loose_pieces, small_pieces, solid_volumes, submesh
 
 REACH = 2.0
 """Radius of the region that a small piece follows, relative to its distance from the body or its own size."""
@@ -52,7 +52,7 @@ class Solid:
             piece = loose_pieces(tetrahedra)
             bears = np.bincount(piece[neighbours[kernel > 0]], minlength=piece.max() + 1) > 0
             if not bears.all():  # pieces without any point of the surface
-                tetrahedra = kept_tetrahedra(tetrahedra, bears[piece[tetrahedra.tets[:, 0]]])
+                tetrahedra = submesh(tetrahedra, bears[piece[tetrahedra.tets[:, 0]]])
                 neighbours, kernel = find_neighbours(surface.points, tetrahedra, surface.normals)
             return {**tetrahedra.arrays(), "neighbours": neighbours, "kernel": kernel}
 
@@ -93,7 +93,7 @@ def larger_pieces(tetrahedra: Tetrahedra) -> tuple[Tetrahedra, IntArray, sp.csr_
     stays = np.flatnonzero(~small[piece])
     if len(stays) == n:
         return tetrahedra, stays, sp.identity(n, format="csr")
-    kept = kept_tetrahedra(tetrahedra, ~small[of_tets])
+    kept = submesh(tetrahedra, ~small[of_tets])
     rows, weights = [stays], [sp.identity(len(stays), format="csr")]
     for members in (np.flatnonzero(piece == index) for index in np.flatnonzero(small)):
         points = tetrahedra.vertices[members]

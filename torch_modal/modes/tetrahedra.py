@@ -93,7 +93,7 @@ def orient(tetrahedra: Tetrahedra) -> Tetrahedra:
     edges = tetrahedra.vertices[tets[:, 1:]] - tetrahedra.vertices[tets[:, :1]]
     # Volumes at the level of rounding give no usable gradients.
     flat = np.abs(volumes) <= 1e-12 * np.linalg.norm(edges, axis=2).max(axis=1, initial=0.0) ** 3
-    return kept_tetrahedra(Tetrahedra(tetrahedra.vertices, tets, tetrahedra.inside), ~flat)
+    return submesh(Tetrahedra(tetrahedra.vertices, tets, tetrahedra.inside), ~flat)
 
 
 def without_debris(tetrahedra: Tetrahedra) -> Tetrahedra:
@@ -112,7 +112,7 @@ def without_debris(tetrahedra: Tetrahedra) -> Tetrahedra:
     debris = (volumes < SMALL_AMOUNT * volumes.sum()) & (np.bincount(user, hinge, n) > 0)
     if volumes[debris].sum() > MOST_DEBRIS * volumes.sum():
         return tetrahedra
-    return kept_tetrahedra(tetrahedra, ~debris[piece])
+    return submesh(tetrahedra, ~debris[piece])
 
 
 def small_pieces(amounts: NDArray[Any], corners: FloatArray, piece: IntArray) -> BoolArray:
@@ -149,7 +149,7 @@ def face_connected_pieces(tets: IntArray) -> IntArray:
     return connected_pieces(np.stack([owner[:-1][shared], owner[1:][shared]], axis=1), len(tets))
 
 
-def kept_tetrahedra(tetrahedra: Tetrahedra, kept: BoolArray) -> Tetrahedra:
+def submesh(tetrahedra: Tetrahedra, kept: BoolArray) -> Tetrahedra:
     """Submesh of some tetrahedra with their vertices."""
     used, compact = np.unique(tetrahedra.tets[kept], return_inverse=True)
     inside = None if tetrahedra.inside is None else tetrahedra.inside[kept]
