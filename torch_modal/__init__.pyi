@@ -20,6 +20,8 @@ from .data.random_transforms import RandomInBetween as RandomInBetween
 from .data.random_transforms import RandomRigidMotion as RandomRigidMotion
 from .data.samples import Sample as Sample
 from .data.samples import load_sample as load_sample
+from .data.sequence import ShapeSequence as ShapeSequence
+from .data.sequence import load_sequence as load_sequence
 from .data.shape_batch import ShapeBatch as ShapeBatch
 from .data.space import ShapeSpace as ShapeSpace
 from .data.stored import StoredSet as StoredSet

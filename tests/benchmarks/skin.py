@@ -21,8 +21,8 @@ from results import Table, add_keep
 
 import torch_modal as tm
 from torch_modal.data.samples import load_sample
+from torch_modal.data.sequence import read_shapes
 from torch_modal.geometry.inspect import diagonals
-from torch_modal.view.page_input import read_shapes
 
 BONES, TARGETS = 40, 8
 COLUMNS = ["", "a morph target for each frame", f"`bones={BONES}`", f"`targets={TARGETS}`"]

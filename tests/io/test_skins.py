@@ -17,7 +17,7 @@ from textured import bend, textured_glb, textured_obj, triangles_of_tube
 
 import torch_modal as tm
 from torch_modal.cli.main import main
-from torch_modal.view.page_input import read_shapes
+from torch_modal.data.sequence import read_shapes
 
 X, FACES = triangles_of_tube()
 SPIN = Rotation.from_rotvec(np.radians(np.linspace(0, 500, 9))[:, None] * [0, 1, 0])  # beyond a full turn

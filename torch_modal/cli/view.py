@@ -19,7 +19,13 @@ if TYPE_CHECKING:
 def add_arguments(sub: argparse.ArgumentParser) -> None:
     """Add the arguments of ``view``."""
     add = sub.add_argument
-    add("meshes", nargs="+", type=Path, metavar="MESH", help="shapes in their order, a folder, or one GLB")
+    add(
+        "meshes",
+        nargs="+",
+        type=Path,
+        metavar="MESH",
+        help="shapes in their order, a folder, or one animated GLB or NPZ",
+    )
     text = "another sequence of as many shapes, of the same faces; may be given several times"
     add("--compare", nargs="+", type=Path, action="append", default=[], metavar="FILE", help=text)
     add("--linear", action="store_true", help="also show linear interpolation of the key-frames of the first sequence")
@@ -44,7 +50,7 @@ def run(args: argparse.Namespace) -> None:
     indices.
 
     The page is one HTML file that needs no network. Shapes are numbered mesh files, a
-    folder of them, or a GLB that `subdivide` or save_animation wrote.
+    folder or a quoted pattern of them, an animated GLB, or an NPZ with frames and faces.
 
     With --landmarks, they are meshes of any connectivity, side by side, on which vertices
     that belong together are picked, for `register` and `subdivide --register`.
@@ -92,8 +98,8 @@ def _sequences(sequences: list[list[Path]], args: argparse.Namespace) -> tuple[P
     import torch
 
     import torch_modal as tm
+    from torch_modal.data.sequence import read_shapes
     from torch_modal.io.read import require_same_mesh
-    from torch_modal.view.page_input import read_shapes
 
     first, faces, options = read_shapes(sequences[0])
     names, shapes, n = [_sequence_name(paths) for paths in sequences], [first], len(first)

@@ -6,13 +6,20 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from scipy.spatial.transform import Rotation
 
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.errors import MeshError
 from torch_modal.geometry.skin import blend_bones
 from torch_modal.io.asset import Asset, Material, Part, as_png_or_jpeg
-from torch_modal.io.gltf import ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER, WHITE, Document, Json, world_transforms
+from torch_modal.io.gltf import (
+    ARRAY_BUFFER,
+    ELEMENT_ARRAY_BUFFER,
+    WHITE,
+    Document,
+    Json,
+    animated_properties,
+    world_transforms,
+)
 from torch_modal.io.normals import carry_together
 
 _COMPRESSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
@@ -98,44 +105,36 @@ class GltfAsset(Asset):
         self._note("materials", "materials", self.document.get("materials"))
         self._note("posing", " and ".join(name for name, there in posing.items() if there), any(posing.values()))
 
-    def morphs(self) -> FloatArray:
-        """The file's shape, and the shape with each morph target at weight 1. *Shape:* ``(N, V, 3)``."""
-        counts = {len(primitive.json.get("targets", [])) for primitive in self._primitives}
-        if len(counts) > 1:
-            raise ValueError(f"meshes of {sorted(counts)} morph targets")
-        shapes = np.repeat(self.positions[None], 1 + max(counts, default=0), axis=0)
-        for primitive in self._primitives:
-            linear = self._world[primitive.node][:3, :3].T
-            for number, target in enumerate(primitive.json.get("targets", []), start=1):
-                moved = self.positions[primitive.points]
-                if "POSITION" in target:
-                    moved = moved + self.document.floats(target["POSITION"]) @ linear
-                shapes[number, primitive.points] = moved
-        return shapes
+    def key_times(self) -> FloatArray:
+        """Times of all keys of the first animation, in seconds; none without one. *Shape:* ``(n,)``, ascending."""
+        return np.unique([time for track in animated_properties(self.document).values() for time in track.times])
 
-    def play(self) -> FloatArray:
-        """Shapes at the key times of an animation that this package wrote. *Shape:* ``(T, V, 3)``."""
-        document, (animation,) = self.document, self.document.get("animations")
-        tracks = [document.floats(sampler["output"]) for sampler in animation["samplers"]]
-        if not document.get("skins"):
-            first, *others = self.morphs()
-            return first + np.tensordot(tracks[0].reshape(-1, len(others)), np.array(others) - first, 1)
-        half = len(tracks) // 2  # rotations of the root and the joints, then their translations
-        local = np.tile(np.eye(4), (half, len(tracks[0]), 1, 1))
-        local[..., :3, :3] = [Rotation.from_quat(track).as_matrix() for track in tracks[:half]]
-        local[..., :3, 3] = tracks[half:]
-        frames = np.empty((local.shape[1], *self.positions.shape))
+    def play(self, times: FloatArray) -> FloatArray:
+        """Shapes of the first animation, as players show them. *Shape:* ``(T,) -> (T, V, 3)``."""
+        document = self.document
+        moved = {key: track.sample(times) for key, track in animated_properties(document).items()}
+        worlds = world_transforms(document, moved)
+        frames = np.empty((len(times), *self.positions.shape))
         for primitive in self._primitives:
-            skin = document.get("skins", document.get("nodes", primitive.node)["skin"])
-            read = primitive.json["attributes"]
-            inverse = document.floats(skin["inverseBindMatrices"]).reshape(-1, 1, 4, 4).swapaxes(2, 3)
-            bones = (local[0] @ local[1:] @ inverse)[:, :, :3].swapaxes(0, 1)
-            joints, weights = document.accessor(read["JOINTS_0"]), document.floats(read["WEIGHTS_0"])
-            points = document.floats(read["POSITION"])
-            by_bone = np.zeros((len(points), half - 1))
-            np.add.at(by_bone, (np.arange(len(points))[:, None], joints), weights)
-            arrays = (by_bone, bones, np.repeat(points[None], len(bones), axis=0))
-            frames[:, primitive.points] = blend_bones(*map(torch.from_numpy, arrays)).numpy()
+            node, read = document.get("nodes", primitive.node), primitive.json["attributes"]
+            points = np.repeat(document.floats(read["POSITION"])[None], len(times), axis=0)
+            if targets := primitive.json.get("targets"):
+                mesh = document.get("meshes", node["mesh"])
+                still = np.tile(node.get("weights", mesh.get("weights", [0.0] * len(targets))), (len(times), 1))
+                offsets = [document.floats(one["POSITION"]) if "POSITION" in one else 0 * points[0] for one in targets]
+                points += np.tensordot(moved.get((primitive.node, "weights"), still), np.stack(offsets), 1)
+            bones, by_bone = worlds[primitive.node].reshape(-1, 1, 4, 4), np.ones((points.shape[1], 1))
+            if "skin" in node:
+                skin = document.get("skins", node["skin"])
+                bones = np.stack([np.broadcast_to(worlds[n], (len(times), 4, 4)) for n in skin["joints"]], axis=1)
+                if "inverseBindMatrices" in skin:
+                    bones = bones @ document.floats(skin["inverseBindMatrices"]).reshape(-1, 4, 4).swapaxes(1, 2)
+                by_bone = np.zeros((points.shape[1], bones.shape[1]))
+                for joints in [name for name in read if name.startswith("JOINTS_")]:
+                    shares = document.floats(read[joints.replace("JOINTS", "WEIGHTS")])
+                    np.add.at(by_bone, (np.arange(len(by_bone))[:, None], document.accessor(read[joints])), shares)
+            affine = np.broadcast_to(bones[:, :, :3], (len(times), *bones.shape[1:2], 3, 4)).copy()
+            frames[:, primitive.points] = blend_bones(*map(torch.from_numpy, (by_bone, affine, points))).numpy()
         return frames
 
     # ------------------------------------------------------------------------------------------------ the file again
