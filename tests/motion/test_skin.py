@@ -57,8 +57,10 @@ def test_shapes_are_those_of_the_definition(generator: torch.Generator) -> None:
         expected += skin.weights[:, j, None] * (skin.rest @ turn.mT + shift[:, None])
     torch.testing.assert_close(skin.shapes(), expected)
     diagonal = float((frames[0].amax(0) - frames[0].amin(0)).norm())
-    off = torch.cat([expected - frames, _halfway_errors(skin, frames)]).square().sum(-1).mean().sqrt()
-    assert skin.error == pytest.approx(float(off) / diagonal)
+    at, between = (x.square().sum(-1).mean() for x in (expected - frames, _halfway_errors(skin, frames)))
+    assert skin.error_at_frames == pytest.approx(float(at.sqrt()) / diagonal)
+    assert skin.error_between_frames == pytest.approx(float(between.sqrt()) / diagonal)
+    assert skin.error == pytest.approx(float((0.5 * (at + between)).sqrt()) / diagonal)
     assert torch.equal(skin.rest, frames[0])
     assert (skin.weights >= 0).all() and ((skin.weights > 0).sum(1) <= 3).all()
     torch.testing.assert_close(skin.weights * 65_535, (skin.weights * 65_535).round(), atol=1e-6, rtol=0)
@@ -133,7 +135,7 @@ def test_errors_half_way_between_frames_by_hand() -> None:
     frames = BENT[0] @ turns.mT + torch.tensor([[[0.0, 0, 0]], [[5, 0, 0]], [[5, 5, 0]]])
     maps = torch.eye(4, dtype=torch.float64).repeat(3, 1, 1, 1)
     maps[:, 0, :3, :3], maps[1:, 0, 0, 3], maps[2, 0, 1, 3] = turns, 5, 5
-    skin = tm.Skin(BENT[0], torch.ones(len(X), 1, dtype=torch.float64), maps, 0.0)
+    skin = tm.Skin(BENT[0], torch.ones(len(X), 1, dtype=torch.float64), maps, 0.0, 0.0)
     assert _halfway_errors(skin, frames).abs().max() < 1e-9
     wrong = skin.transforms.clone()
     wrong[2, 0, 2, 3] += 0.5

@@ -97,10 +97,13 @@ def bake(
         transforms = torch.eye(4, dtype=torch.float64).repeat(*made.shape[:2], 1, 1)
         transforms[..., :3, :3] = made[..., :3]
         transforms[..., :3, 3] = made[..., 3] * diagonal + after - made[..., :3] @ after[0, 0]
-        fitted = Skin(like[0], weights[copies].to(like), transforms.to(like), 0.0, when)
-        off = fitted.shapes().double().cpu() - torch.from_numpy(shapes)
-        off = torch.cat([off, _halfway_errors(fitted, torch.from_numpy(shapes))]).square().sum(-1).mean().sqrt()
-        return replace(fitted, error=float(off) / diagonal)
+        fitted = Skin(like[0], weights[copies].to(like), transforms.to(like), 0.0, 0.0, when)
+        off = (
+            fitted.shapes().double().cpu() - torch.from_numpy(shapes),
+            _halfway_errors(fitted, torch.from_numpy(shapes)),
+        )
+        at, between = (float(x.square().sum(-1).mean().sqrt()) / diagonal for x in off)
+        return replace(fitted, error_at_frames=at, error_between_frames=between)
 
     best = skin(bones)
     low, high = 0, best.weights.shape[1]
@@ -253,7 +256,10 @@ def _frame_rotations(x: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
     """
     parts = weights / weights.sum(0).clamp_min(TINY)
     centres = parts.mT @ x
-    moments = torch.einsum("vj,tva,vb->tjab", parts, x, x[0]) - centres[..., None] * centres[0, :, None]
+    sums = x.mT.flatten(0, 1) @ (parts[:, :, None] * x[0, :, None]).flatten(1)
+    moments = (
+        sums.unflatten(1, (-1, 3)).unflatten(0, (-1, 3)).transpose(1, 2) - centres[..., None] * centres[0, :, None]
+    )
     width = moments[0].diagonal(dim1=1, dim2=2).sum(1)[:, None, None]
     turns = best_rotation(moments + THIN * width * torch.eye(3).to(x))
     return turns[1:] @ turns[:-1].mT, centres
