@@ -5,7 +5,8 @@
 
 Pages are names such as ``quality`` or ``README``; without one, all. With ``--run`` the command of each table runs and
 keeps its results, one after the other; then the pages are written. ``TORCH_MODAL_PEER_PYTHON`` names a Python that has
-morphomatics, where this one has not; without it, a new run has no results of that.
+morphomatics, where this one has not; without it, a new run has no results of that. The table of skins needs
+py-dem-bones here.
 """
 
 import argparse

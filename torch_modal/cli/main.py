@@ -12,7 +12,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
-from torch_modal.cli import bases, commands, complete, demo, subdivide, view
+from torch_modal.cli import bake, bases, commands, complete, demo, subdivide, view
 from torch_modal.version import __version__
 
 PROGRAM = "torch-modal"
@@ -28,11 +28,13 @@ start here:
   torch-modal demo                                        try it on the samples that come with it
   torch-modal subdivide a.obj b.obj --out between.glb     from your meshes to an animation
   torch-modal subdivide a.obj scan.ply --register --out between.glb   of different connectivity
+  torch-modal bake frames/*.obj --bones 40 --out x.glb                from a sequence to one file
   torch-modal complete a.obj scans/*.ply --out motion.glb             from scans and a template
   torch-modal subdivide --help                            all that can be set"""
 
 COMMANDS: dict[str, tuple[Callable[[Any], None], Callable[[Any], int | None]]] = {
     "subdivide": (subdivide.add_arguments, subdivide.run),
+    "bake": (bake.add_arguments, bake.run),
     "complete": (complete.add_arguments, complete.run),
     "register": (commands.add_register, commands.register),
     "check": (commands.add_check, commands.check),

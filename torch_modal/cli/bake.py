@@ -1,0 +1,116 @@
+"""``torch-modal bake``: from a sequence of meshes to one file that plays."""
+
+import argparse
+from pathlib import Path
+
+from torch_modal.cli.arguments import (
+    add_common,
+    add_registration,
+    check_output,
+    file_name,
+    number,
+    register_options,
+    reporter,
+)
+from torch_modal.io.formats import ANIMATION_FORMATS
+
+
+def add_arguments(sub: argparse.ArgumentParser) -> None:
+    """Add the arguments of ``bake``."""
+    add, positive = sub.add_argument, number(float, 0, above=True)
+    text = (
+        "meshes in their order, a folder or a quoted pattern of them, an animated GLB, or an NPZ with frames and faces"
+    )
+    add("meshes", nargs="+", type=Path, metavar="MESH", help=text)
+    text = f"the file: {', '.join(ANIMATION_FORMATS)}"
+    add("--out", type=file_name(ANIMATION_FORMATS), required=True, metavar="FILE", help=text)
+    text = "GLB: a skin of at most N bones, four for each vertex, for engines (40 are usual)"
+    add("--bones", type=number(int, 1), metavar="N", help=text)
+    add("--targets", type=number(int, 1), metavar="N", help="GLB: N principal shapes as the only morph targets")
+    add("--fps", type=positive, metavar="X", help="frames a second (default: as in the file, or 24)")
+    add("--cyclic", action="store_true", help="the last frame leads on to the first")
+    text = "take out trembling: what has a period of X frames is halved, what is slower hardly changes"
+    add("--smooth", type=positive, metavar="X", help=text)
+    text = "keep each N-th frame and the last as key-frames, and fill in a smooth path through them"
+    add("--every", type=number(int, 2), metavar="N", help=text)
+    add("--register", action="store_true", help="the meshes have different connectivity: lay the first onto the others")
+    add_registration(sub)
+    add_common(sub)
+
+
+def run(args: argparse.Namespace) -> None:
+    """Make one animated or skinned file of a sequence of meshes.
+
+    Write the frames of a motion as one file that plays: as a skin of bones, as principal
+    shapes, as a morph target for each frame, as USD, a point cache or a video.
+
+    Errors are root mean square distances from the frames that were read, in % of the diagonal
+    of the first. Materials and textures come from the first mesh.
+
+    Examples:
+      a skin for engines, of a hundred meshes:
+        torch-modal bake frames/*.obj --bones 40 --fps 24 --out motion.glb
+      the animation of another program, without trembling, as a video:
+        torch-modal bake walk.glb --smooth 4 --out walk.mp4
+      scans of different connectivity:
+        torch-modal bake "scans/*.ply" --register --bones 40 --out motion.glb
+    """
+    if (args.landmarks or args.across) and not args.register:
+        args.fail("--landmarks and --across are for --register")
+    if (args.bones or args.targets) and (args.out.suffix.lower() != ".glb" or (args.bones and args.targets)):
+        args.fail("--bones and --targets are two forms of a .glb file; take one of them")
+
+    import torch
+
+    import torch_modal as tm
+    from torch_modal.data.sequence import sequence_files, smooth_in_time
+    from torch_modal.view.animation import require_packages
+
+    files, report = sequence_files(args.meshes), reporter(args)
+    check_output([args.out], files, args.overwrite)
+    require_packages(args.out)
+    registration = {"register": args.register, **register_options(args), "report": report}
+    given, faces, fps = tm.load_sequence(files, args.fps, **registration)
+    n = len(given)
+    if n < 2:
+        raise ValueError(f"{files[0]} is one shape; a motion has two frames or more: name more meshes, or a folder")
+    report(f"{n} frames of {given.shape[1]} vertices, {fps:g} a second")
+    frames = smooth_in_time(given, args.smooth, args.cyclic) if args.smooth else given
+    kept = [*range(0, n - 1, args.every), *([n - 1] * (not args.cyclic))] if args.every else list(range(n))
+    if args.every:
+        welded = tm.weld_seams(frames, faces)
+        keyframes = welded.keyframes[kept]
+        path = tm.Path(keyframes, welded.faces, kept + [n] * args.cyclic, args.cyclic)
+        with torch.no_grad():
+            frames = welded.scatter(path(keyframes, torch.arange(n)))
+    skin = tm.bake(frames, faces, args.bones) if args.bones else None
+    asset = None if files[0].suffix.lower() == ".npz" else tm.open_asset(files[0])
+    if asset is not None:
+        asset.carries.pop("posing", None)  # it is what is written
+    tm.save_animation(
+        frames,
+        faces,
+        args.out,
+        fps,
+        cyclic=args.cyclic,
+        overwrite=args.overwrite,
+        asset=asset,
+        bones=skin,
+        targets=args.targets,
+        progress=False if args.quiet else None,
+    )
+    bones = f", {skin.weights.shape[1]} bones" if skin else ""
+    report(f"animation: {args.out}, {args.out.stat().st_size / 1e6:.2f} MB{bones}")
+    shown = frames.clone()
+    if args.out.suffix.lower() == ".glb":  # as it plays; the file has a point for each corner of a texture
+        parts = asset.parts() if asset else []
+        points = torch.cat([torch.from_numpy(part.vertices) for part in parts]) if parts else slice(None)
+        shown[:, points] = tm.load_sequence(args.out, fps).frames[:n]
+    used = given[0, faces.unique()]
+    off = (shown - given).square().sum(-1).mean(1) / (used.amax(0) - used.amin(0)).square().sum()
+    error = f"error:     {100 * off[kept].mean().sqrt():.3f} % at the {'key-' * bool(args.every)}frames"
+    if left := sorted({*range(n)} - {*kept}):
+        error += f", {100 * off[left].mean().sqrt():.3f} % at the {len(left)} frames between them"
+    elif skin:
+        error += f", {100 * skin.error_between_frames:.3f} % half-way between them"
+    report(error)
