@@ -19,7 +19,6 @@ from make_samples import gesture, sculpted
 from torch import Tensor
 
 import torch_modal as tm
-from torch_modal.geometry.rigid import best_fit
 
 N_GIVEN, N_TEST, N_STEPS = 6, 24, 1500
 
@@ -29,9 +28,9 @@ def nearest(made: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
 
     *Shape:* ``(N, V, 3), (M, V, 3) -> (M, V, 3), (M,)``.
     """
-    found, masses = [], torch.ones(made.shape[1]).to(made)
+    found = []
     for x in truth:
-        moved = best_fit(made, x.expand_as(made), masses).apply(made)
+        moved = tm.align(made, x)
         found.append(moved[(moved - x).norm(dim=-1).mean(1).argmin()])
     shapes = torch.stack(found)
     return shapes, (shapes - truth).norm(dim=-1).mean(1)
@@ -40,7 +39,7 @@ def nearest(made: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
 def next_round(given: Tensor, made: Tensor, generator: torch.Generator) -> Tensor:
     """As many shapes again, by an auto-decoder of what was made. *Shape:* ``(K, V, 3), (N, V, 3) -> (N, V, 3)``."""
     shapes = torch.cat([given, made])
-    shapes = best_fit(shapes, given[0].expand_as(shapes), torch.ones(shapes.shape[1]).to(shapes)).apply(shapes)
+    shapes = tm.align(shapes, given[0])
     decoder, codes = autodecoder.train(shapes, torch.eye(len(shapes)), len(given), N_STEPS, None)
     i, j = torch.randint(len(codes), (2, len(made)), generator=generator)
     amounts = 2 * torch.rand(len(made), 1, generator=generator) - 0.5

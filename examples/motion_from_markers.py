@@ -133,9 +133,7 @@ def by_amplitudes(known: Problem, steps: int) -> tuple[Tensor, Tensor]:
 def by_pca(known: Problem) -> Tensor:
     """Mean and components of the key-frames, with their deviations as the prior, and a rigid motion, alternately."""
     keyframes = known.frames[known.keys]
-    shapes = best_fit(keyframes, keyframes[:1].expand_as(keyframes), torch.ones(keyframes.shape[1]).double()).apply(
-        keyframes
-    )
+    shapes = tm.align(keyframes, keyframes[0])
     mean = shapes.mean(0)
     _, s, vh = torch.linalg.svd((shapes - mean).flatten(1), full_matrices=False)
     n = len(shapes) - 1
@@ -147,7 +145,7 @@ def by_pca(known: Problem) -> Tensor:
         c = torch.zeros(n, dtype=torch.float64)
         for _ in range(20):
             x = mean + torch.tensordot(c, components, 1)
-            back = best_fit(wanted, x[rows], torch.ones(len(rows)).double())
+            back = best_fit(wanted, x[rows])
             apart = (back.apply(wanted) - mean[rows]).flatten()
             ridge = (NOISE * known.diagonal) ** 2 / 3 * torch.eye(n, dtype=torch.float64)
             c = torch.linalg.solve(own.mT @ own + ridge, own.mT @ apart)

@@ -37,17 +37,16 @@ def markers(x: Tensor) -> Tensor:
 
 def linear_fit(poses: Tensor, points: Tensor, vertices: Tensor) -> Tensor:
     """The pose of the linear span, moved rigidly, that meets points. *Shape:* ``(K, V, 3) -> (V, 3)``."""
-    count = torch.ones(len(points)).to(points)
-    poses = best_fit(poses[:, vertices], points.expand(len(poses), -1, -1), count).apply(poses)
+    poses = best_fit(poses[:, vertices], points).apply(poses)
     mean, off = poses.mean(0), poses - poses.mean(0)
     columns = off[:, vertices].flatten(1).mT
     size = float((mean.amax(0) - mean.amin(0)).norm())
     system = columns.mT @ columns + N_MARKERS * (RIDGE * size) ** 2 * torch.eye(len(poses)).to(poses)
     x = mean
     for _ in range(20):
-        wanted = best_fit(x[vertices], points, count).inverse().apply(points) - mean[vertices]
+        wanted = tm.align(points, x[vertices]) - mean[vertices]
         x = mean + torch.einsum("k,kvc->vc", torch.linalg.solve(system, columns.mT @ wanted.flatten()), off)
-    return best_fit(x[vertices], points, count).apply(x)
+    return best_fit(x[vertices], points).apply(x)
 
 
 def draw_members(poses: Tensor, members: Tensor, faces: Tensor, view: tuple[float, float] | None, out: Path) -> None:

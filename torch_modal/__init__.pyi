@@ -37,6 +37,7 @@ from .elastic.term import PeriodicTerm as PeriodicTerm
 from .elastic.term import Term as Term
 from .errors import MeshError as MeshError
 from .errors import MeshWarning as MeshWarning
+from .geometry.rigid import align as align
 from .geometry.skin import Skin as Skin
 from .geometry.vectors import vertex_normals as vertex_normals
 from .inbetween.results import ConvergenceError as ConvergenceError

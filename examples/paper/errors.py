@@ -3,8 +3,8 @@
 import torch
 from torch import Tensor
 
+import torch_modal as tm
 from torch_modal.geometry.connectivity import Connectivity
-from torch_modal.geometry.rigid import best_fit
 
 
 def lengths(x: Tensor, faces: Tensor) -> Tensor:
@@ -21,9 +21,8 @@ def edge_error(x: Tensor, truth: Tensor, faces: Tensor) -> float:
 
 def vertex_error(x: Tensor, truth: Tensor) -> float:
     """Mean distance after the best rigid motion of each, in per cent of the diagonal. *Shape:* ``(T, V, 3)``."""
-    weights = torch.ones(x.shape[-2], dtype=x.dtype)
     diagonal = (truth.amax(-2) - truth.amin(-2)).norm(dim=-1).mean()
-    return 100 * float((best_fit(x, truth, weights).apply(x) - truth).norm(dim=-1).mean() / diagonal)
+    return 100 * float((tm.align(x, truth) - truth).norm(dim=-1).mean() / diagonal)
 
 
 def percents(*errors: float) -> list[str]:

@@ -18,7 +18,6 @@ from results import Table, wanted
 from torch import Tensor
 
 import torch_modal as tm
-from torch_modal.geometry.rigid import best_fit
 
 COLUMNS = ["", "edge error", "vertex error", "leg off", "thinnest"]
 CHECK = "torch_modal"
@@ -47,7 +46,7 @@ def turned(body: Biped, x: Tensor, truth: Tensor) -> float:
     members = np.flatnonzero(body.bone == list(body.bones).index("tarsus-left"))
     along = (body.rest[members] - bone.head) @ np.subtract(bone.tail, bone.head)
     parts = np.array_split(members[np.argsort(along)], 4)
-    laid = best_fit(x, truth, torch.ones(x.shape[1], dtype=x.dtype)).apply(x)
+    laid = tm.align(x, truth)
     here, there = (y[:, parts[-1]].mean(1) - y[:, parts[0]].mean(1) for y in (laid, truth))
     return float(torch.rad2deg(torch.acos(torch.cosine_similarity(here, there, dim=-1))).amax())
 

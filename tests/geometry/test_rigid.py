@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
 from torch.autograd import gradcheck, gradgradcheck
 
+import torch_modal as tm
 from torch_modal.geometry.rigid import RigidMotion, best_fit, best_rotation, blend, centroid, signed_volumes
 from torch_modal.geometry.rotations import exp
 
@@ -46,6 +47,29 @@ def test_recovers_a_known_motion(cloud: Tensor, weights: Tensor, angle: float) -
     torch.testing.assert_close(fit.rotation, rotation, atol=1e-13, rtol=0)
     torch.testing.assert_close(fit.apply(cloud), moved, atol=1e-12, rtol=0)
     torch.testing.assert_close(fit.inverse().apply(moved), cloud, atol=1e-12, rtol=0)
+
+
+def test_aligned_shapes_broadcast_and_have_gradients(
+    cloud: Tensor, weights: Tensor, generator: torch.Generator
+) -> None:
+    turns = torch.stack([random_rotation(generator) for _ in range(6)]).view(2, 3, 3, 3)
+    moved = cloud @ turns.mT + torch.randn(2, 3, 1, 3, dtype=torch.float64, generator=generator)
+    torch.testing.assert_close(tm.align(moved, cloud), cloud.expand_as(moved))
+    torch.testing.assert_close(tm.align(cloud, moved), moved)
+    spoilt = moved.clone()
+    spoilt[..., :5, :] += 3
+    torch.testing.assert_close(tm.align(cloud, spoilt, torch.arange(40) >= 5), moved)
+    noisy = moved[0] + torch.randn(3, 40, 3, dtype=torch.float64, generator=generator)
+    small = (cloud[::8].clone().requires_grad_(), noisy[:, ::8].clone().requires_grad_())
+    assert gradcheck(lambda x, y: tm.align(x, y, weights[::8]), small) and gradgradcheck(tm.align, small)
+    for x, y, one in (
+        (cloud, cloud[1:], None),
+        (cloud[:, :2], cloud[:, :2], None),
+        (cloud.float(), cloud, None),
+        (cloud, cloud, weights[1:]),
+    ):
+        with pytest.raises(ValueError, match=r"must (be|have shape) \("):
+            tm.align(x, y, one)
 
 
 @pytest.mark.parametrize("noise", [0.01, 1.0, 30.0])

@@ -78,6 +78,8 @@ class TestComponents:
         found = components.coordinates(bars.keyframes)
         assert found.shape == (3, 2)
         back = components.shapes(found)
+        torch.testing.assert_close(components.shapes(found, like=bars.keyframes), tm.align(back, bars.keyframes))
+        torch.testing.assert_close(components.shapes(found[0], bars.keyframes[0]), tm.align(back[0], bars.keyframes[0]))
         assert max(far(x, y) for x, y in zip(back, bars.keyframes, strict=True)) < 1e-9
         torch.testing.assert_close(found.var(0), components.variances)
         assert float(components.shares.sum()) == pytest.approx(1)

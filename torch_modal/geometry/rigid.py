@@ -103,6 +103,30 @@ def best_fit(x: Tensor, y: Tensor, weights: Tensor | None = None) -> RigidMotion
     return RigidMotion(best_rotation(centred_y.mT @ centred_x), source, target)
 
 
+def align(x: Tensor, y: Tensor, weights: Tensor | None = None) -> Tensor:
+    """Move shapes rigidly onto others, by the rotation and translation of least squared distance (Kabsch).
+
+    Gradients, also second ones, reach both shapes. Reflections are left out.
+
+    Args:
+        x: Shapes to move. *Shape:* ``(..., V, 3)``.
+        y: Where they go, the same vertices. Leading dimensions broadcast. *Shape:* ``(..., V, 3)``.
+        weights: Weight of each vertex, such as its area; zero leaves it out. Equal by default. *Shape:* ``(V,)``.
+
+    Returns:
+        The moved shapes. *Shape:* ``(..., V, 3)``.
+
+    Raises:
+        ValueError: The shapes do not have the same vertices or dtype, or the weights do not fit.
+    """
+    if x.dim() < 2 or x.shape[-2:] != (x.shape[-2], 3) or x.shape[-2:] != y.shape[-2:] or x.dtype != y.dtype:
+        got = ", ".join(f"{tuple(shape.shape)} of {shape.dtype}" for shape in (x, y))
+        raise ValueError(f"x and y must be (..., V, 3) of equal V and dtype; got {got}")
+    if weights is not None and weights.shape != x.shape[-2:-1]:
+        raise ValueError(f"weights must have shape ({x.shape[-2]},), one for each vertex; got {tuple(weights.shape)}")
+    return best_fit(x, y, None if weights is None else weights.to(x)).apply(x)
+
+
 def blend(x: Tensor, y: Tensor, t: Tensor, weights: Tensor) -> Tensor:
     """Interpolate two shapes, at 0 and 1: linear in the shape, geodesic in the rigid motion.
 

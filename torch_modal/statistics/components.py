@@ -4,6 +4,7 @@ import torch
 from torch import Tensor
 
 from torch_modal.autograd import outside_inference_mode
+from torch_modal.geometry.rigid import align
 from torch_modal.keyframes.arrays import check_tensor
 from torch_modal.statistics.variation import Variation
 
@@ -43,13 +44,15 @@ class Components:
         values = torch.einsum("bjf,njf->bn", off, self.directions)
         return values.view(*shapes.shape[:-2], len(self)).to(shapes)
 
-    def shapes(self, coordinates: Tensor) -> Tensor:
-        """The shapes of coordinates, in the pose of the mean; zeros give the average of rotations and strains.
+    def shapes(self, coordinates: Tensor, like: Tensor | None = None) -> Tensor:
+        """The shapes of coordinates; zeros give the average of rotations and strains.
 
-        *Shape:* ``(..., n) -> (..., V, 3)``.
+        They have the pose of the mean, or are moved rigidly onto shapes ``like``, *shape* ``(V, 3)`` or
+        ``(..., V, 3)``, by :func:`torch_modal.align`. *Shape:* ``(..., n) -> (..., V, 3)``.
         """
         check_tensor("coordinates", coordinates, "...", "n")
         flat = coordinates.reshape(coordinates.shape[:-1].numel(), coordinates.shape[-1]).to(self.directions)
         bending = self._average + torch.einsum("bn,njf->bjf", flat, self.directions[: flat.shape[1]])
         shapes = self._coordinates.shapes(bending) + self._origin
-        return shapes.view(*coordinates.shape[:-1], *shapes.shape[1:]).to(coordinates)
+        shapes = shapes.view(*coordinates.shape[:-1], *shapes.shape[1:])
+        return (shapes if like is None else align(shapes, like.to(shapes))).to(coordinates)
