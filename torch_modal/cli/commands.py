@@ -1,6 +1,7 @@
 """Commands on meshes: ``register``, ``check`` and ``carry`` of ``torch-modal``."""
 
 import argparse
+import time
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -61,6 +62,9 @@ def add_check(sub: argparse.ArgumentParser) -> None:
     add = sub.add_argument
     add("meshes", nargs="+", type=Path, metavar="MESH", help="meshes of one connectivity")
     add("--keyframes", nargs="+", type=Path, default=[], metavar="FILE", help="meshes whose own crossings are known")
+    text = "check the motion through the meshes: seven shapes between any two, with its shell energy and seconds"
+    add("--between", action="store_true", help=text)
+    add("--contact", action="store_true", help="with --between: keep parts from passing through each other")
     text = "draw the meshes with crossings in colour, as .png or .pdf"
     add("--picture", type=file_name(PICTURES), metavar="FILE", help=text)
     add_common(sub, "replace the picture if it exists (default: refuse)", cache_dir=None)
@@ -76,14 +80,23 @@ def check(args: argparse.Namespace) -> int:
     two parts that went through each other, not crossings that grew or folds. Without, all
     are new.
 
+    With --between, shapes between the meshes are computed and checked too; crossings of the
+    meshes themselves are then known. The shell energy of the motion, of n steps, is n times
+    the sum of ShellLoss from each shape to the next: free of units, and less is better.
+
     exit status: 0 nothing passes through anything far, 3 something does
 
     Examples:
       torch-modal check open.obj fist.obj
+      torch-modal check open.obj fist.obj --between --contact
       torch-modal check out/frame-*.obj --keyframes open.obj fist.obj --picture crossings.png
     """
     if args.picture:
         check_output([args.picture], [*args.meshes, *args.keyframes], args.overwrite)
+    if args.contact and not args.between:
+        args.fail("--contact is for the shapes that --between computes")
+    if args.between and len(args.meshes) < 2:
+        args.fail("--between needs two meshes or more")
     from torch_modal.geometry.crossings import require_contact
 
     require_contact()
@@ -94,20 +107,33 @@ def check(args: argparse.Namespace) -> int:
     shapes, faces = tm.load_keyframes([*args.keyframes, *args.meshes])
     welded = tm.weld_seams(shapes, faces)
     keyframes, shapes = welded.keyframes[:n], welded.keyframes[n:]
+    names, motion = [str(mesh) for mesh in args.meshes], ""
+    if args.between:
+        keyframes, places, n = welded.keyframes, tm.keyframe_places(len(names), 3), len(welded.keyframes)
+        started = time.perf_counter()
+        frames = tm.subdivide(shapes, welded.faces, 3, contact=args.contact, progress=False if args.quiet else None)
+        seconds, shell = time.perf_counter() - started, tm.losses.ShellLoss(welded.faces)
+        ours, linear = (
+            float((len(x) - 1) * shell(x[1:], x[:-1]).sum()) for x in (frames, tm.linear_sequence(shapes, places))
+        )
+        motion = f"shell energy of the motion: {ours:.4g}, of linear interpolation: {linear:.4g}; {seconds:.1f} s"
+        names, shapes = [f"t = {i / 8:g}" for i in range(len(frames))], frames
     contacts = tm.self_contacts(shapes, welded.faces, keyframes if n else None)
     used = shapes[0][welded.faces.unique()]
     diagonal = float((used.amax(0) - used.amin(0)).norm())
     columns = {"pairs": contacts.number, **({"new": contacts.n_new} if n else {}), "far": contacts.n_far}
-    width = max(len(str(mesh)) for mesh in args.meshes)
+    width = max(map(len, names))
     report(" " * width + "".join(f"{name:>9s}" for name in (*columns, "depth")))
-    for i, mesh in enumerate(args.meshes):
+    for i, name in enumerate(names):
         deepest = 100 * float(contacts.depth[i].max()) / diagonal
-        report(f"{mesh!s:{width}s}" + "".join(f"{int(c[i]):9d}" for c in columns.values()) + f"{deepest:7.2f} %")
+        report(f"{name:{width}s}" + "".join(f"{int(c[i]):9d}" for c in columns.values()) + f"{deepest:7.2f} %")
     report(
         "pairs of triangles that cross; far: of two parts that went through each other"
         + (", and cross in no key-frame" if n else "")
         + "; depth: of the deepest vertex there, in % of the diagonal"
     )
+    if motion:
+        report(motion)
     if args.picture:
         marks = shapes.new_zeros(shapes.shape[:2])  # of each vertex: 0, 1 for a crossing, 2 for a new one
         for value, chosen in ((1.0, slice(None)), (2.0, contacts.new)):
@@ -116,7 +142,7 @@ def check(args: argparse.Namespace) -> int:
             {"crossings": shapes},
             welded.faces,
             args.picture,
-            columns=min(len(args.meshes), 8),
+            columns=min(len(names), 8),
             keyframe_indices=[0],
             colors={"crossings": marks},
             color_label="1: crosses, 2: new" if n else "2: crosses",
