@@ -276,10 +276,10 @@ def test_notebooks_are_small_and_were_run(path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_notebooks_run(path: Path) -> None:
-    """From end to end; each asserts what it shows in its last cell."""
+def test_notebooks_run(path: Path, tmp_path: Path) -> None:
+    """From end to end, in a folder without the repository; each asserts what it shows in its last cell."""
     notebook = nbformat.read(path, as_version=4)
-    NotebookClient(notebook, timeout=600, resources={"metadata": {"path": str(path.parent)}}).execute()
+    NotebookClient(notebook, timeout=600, resources={"metadata": {"path": str(tmp_path)}}).execute()
 
 
 # ------------------------------------------------------------------------------------------------------------ site
