@@ -14,7 +14,7 @@ python=$root/.venv/bin/python
 
 if [ ! -e "$root/.venv" ]; then
     found=
-    for candidate in ${PYTHON:+"$PYTHON"} python3 python3.13 python3.12 python3.11 python3.10 python; do
+    for candidate in ${PYTHON:+"$PYTHON"} python3 python3.14 python3.13 python3.12 python3.11 python3.10 python; do
         if is_recent "$candidate"; then
             found=$candidate
             break

@@ -293,10 +293,12 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
         shutil.copy(ROOT / name, root)
     (root / "docs" / "added.md").write_text("# A page that nobody listed\n\nSee [the layer](layer.md#gradients).\n")
     (root / "tests" / "environment.sh").write_text(f"python='{sys.executable}'\n")  # is there already
-    command = ["sh", str(root / "docs" / "build.sh"), "--quiet"]
+    command = ["sh", str(root / "docs" / "build.sh"), "--version", "--quiet"]
     done = subprocess.run(command, cwd=root, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stdout[-5000:] + done.stderr[-5000:]
-    return root / "out" / "docs"
+    pages = root / "out" / "docs" / tm.__version__
+    assert f'href="{tm.__version__}/index.html"' in (pages.parent / "index.html").read_text()
+    return pages
 
 
 @pytest.mark.slow

@@ -47,7 +47,7 @@ def test_twine_and_check_wheel_contents_pass(built: Path) -> None:
 def test_metadata_of_the_wheel(metadata: email.message.Message) -> None:
     assert metadata["Author"] == "torch_modal contributors"
     classifiers = metadata.get_all("Classifier") or []
-    assert {f"Programming Language :: Python :: 3.{minor}" for minor in (10, 11, 12, 13)} <= set(classifiers)
+    assert {f"Programming Language :: Python :: 3.{minor}" for minor in (10, 11, 12, 13, 14)} <= set(classifiers)
     assert {url.split(",")[0] for url in metadata.get_all("Project-URL") or []} >= {
         "Changelog",
         "Documentation",
