@@ -1,5 +1,7 @@
-"""The add-on for Blender against a fake of the calls that it makes."""
+"""The extension for Blender: against a fake of the calls that it makes, and in Blender where bpy is installed."""
 
+import re
+import subprocess
 import sys
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -10,6 +12,7 @@ import torch
 from conftest import Shapes
 from test_examples import load_example
 
+EXTENSION = Path(__file__).parents[2] / "examples" / "blender" / "in_between_keys"
 PROGRAM = str(Path(sys.executable).with_name("torch-modal"))
 
 
@@ -61,9 +64,9 @@ def addon(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     )
     fake.utils = SimpleNamespace(register_class=registered.append, unregister_class=registered.remove)
     monkeypatch.setitem(sys.modules, "bpy", fake)
-    found = load_example("blender/in_between_keys")
+    found = load_example("blender/in_between_keys/__init__")
     found.register()
-    assert len(registered) == 2 and len(menu) == 1
+    assert len(registered) == 3 and len(menu) == 1
     found.unregister()
     assert not registered and not menu
     return found
@@ -76,10 +79,12 @@ def run(addon: ModuleType, body: Body, program: str = PROGRAM) -> tuple[set[str]
     context = SimpleNamespace(
         active_object=body,
         preferences=SimpleNamespace(addons=preferences),
-        scene=SimpleNamespace(frame_current=10),
+        scene=SimpleNamespace(frame_current=10, frame_end=17),
     )
     assert addon.InBetweenKeys.poll(context)
-    return operator.execute(context), operator.said
+    ended = operator.execute(context)
+    assert context.scene.frame_end == (18 if ended == {"FINISHED"} else 17)
+    return ended, operator.said
 
 
 def test_shapes_are_added_and_animated(addon: ModuleType, bars: Shapes) -> None:
@@ -105,3 +110,74 @@ def test_what_is_wrong_is_reported(addon: ModuleType, bars: Shapes) -> None:
     assert ended == {"CANCELLED"} and said[0][0] == {"ERROR"} and said[0][1]
     body.keys[1:] = []
     assert run(addon, body)[1] == [({"ERROR"}, "two shape keys or more are needed")]
+
+
+def test_the_manifest_names_what_blender_asks_for() -> None:
+    text = (EXTENSION / "blender_manifest.toml").read_text()
+    found = dict(re.findall(r'^(\w+) = "(.*)"$', text, re.M))
+    wanted = {"schema_version", "id", "version", "name", "tagline", "maintainer", "type", "blender_version_min"}
+    assert wanted <= set(found) and found["id"] == EXTENSION.name and found["type"] == "add-on"
+    assert len(found["tagline"]) <= 64 and not found["tagline"].endswith(".")
+    assert len(found["files"]) <= 64 and not found["files"].endswith(".")
+
+
+# ------------------------------------------------------------------------------------------------------- in Blender
+@pytest.fixture
+def blender(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Blender with the extension, and a program that runs this package."""
+    bpy = pytest.importorskip("bpy", reason="bpy is not installed")
+    monkeypatch.syspath_prepend(str(EXTENSION.parent))
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    import addon_utils
+
+    addon_utils.enable(EXTENSION.name, default_set=True)
+    program = tmp_path / "torch-modal"
+    program.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m torch_modal "$@"\n')
+    program.chmod(0o755)
+    bpy.context.preferences.addons[EXTENSION.name].preferences.program = str(program)
+    yield bpy
+    addon_utils.disable(EXTENSION.name, default_set=True)
+
+
+def body_in(blender: Any, shapes: Shapes) -> Any:
+    """An active object with shape keys, turned and moved."""
+    mesh = blender.data.meshes.new("bars")
+    mesh.from_pydata(shapes.keyframes[0].tolist(), [], shapes.faces.tolist())
+    own = blender.data.objects.new("bars", mesh)
+    own.location, own.rotation_euler = (1, 2, 3), (0.1, 0.2, 0.3)
+    blender.context.collection.objects.link(own)
+    blender.context.view_layer.objects.active = own
+    for number, x in enumerate(shapes.keyframes[:2].tolist()):
+        key = own.shape_key_add(name=f"key {number}", from_mix=False)
+        for target, point in zip(key.data, x, strict=True):
+            target.co = point
+    return own
+
+
+def posed(blender: Any, own: Any) -> torch.Tensor:
+    """The vertices of an object in the world, at the frame of the scene."""
+    evaluated = own.evaluated_get(blender.context.evaluated_depsgraph_get())
+    return torch.tensor([list(evaluated.matrix_world @ vertex.co) for vertex in evaluated.data.vertices])
+
+
+def test_shape_keys_and_bones_in_blender(blender: Any, bars: Shapes) -> None:
+    own, scene = body_in(blender, bars), blender.context.scene
+    scene.frame_start, scene.frame_end = 1, 3
+    scene.frame_set(1)
+    assert blender.ops.object.in_between_shape_keys(levels=2, step=2) == {"FINISHED"}
+    assert len(own.data.shape_keys.key_blocks) == 2 + 5 and scene.frame_end == 9
+    assert blender.ops.object.bake_to_bones(bones=12) == {"FINISHED"}
+    baked = next(each for each in blender.data.objects if each.type == "MESH" and each.find_armature())
+    assert len(baked.find_armature().data.bones) > 2
+    for frame in range(1, 10):
+        scene.frame_set(frame)
+        expected, found = posed(blender, own), posed(blender, baked)
+        diagonal = (expected.amax(0) - expected.amin(0)).norm()
+        assert (expected - found).norm(dim=1).max() < 0.004 * diagonal
+
+
+def test_blender_accepts_the_extension(blender: Any) -> None:
+    tool = Path(blender.utils.system_resource("SCRIPTS"), "addons_core", "bl_pkg", "cli", "blender_ext.py")
+    command = [sys.executable, str(tool), "validate", str(EXTENSION)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=100)
+    assert done.returncode == 0, done.stdout + done.stderr

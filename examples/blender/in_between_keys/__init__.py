@@ -1,9 +1,11 @@
-"""Blender add-on: in-betweens of an object's shape keys.
+"""Blender extension: in-betweens of an object's shape keys, and any animation of a mesh as bones.
 
-Install it under Edit > Preferences > Add-ons > Install from Disk, and name the program ``torch-modal`` there (of the
-environment that the package is installed in: Blender's own Python needs nothing). With a mesh object selected, Object >
-In-Between Shape Keys adds shapes between its shape keys, as keys of their own that are animated one after the other.
-The given keys are muted, and else stay as they are.
+Zip this folder, install the file under Edit > Preferences > Get Extensions > Install from Disk, and name the program
+``torch-modal`` in its preferences (of the environment that the package is installed in: Blender's own Python needs
+nothing). With a mesh object selected, Object > In-Between Shape Keys adds shapes between its shape keys, as keys of
+their own that are animated one after the other. The given keys are muted, and else stay as they are. Object > Bake to
+Bones adds an armature with a skinned mesh that moves as the object does in the frames of the scene, whatever moves it:
+shape keys, a cache, cloth or other modifiers.
 """
 
 import subprocess
@@ -13,16 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import bpy
-
-bl_info = {
-    "name": "In-Between Shape Keys",
-    "author": "torch_modal contributors",
-    "version": (0, 1, 0),
-    "blender": (3, 6, 0),
-    "location": "Object > In-Between Shape Keys",
-    "description": "Physically plausible shapes between shape keys",
-    "category": "Animation",
-}
 
 PREFIX = "between "
 
@@ -42,6 +34,20 @@ def read_points(path: Path) -> list[Point]:
     return [(float(x), float(y), float(z)) for _, x, y, z, *_ in rows]
 
 
+def run_program(program: str, *arguments: str) -> None:
+    """Run a command of torch-modal.
+
+    Raises:
+        RuntimeError: The program is not there, or says why not.
+    """
+    try:
+        done = subprocess.run([program, *arguments, "--quiet"], capture_output=True, text=True, check=False)
+    except OSError as error:
+        raise RuntimeError(f"{program} does not start ({error}); name it in the add-on's preferences") from error
+    if done.returncode != 0:
+        raise RuntimeError(done.stderr.strip().splitlines()[-1] if done.stderr.strip() else "it gave no reason")
+
+
 def in_betweens(
     program: str,
     shapes: Sequence[Sequence[Point]],
@@ -50,24 +56,14 @@ def in_betweens(
     cyclic: bool = False,
     contact: bool = False,
 ) -> list[list[Point]]:
-    """All frames, the given shapes among them, by the command line.
-
-    Raises:
-        RuntimeError: The program is not there, or says why not.
-    """
+    """All frames, the given shapes among them, by the command line. Raises as :func:`run_program`."""
     with tempfile.TemporaryDirectory(prefix="torch_modal-") as name:
         folder = Path(name)
         files = [folder / f"key-{i:03d}.obj" for i in range(len(shapes))]
         for file, points in zip(files, shapes, strict=True):
             write_mesh(file, points, triangles)
-        command = [program, "subdivide", *map(str, files), "--levels", str(levels), "--out", str(folder / "out")]
-        command += ["--quiet", *["--cyclic"] * cyclic, *["--contact"] * contact]
-        try:
-            done = subprocess.run(command, capture_output=True, text=True, check=False)
-        except OSError as error:
-            raise RuntimeError(f"{program} does not start ({error}); name it in the add-on's preferences") from error
-        if done.returncode != 0:
-            raise RuntimeError(done.stderr.strip().splitlines()[-1] if done.stderr.strip() else "it gave no reason")
+        options = ["--levels", str(levels), *["--cyclic"] * cyclic, *["--contact"] * contact]
+        run_program(program, "subdivide", *map(str, files), *options, "--out", str(folder / "out"))
         return [read_points(file) for file in sorted((folder / "out").glob("frame-*.obj"))]
 
 
@@ -133,24 +129,74 @@ class InBetweenKeys(bpy.types.Operator):  # type: ignore[misc]
             for value, offset in ((0.0, -1), (1.0, 0), (0.0, 1)):
                 key.value = value
                 key.keyframe_insert("value", frame=start + (i + offset) * self.step)
+        context.scene.frame_end = max(context.scene.frame_end, start + (len(frames) - 1) * self.step)
         self.report({"INFO"}, f"{len(frames)} shapes between {len(keys)} shape keys, which are muted now")
         return {"FINISHED"}
 
 
+class BakeToBones(bpy.types.Operator):  # type: ignore[misc]
+    """Add an armature and a skinned mesh that move as the active object does in the frames of the scene."""
+
+    bl_idname = "object.bake_to_bones"
+    bl_label = "Bake to Bones"
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 (Blender reads it so)
+
+    bones: bpy.props.IntProperty(name="Bones", default=40, min=1)  # type: ignore[valid-type]
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        """A mesh."""
+        return context.active_object is not None and context.active_object.type == "MESH"
+
+    def execute(self, context: Any) -> set[str]:
+        """Write each frame, fit bones, import them."""
+        own, scene, before = context.active_object, context.scene, context.scene.frame_current
+        program = context.preferences.addons[__name__].preferences.program
+        with tempfile.TemporaryDirectory(prefix="torch_modal-") as name:
+            for frame in range(scene.frame_start, scene.frame_end + 1):
+                scene.frame_set(frame)
+                posed = own.evaluated_get(context.evaluated_depsgraph_get())
+                mesh = posed.to_mesh()
+                mesh.calc_loop_triangles()
+                places = [posed.matrix_world @ vertex.co for vertex in mesh.vertices]
+                points = [(x, z, -y) for x, y, z in places]  # glTF's Y is up
+                write_mesh(Path(name, f"frame-{frame:06d}.obj"), points, [(*t.vertices,) for t in mesh.loop_triangles])
+                posed.to_mesh_clear()
+            scene.frame_set(before)
+            rate, out = (
+                scene.render.fps / scene.render.fps_base,
+                Path(name, f"{bpy.path.clean_name(own.name)}-baked.glb"),
+            )
+            try:
+                run_program(program, "bake", name, "--bones", str(self.bones), "--fps", str(rate), "--out", str(out))
+            except RuntimeError as error:
+                self.report({"ERROR"}, str(error))
+                return {"CANCELLED"}
+            bpy.ops.import_scene.gltf(filepath=str(out))
+        for moved in [each for each in context.selected_objects if each.animation_data and each.animation_data.action]:
+            data = moved.animation_data  # its keys begin at 0: a strip puts them where the frames were
+            data.nla_tracks.new().strips.new("baked", scene.frame_start, data.action)
+            data.action = None
+        return {"FINISHED"}
+
+
 def menu(self: Any, context: Any) -> None:
-    """The entry of the menu."""
+    """The entries of the menu."""
     self.layout.operator(InBetweenKeys.bl_idname)
+    self.layout.operator(BakeToBones.bl_idname)
 
 
 def register() -> None:
     """What Blender calls when the add-on is turned on."""
     bpy.utils.register_class(Preferences)
     bpy.utils.register_class(InBetweenKeys)
+    bpy.utils.register_class(BakeToBones)
     bpy.types.VIEW3D_MT_object.append(menu)
 
 
 def unregister() -> None:
     """And when it is turned off."""
     bpy.types.VIEW3D_MT_object.remove(menu)
+    bpy.utils.unregister_class(BakeToBones)
     bpy.utils.unregister_class(InBetweenKeys)
     bpy.utils.unregister_class(Preferences)
