@@ -56,8 +56,26 @@ def add_modes(sub: argparse.ArgumentParser) -> None:
     add("--mesher", choices=("auto", "lattice", "tetwild"), default="auto", help=text)
 
 
-def add_registration(sub: argparse.ArgumentParser) -> None:
-    """Add options of the registration of meshes of different connectivity."""
+def add_forms(sub: argparse._ActionsContainer) -> None:
+    """Add ``--bones`` and ``--targets``, forms of an animation as GLB."""
+    text = "GLB: a skin of at most N bones, a tenth of the size, for engines (40 are usual)"
+    sub.add_argument("--bones", type=number(int, 1), metavar="N", help=text)
+    sub.add_argument(
+        "--targets", type=number(int, 1), metavar="N", help="GLB: N principal shapes as the only morph targets"
+    )
+
+
+def check_forms(args: argparse.Namespace, file: Path) -> None:
+    """Usage error for two forms, or for a form of another format."""
+    if (args.bones or args.targets) and (file.suffix.lower() != ".glb" or (args.bones and args.targets)):
+        args.fail("--bones and --targets are two forms of a .glb file; take one of them")
+
+
+def add_registration(sub: argparse.ArgumentParser, optional: bool = False) -> None:
+    """Add options of the registration of meshes of different connectivity, with ``--register`` if it is optional."""
+    if optional:
+        text = "the meshes have different connectivity: lay the first onto the others"
+        sub.add_argument("--register", action="store_true", help=text)
     text = "lines of vertex numbers, counted from 0, or of coordinates: a column for each mesh"
     sub.add_argument("--landmarks", type=Path, metavar="FILE", help=text)
     text = "the meshes are different subjects; may need five landmarks or more"
@@ -96,7 +114,9 @@ def mode_options(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def register_options(args: argparse.Namespace) -> dict[str, Any]:
-    """Options of `register`."""
+    """Options of `register`; a usage error if it is optional and not asked for."""
+    if (args.landmarks or args.across) and not getattr(args, "register", True):
+        args.fail("--landmarks and --across are for --register")
     return {"landmarks": args.landmarks, "same_subject": not args.across, **cache_options(args)}
 
 

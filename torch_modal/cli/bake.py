@@ -2,13 +2,17 @@
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 from torch_modal.cli.arguments import (
     add_common,
+    add_forms,
     add_registration,
+    check_forms,
     check_output,
     file_name,
     number,
+    pick_options,
     register_options,
     reporter,
 )
@@ -24,17 +28,14 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
     add("meshes", nargs="+", type=Path, metavar="MESH", help=text)
     text = f"the file: {', '.join(ANIMATION_FORMATS)}"
     add("--out", type=file_name(ANIMATION_FORMATS), required=True, metavar="FILE", help=text)
-    text = "GLB: a skin of at most N bones, four for each vertex, for engines (40 are usual)"
-    add("--bones", type=number(int, 1), metavar="N", help=text)
-    add("--targets", type=number(int, 1), metavar="N", help="GLB: N principal shapes as the only morph targets")
+    add_forms(sub)
     add("--fps", type=positive, metavar="X", help="frames a second (default: as in the file, or 24)")
     add("--cyclic", action="store_true", help="the last frame leads on to the first")
     text = "take out trembling: what has a period of X frames is halved, what is slower hardly changes"
     add("--smooth", type=positive, metavar="X", help=text)
     text = "keep each N-th frame and the last as key-frames, and fill in a smooth path through them"
     add("--every", type=number(int, 2), metavar="N", help=text)
-    add("--register", action="store_true", help="the meshes have different connectivity: lay the first onto the others")
-    add_registration(sub)
+    add_registration(sub, optional=True)
     add_common(sub)
 
 
@@ -55,10 +56,8 @@ def run(args: argparse.Namespace) -> None:
       scans of different connectivity:
         torch-modal bake "scans/*.ply" --register --bones 40 --out motion.glb
     """
-    if (args.landmarks or args.across) and not args.register:
-        args.fail("--landmarks and --across are for --register")
-    if (args.bones or args.targets) and (args.out.suffix.lower() != ".glb" or (args.bones and args.targets)):
-        args.fail("--bones and --targets are two forms of a .glb file; take one of them")
+    check_forms(args, args.out)
+    registration = {"register": args.register, **register_options(args), "report": reporter(args)}
 
     import torch
 
@@ -69,7 +68,6 @@ def run(args: argparse.Namespace) -> None:
     files, report = sequence_files(args.meshes), reporter(args)
     check_output([args.out], files, args.overwrite)
     require_packages(args.out)
-    registration = {"register": args.register, **register_options(args), "report": report}
     given, faces, fps = tm.load_sequence(files, args.fps, **registration)
     n = len(given)
     if n < 2:
@@ -87,18 +85,8 @@ def run(args: argparse.Namespace) -> None:
     asset = None if files[0].suffix.lower() == ".npz" else tm.open_asset(files[0])
     if asset is not None:
         asset.carries.pop("posing", None)  # it is what is written
-    tm.save_animation(
-        frames,
-        faces,
-        args.out,
-        fps,
-        cyclic=args.cyclic,
-        overwrite=args.overwrite,
-        asset=asset,
-        bones=skin,
-        targets=args.targets,
-        progress=False if args.quiet else None,
-    )
+    options: dict[str, Any] = {**pick_options(args, "cyclic", "overwrite", "targets"), "bones": skin, "asset": asset}
+    tm.save_animation(frames, faces, args.out, fps, progress=False if args.quiet else None, **options)
     bones = f", {skin.weights.shape[1]} bones" if skin else ""
     report(f"animation: {args.out}, {args.out.stat().st_size / 1e6:.2f} MB{bones}")
     shown = frames.clone()

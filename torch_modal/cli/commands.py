@@ -95,8 +95,6 @@ def check(args: argparse.Namespace) -> int:
         check_output([args.picture], [*args.meshes, *args.keyframes], args.overwrite)
     if args.contact and not args.between:
         args.fail("--contact is for the shapes that --between computes")
-    if args.between and len(args.meshes) < 2:
-        args.fail("--between needs two meshes or more")
     from torch_modal.geometry.crossings import require_contact
 
     require_contact()
@@ -107,7 +105,7 @@ def check(args: argparse.Namespace) -> int:
     shapes, faces = tm.load_keyframes([*args.keyframes, *args.meshes])
     welded = tm.weld_seams(shapes, faces)
     keyframes, shapes = welded.keyframes[:n], welded.keyframes[n:]
-    names, motion = [str(mesh) for mesh in args.meshes], ""
+    names = [str(mesh) for mesh in args.meshes]
     if args.between:
         keyframes, places, n = welded.keyframes, tm.keyframe_places(len(names), 3), len(welded.keyframes)
         started = time.perf_counter()
@@ -116,7 +114,7 @@ def check(args: argparse.Namespace) -> int:
         ours, linear = (
             float((len(x) - 1) * shell(x[1:], x[:-1]).sum()) for x in (frames, tm.linear_sequence(shapes, places))
         )
-        motion = f"shell energy of the motion: {ours:.4g}, of linear interpolation: {linear:.4g}; {seconds:.1f} s"
+        report(f"shell energy of the motion: {ours:.4g}, of linear interpolation: {linear:.4g}; {seconds:.1f} s")
         names, shapes = [f"t = {i / 8:g}" for i in range(len(frames))], frames
     contacts = tm.self_contacts(shapes, welded.faces, keyframes if n else None)
     used = shapes[0][welded.faces.unique()]
@@ -132,8 +130,6 @@ def check(args: argparse.Namespace) -> int:
         + (", and cross in no key-frame" if n else "")
         + "; depth: of the deepest vertex there, in % of the diagonal"
     )
-    if motion:
-        report(motion)
     if args.picture:
         marks = shapes.new_zeros(shapes.shape[:2])  # of each vertex: 0, 1 for a crossing, 2 for a new one
         for value, chosen in ((1.0, slice(None)), (2.0, contacts.new)):

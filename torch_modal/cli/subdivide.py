@@ -8,9 +8,11 @@ from typing import Any
 
 from torch_modal.cli.arguments import (
     add_common,
+    add_forms,
     add_levels,
     add_modes,
     add_registration,
+    check_forms,
     check_output,
     file_name,
     is_file,
@@ -94,12 +96,8 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
     group.add_argument("--fps", type=positive, metavar="X", help=text)
     group.add_argument("--ping-pong", action="store_true", help="there and back again")
     group.add_argument("--ease", action="store_true", help="slow at both ends")
-    text = "GLB: a skin of at most N bones, a tenth of the size, for engines (40 are usual)"
-    group.add_argument("--bones", type=number(int, 1), metavar="N", help=text)
-    text = "GLB: N principal shapes as the only morph targets"
-    group.add_argument("--targets", type=number(int, 1), metavar="N", help=text)
-    add("--register", action="store_true", help="the meshes have different connectivity: lay the first onto the others")
-    add_registration(sub)
+    add_forms(group)
+    add_registration(sub, optional=True)
     add_modes(sub)
     add_common(sub)
 
@@ -136,14 +134,12 @@ def run(args: argparse.Namespace) -> None:
         args.fail("--contact needs one shape for each in-between; --preset paper has two")
     if args.preset != "paper" and (args.mu is not None or args.regions is not None):
         args.fail(f"--{'regions' if args.mu is None else 'mu'} is for the two shapes of --preset paper")
-    if (args.landmarks or args.across) and not args.register:
-        args.fail("--landmarks and --across are for --register")
     if args.cyclic and (args.ping_pong or args.ease):
         option = "ping-pong" if args.ping_pong else "ease"
         args.fail(f"--{option} is for sequences that begin and end; a cycle does not")
     files = check_files(args, args.meshes)
-    if (args.bones or args.targets) and (files[0].suffix.lower() != ".glb" or (args.bones and args.targets)):
-        args.fail("--bones and --targets are two forms of a .glb file; take one of them")
+    check_forms(args, files[0])
+    registration = {"register": args.register, **register_options(args)}
 
     import torch_modal as tm
     from torch_modal.passengers.proxy import proxy_size
@@ -154,7 +150,6 @@ def run(args: argparse.Namespace) -> None:
     places = tm.keyframe_places(n, args.levels, **spread)
     when = tm.frame_times(n, args.levels, **spread).tolist() + args.times[-1:] * args.cyclic if args.times else None
     report = reporter(args)
-    registration = {"register": args.register, **register_options(args)}
     keyframes, faces = tm.load_keyframes(args.meshes, **registration, report=report)
     asset = tm.open_asset(args.meshes[0])
     welded = tm.weld_seams(keyframes, faces)

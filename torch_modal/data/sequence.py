@@ -14,8 +14,9 @@ from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.data.tree import natural
 from torch_modal.errors import MeshError
 from torch_modal.io.formats import FPS
+from torch_modal.io.gltf import key_times
 from torch_modal.io.gltf_asset import GltfAsset
-from torch_modal.io.read import SUFFIXES, open_asset
+from torch_modal.io.read import SUFFIXES, mesh_errors, open_asset
 from torch_modal.io.write import check_frames
 from torch_modal.registration.load import load_keyframes
 
@@ -23,6 +24,7 @@ GENERATOR = "torch_modal"
 FASTEST = 60.0
 """Most frames a second at which the animations of others are sampled by default."""
 
+Shapes = tuple[FloatArray, IntArray, dict[str, Any]]
 Paths = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
 
 
@@ -99,9 +101,7 @@ def smooth_in_time(frames: Tensor, period: float, cyclic: bool = False) -> Tenso
     return torch.linalg.solve(eye + penalty * second.mT @ second, frames.flatten(1)).view_as(frames)
 
 
-def read_shapes(
-    paths: Paths, fps: float | None = None, **registration: Any
-) -> tuple[FloatArray, IntArray, dict[str, Any]]:
+def read_shapes(paths: Paths, fps: float | None = None, **registration: Any) -> Shapes:
     """Read a sequence: shapes ``(N, V, 3)``, their faces ``(F, 3)``, and options of :func:`torch_modal.show`.
 
     Arguments as for :func:`load_sequence`.
@@ -113,51 +113,43 @@ def read_shapes(
     if suffix in (".glb", ".gltf"):
         asset = open_asset(files[0])
         assert isinstance(asset, GltfAsset)
-        animation = _animation(files[0], asset, fps)
+        with mesh_errors(f"{files[0]}: its animation cannot be read"):
+            animation = _animation(asset, fps)
         if animation is not None:
             return animation[0], asset.faces, animation[1]
     keyframes, faces = load_keyframes(files, **registration)
     return keyframes.numpy(), faces.numpy(), {}
 
 
-def _arrays(path: Path) -> tuple[FloatArray, IntArray, dict[str, Any]]:
+def _arrays(path: Path) -> Shapes:
     """Shapes of an NPZ file."""
-    try:
-        with np.load(path, allow_pickle=False) as arrays:
-            frames, faces = check_frames(arrays["frames"], arrays["faces"])
-            times = arrays["times"] if "times" in arrays else np.zeros(0)
-            seconds = float(times[-1] - times[0]) if times.shape == (len(frames),) else 0.0
-    except Exception as error:  # Damaged files may raise any exception; the message names the file.
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise MeshError(f"{path}: needs arrays frames (N, V, 3) and faces (F, 3) ({reason[:200]})") from error
+    with mesh_errors(f"{path}: needs arrays frames (N, V, 3) and faces (F, 3)"), np.load(path) as arrays:
+        frames, faces = check_frames(arrays["frames"], arrays["faces"])
+        times = arrays["times"] if "times" in arrays else np.zeros(0)
+        seconds = float(times[-1] - times[0]) if times.shape == (len(frames),) else 0.0
     return frames, faces, {"fps": (len(frames) - 1) / seconds} if seconds > 0 else {}
 
 
-def _animation(path: Path, asset: GltfAsset, fps: float | None) -> tuple[FloatArray, dict[str, Any]] | None:
+def _animation(asset: GltfAsset, fps: float | None) -> tuple[FloatArray, dict[str, Any]] | None:
     """Frames of an animated GLB, and options of `show`; None without an animation."""
-    try:
-        keys = asset.key_times()
-        if not len(keys):
-            return None
-        (animation, *_), written = asset.document.get("animations"), asset.document.root["asset"].get("generator")
-        extras = animation.get("extras", {})
-        if fps is not None or written != GENERATOR or "frames" not in extras:
-            steps = np.diff(keys)
-            rate = fps or min(1 / steps[steps > 1 / (2 * FASTEST)].min(initial=1.0), FASTEST)
-            rate = round(rate) if abs(rate - round(rate)) < 0.01 * rate else rate
-            n = int((keys[-1] - keys[0]) * rate + 1.001)
-            return asset.play(keys[0] + np.arange(n) / rate), {"fps": float(rate)}
-        kept = [int(number) for number in extras["frames"]]
-        keyframes = [kept.index(number) for number in extras["keyframes"] if number in kept]
-        back = bool(extras.get("ping_pong"))
-        n = len(kept)
-        closed = len(keys) == n + 1 and not back
-        if len(keys) != (2 * n - 1 if back else n + closed):
-            raise ValueError(f"{n} frames, {len(keys)} times")
-        frames, times, rate = asset.play(keys[:n]), keys[:n], float(extras["fps"])
-    except Exception as error:  # Damaged files may raise any exception; the message names the file.
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise MeshError(f"{path}: its animation cannot be read ({reason[:200]})") from error
+    keys = key_times(asset.document)
+    if not len(keys):
+        return None
+    (animation, *_), written = asset.document.get("animations"), asset.document.root["asset"].get("generator")
+    extras = animation.get("extras", {})
+    if fps is not None or written != GENERATOR or "frames" not in extras:
+        steps = np.diff(keys)
+        rate = fps or min(1 / steps[steps > 1 / (2 * FASTEST)].min(initial=1.0), FASTEST)
+        rate = round(rate) if abs(rate - round(rate)) < 0.01 * rate else rate
+        n = int((keys[-1] - keys[0]) * rate + 1.001)
+        return asset.play(keys[0] + np.arange(n) / rate), {"fps": float(rate)}
+    kept = [int(number) for number in extras["frames"]]
+    keyframes = [kept.index(number) for number in extras["keyframes"] if number in kept]
+    n, back, rate = len(kept), bool(extras.get("ping_pong")), float(extras["fps"])
+    closed = len(keys) == n + 1 and not back
+    if len(keys) != (2 * n - 1 if back else n + closed):
+        raise ValueError(f"{n} frames, {len(keys)} times")
+    times = keys[:n]
     options: dict[str, Any] = {"keyframe_indices": keyframes or None, "cyclic": closed, "fps": rate}
     # Steps in time differ where frames of a long sequence were left out, or with ease.
     even = np.allclose(np.diff(times), times[-1] / (n - 1), rtol=1e-4)
@@ -165,4 +157,4 @@ def _animation(path: Path, asset: GltfAsset, fps: float | None) -> tuple[FloatAr
         options["fps"] = float((n - 1) / times[-1])
     if not even:
         options["times"] = times.tolist()
-    return frames, options
+    return asset.play(times), options

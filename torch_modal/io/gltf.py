@@ -10,10 +10,9 @@ import base64
 import json
 import struct
 import warnings
-from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 from urllib.parse import unquote
 
 import numpy as np
@@ -27,6 +26,8 @@ from torch_modal.geometry.skin import STEPS
 from torch_modal.io.files import read_companion
 
 Json = dict[str, Any]
+Tracks = dict[tuple[int, str], FloatArray]
+"""Values over time by node and property. *Shape of each:* ``(T, width)``."""
 
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
@@ -215,61 +216,52 @@ class Document:
         return b"".join([head, text, struct.pack("<I4s", len(binary), b"BIN\0"), binary])
 
 
-class Animated(NamedTuple):
-    """A property of a node over time, with keys; it is constant before the first and after the last."""
-
-    path: str
-    """``"translation"``, ``"rotation"``, ``"scale"`` or ``"weights"``."""
-    times: FloatArray
-    """In seconds, ascending. *Shape:* ``(n,)``."""
-    values: FloatArray
-    """With tangents before and after each, if cubic. *Shape:* ``(n, 1, width)`` or ``(n, 3, width)``."""
-    steps: bool
-    """True where values jump from key to key."""
-
-    def sample(self, times: FloatArray) -> FloatArray:
-        """Values at times, as players compute them. *Shape:* ``(T,) -> (T, width)``."""
-        keys, last = self.times, len(self.times) - 1
-        i = np.clip(np.searchsorted(keys, times, "right") - 1, 0, last)
-        j = np.minimum(i + 1, last)
-        seconds = (keys[j] - keys[i])[:, None]
-        u = np.clip((times - keys[i])[:, None] / np.maximum(seconds, 1e-30), 0.0, 1.0)
-        middle = self.values.shape[1] // 2
-        a, b = self.values[i, middle], self.values[j, middle]
-        if self.steps:
-            return np.where(u < 1, a, b)
-        if middle:  # glTF 2.0, appendix C.5
-            tangents = self.values[i, 2] * u * (1 - u) ** 2 + self.values[j, 0] * u**2 * (u - 1)
-            return (1 + 2 * u) * (1 - u) ** 2 * a + u**2 * (3 - 2 * u) * b + seconds * tangents
-        if self.path == "rotation":
-            first = Rotation.from_quat(a)
-            turn = (first.inv() * Rotation.from_quat(b)).as_rotvec()
-            return np.asarray((first * Rotation.from_rotvec(u * turn)).as_quat())
-        return (1 - u) * a + u * b
+def key_times(document: Document) -> FloatArray:
+    """Times of all keys of the first animation, in seconds; none without one. *Shape:* ``(n,)``, ascending."""
+    samplers = [sampler for animation in document.get("animations")[:1] for sampler in animation["samplers"]]
+    return np.unique([time for sampler in samplers for time in document.floats(sampler["input"])])
 
 
-def animated_properties(document: Document) -> dict[tuple[int, str], Animated]:
-    """Properties that the first animation moves, by node and path."""
-    properties = {}
+def animate(document: Document, times: FloatArray) -> Tracks:
+    """Values of the first animation at times in seconds, as players compute them. *Shape:* ``(T,)``."""
+    moved: Tracks = {}
     for animation in document.get("animations")[:1]:
         for channel in animation["channels"]:
             sampler, target = animation["samplers"][channel["sampler"]], channel["target"]
-            times, mode = document.floats(sampler["input"])[:, 0], sampler.get("interpolation", "LINEAR")
-            values = document.floats(sampler["output"]).reshape(len(times), 3 if mode == "CUBICSPLINE" else 1, -1)
             if "node" in target:
-                track = Animated(target["path"], times, values, mode == "STEP")
-                properties[target["node"], target["path"]] = track
-    return properties
+                values = _sample(document, sampler, times, target["path"] == "rotation")
+                moved[target["node"], target["path"]] = values
+    return moved
 
 
-def world_transforms(
-    document: Document, moved: Mapping[tuple[int, str], FloatArray] | None = None
-) -> dict[int, FloatArray]:
+def _sample(document: Document, sampler: Json, times: FloatArray, quaternions: bool) -> FloatArray:
+    """Values of a sampler, constant before the first key and after the last. *Shape:* ``(T,) -> (T, width)``."""
+    keys, mode = document.floats(sampler["input"])[:, 0], sampler.get("interpolation", "LINEAR")
+    # Cubics have a tangent before and after each value.
+    values = document.floats(sampler["output"]).reshape(len(keys), 3 if mode == "CUBICSPLINE" else 1, -1)
+    middle = values.shape[1] // 2
+    i = np.clip(np.searchsorted(keys, times, "right") - 1, 0, len(keys) - 1)
+    j = np.minimum(i + 1, len(keys) - 1)
+    seconds = (keys[j] - keys[i])[:, None]
+    u = np.clip((times - keys[i])[:, None] / np.maximum(seconds, 1e-30), 0.0, 1.0)
+    a, b = values[i, middle], values[j, middle]
+    if mode == "STEP":
+        return np.where(u < 1, a, b)
+    if mode == "CUBICSPLINE":  # glTF 2.0, appendix C.5
+        tangents = values[i, 2] * u * (1 - u) ** 2 + values[j, 0] * u**2 * (u - 1)
+        return (1 + 2 * u) * (1 - u) ** 2 * a + u**2 * (3 - 2 * u) * b + seconds * tangents
+    if quaternions:
+        first = Rotation.from_quat(a)
+        turn = (first.inv() * Rotation.from_quat(b)).as_rotvec()
+        return np.asarray((first * Rotation.from_rotvec(u * turn)).as_quat())
+    return (1 - u) * a + u * b
+
+
+def world_transforms(document: Document, moved: Tracks | None = None) -> dict[int, FloatArray]:
     """World transform of each node of the scene, parents first. *Shape of each:* ``(4, 4)``, or ``(T, 4, 4)``.
 
     ``moved`` holds values at T times by node and path, instead of the values of the nodes.
     """
-    moved = moved or {}
     nodes = document.get("nodes")
     if document.get("scenes"):
         roots = document.get("scenes", document.root.get("scene", 0)).get("nodes", [])
@@ -290,7 +282,7 @@ def world_transforms(
             local = quaternion_matrix((w, x, y, z))
             scale = np.array(node.get("scale", (1.0, 1.0, 1.0)), dtype=np.float64)
             local[:3, 3] = node.get("translation", (0.0, 0.0, 0.0))
-            paths = {path: values for (other, path), values in moved.items() if other == number}
+            paths = {path: values for (other, path), values in (moved or {}).items() if other == number}
             if paths:
                 local = np.tile(local, (len(next(iter(paths.values()))), 1, 1))
                 scale = paths.get("scale", scale)[..., None, :]

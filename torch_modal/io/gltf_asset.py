@@ -11,15 +11,7 @@ from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.errors import MeshError
 from torch_modal.geometry.skin import blend_bones
 from torch_modal.io.asset import Asset, Material, Part, as_png_or_jpeg
-from torch_modal.io.gltf import (
-    ARRAY_BUFFER,
-    ELEMENT_ARRAY_BUFFER,
-    WHITE,
-    Document,
-    Json,
-    animated_properties,
-    world_transforms,
-)
+from torch_modal.io.gltf import ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER, WHITE, Document, Json, animate, world_transforms
 from torch_modal.io.normals import carry_together
 
 _COMPRESSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
@@ -105,14 +97,10 @@ class GltfAsset(Asset):
         self._note("materials", "materials", self.document.get("materials"))
         self._note("posing", " and ".join(name for name, there in posing.items() if there), any(posing.values()))
 
-    def key_times(self) -> FloatArray:
-        """Times of all keys of the first animation, in seconds; none without one. *Shape:* ``(n,)``, ascending."""
-        return np.unique([time for track in animated_properties(self.document).values() for time in track.times])
-
     def play(self, times: FloatArray) -> FloatArray:
         """Shapes of the first animation, as players show them. *Shape:* ``(T,) -> (T, V, 3)``."""
         document = self.document
-        moved = {key: track.sample(times) for key, track in animated_properties(document).items()}
+        moved = animate(document, times)
         worlds = world_transforms(document, moved)
         frames = np.empty((len(times), *self.positions.shape))
         for primitive in self._primitives:

@@ -1,6 +1,8 @@
 """Reading mesh files; the order and number of vertices stay."""
 
+import contextlib
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +23,18 @@ READERS: dict[str, type[Asset]] = {
 }
 SUFFIXES = tuple(READERS)
 Mesh = tuple[FloatArray, IntArray]  # vertices and faces
+
+
+@contextlib.contextmanager
+def mesh_errors(problem: str) -> Iterator[None]:
+    """Raise a MeshError of this problem for any exception, as damaged files may raise all kinds."""
+    try:
+        yield
+    except MeshError:
+        raise
+    except Exception as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise MeshError(f"{problem} ({reason[:200]})") from error
 
 
 def open_asset(path: str | os.PathLike[str]) -> Asset:
@@ -50,15 +64,10 @@ def open_asset(path: str | os.PathLike[str]) -> Asset:
         raise FileNotFoundError(f"{str(path)[:300]}: no such file")
     if not os.path.isfile(path):
         raise MeshError(f"{path}: not a file, or a link to none")
-    try:
+    with mesh_errors(f"{path}: cannot be read as {suffix[1:].upper()}"):
         if not path.stat().st_size:
             raise MeshError(f"{path}: the file is empty")
         asset = READERS[suffix](path)
-    except MeshError:
-        raise
-    except Exception as error:  # Damaged files may raise any exception; the message names the file.
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise MeshError(f"{path}: cannot be read as {suffix[1:].upper()} ({reason[:200]})") from error
     vertices, faces = asset.positions, asset.faces
     if len(faces) == 0:
         what = f" (a point cloud of {len(vertices)} vertices)" if len(vertices) else ""
