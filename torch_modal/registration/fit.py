@@ -223,11 +223,9 @@ def sliding_freedom(shape: SpectralShape, fixed: IntArray) -> float:
     (i, j), faces, k = surface.edges.T, surface.faces, functions.shape[1]
     sides = surface.vertices[i] - surface.vertices[j]
     areas: FloatArray = np.bincount(surface.connectivity.sides, np.tile(surface.face_areas, 3), minlength=len(i)) / 3
-    # Twice the mean curvature, of low frequencies, and its gradient.
-    spectrum = shape.eigenvalues[:, None] * (shape.functions.T @ (shape.mass[:, None] * surface.vertices))
-    curvature = dot(shape.functions @ spectrum, surface.vertex_normals)
+    # Gradient of the curvature.
     opposite = surface.vertices[np.roll(faces, 1, axis=1)] - surface.vertices[np.roll(faces, -1, axis=1)]
-    slopes = np.cross(surface.face_normals, (opposite * curvature[faces][..., None]).sum(1))
+    slopes = np.cross(surface.face_normals, (opposite * shape.curvature()[faces][..., None]).sum(1))
     slopes /= 2 * np.maximum(surface.face_areas, 1e-12)[:, None]
 
     def rows(weights: FloatArray, values: FloatArray, directions: FloatArray) -> FloatArray:

@@ -44,6 +44,17 @@ _TORN = (2.5, 0.03)
 _LEAST_COUNTED = 0.3
 # Largest error of a consistent distance, and minimum number of consistent samples for a repair.
 _CONSISTENT, _FEWEST = 0.12, 8
+# Tips: their smallest distance, the radius in which no vertex is more distant, and the numbers that are matched.
+_TIPS_APART, _TIP_RADIUS, _FEWEST_TIPS, _MOST_TIPS = 0.35, 0.25, 4, 6
+N_MATCHINGS = 4
+"""Number of matchings of tips that give maps."""
+# Weight of differences of limb lengths relative to those of the tree between the limbs.
+_LIMB_LENGTH = 0.2
+_SHORTEST_LIMB = 0.1
+# Weight of orientation relative to distance in coordinates of landmarks, and its number of eigenfunctions.
+_ORIENTATION, _ORIENTATION_FUNCTIONS = 0.1, 30
+# Number of eigenfunctions of the curvature that is compared.
+_CURVATURE_FUNCTIONS = 40
 
 
 class SpectralShape:
@@ -89,6 +100,58 @@ class SpectralShape:
     def geodesics_from(self, sources: IntArray) -> FloatArray:
         """Distances along the surface by the heat method. *Shape:* ``(m,) -> (n, m)``."""
         return np.stack([self._heat.compute_distance(int(source)) for source in sources], axis=1)
+
+    @cached_property
+    def samples(self) -> tuple[IntArray, FloatArray]:
+        """Farthest-point samples, and the distances to them. *Shape:* ``(m,), (n, m)``."""
+        return self.farthest_points(N_SAMPLES)
+
+    @cached_property
+    def tips(self) -> IntArray:
+        """Ends of limbs, the most distant first: local maxima of the mean distance. *Shape:* ``(m,)``."""
+        far, (i, j) = self.samples[1].mean(1), self.coarse.edges.T
+        lower = np.zeros(len(self), dtype=bool)
+        lower[np.where(far[i] < far[j], i, j)] = True
+        chosen: list[int] = []
+        for peak in sorted(np.flatnonzero(~lower), key=lambda vertex: -far[vertex]):
+            distances = self.geodesics_from(np.array([peak]))[:, 0]
+            highest = far[peak] >= far[distances < _TIP_RADIUS].max()
+            if highest and (distances[chosen] > _TIPS_APART).all():
+                chosen.append(int(peak))
+        return np.array(chosen, dtype=np.int64)
+
+    def limb_coordinates(self, tips: IntArray) -> FloatArray:
+        """Coordinates along limbs, relative to the length of each, and around them.
+
+        Distances to the tips do not tell a side of the body from its mirror image. The angle between the directions to
+        two tips has a sign, which does (Ren et al. 2018). *Shape:* ``(m,) -> (n, m + m (m - 1) / 2)``.
+        """
+        distances = self.geodesics_from(tips)
+        lengths = np.maximum(_limb_lengths(distances[tips]), _SHORTEST_LIMB)
+        beyond = np.maximum(distances - lengths, 0)
+        along = np.minimum(distances / lengths, 1) + beyond / lengths.mean()
+        return np.hstack([along, _ORIENTATION * self._orientations(distances)])
+
+    def _orientations(self, values: FloatArray) -> FloatArray:
+        """Smoothed sines of the angles between gradients, for each pair of functions. *Shape:* ``(n, m)``."""
+        mesh = self.coarse
+        corners = mesh.vertices[mesh.faces]
+        opposite = np.roll(corners, 1, axis=1) - np.roll(corners, -1, axis=1)
+        gradients = np.einsum("fci,fcm->fmi", np.cross(mesh.face_normals[:, None], opposite), values[mesh.faces])
+        gradients /= np.maximum(np.linalg.norm(gradients, axis=2, keepdims=True), 1e-12)
+        first, second = np.triu_indices(values.shape[1], 1)
+        sines = dot(np.cross(gradients[:, first], gradients[:, second]), mesh.face_normals[:, None])
+        share = mesh.face_areas[:, None] * sines / 3
+        functions = self.functions[:, :_ORIENTATION_FUNCTIONS]
+        # Integrals of products with functions that are linear in each face, by their values at its corners.
+        smoothed: FloatArray = functions @ (functions[mesh.faces].sum(1).T @ share)
+        return smoothed
+
+    def curvature(self, n_functions: int = N_FUNCTIONS) -> FloatArray:
+        """Twice the mean curvature, of low frequencies, positive where the surface is convex. *Shape:* ``(n,)``."""
+        functions, mesh = self.functions[:, :n_functions], self.coarse
+        spectrum = self.eigenvalues[:n_functions, None] * (functions.T @ (self.mass[:, None] * mesh.vertices))
+        return dot(functions @ spectrum, mesh.vertex_normals)
 
     def is_near(self, vertices: IntArray, points: FloatArray) -> BoolArray:
         """Points in space whose nearest coarse vertices are near given ones, as a mask. *Shape:* ``(n,), (n, 3)``."""
@@ -146,7 +209,7 @@ class CoarsePair:
 
     def __init__(self, first: SpectralShape, second: SpectralShape) -> None:
         self.first, self.second = first, second
-        self.samples, self.distances = first.farthest_points(N_SAMPLES)
+        self.samples, self.distances = first.samples
 
     # ------------------------------------------------------------------------------------------------ scores and errors
     def rated(self, vertices: IntArray, k: int = FINE_FUNCTIONS) -> Map:
@@ -164,6 +227,12 @@ class CoarsePair:
         images = self.second.geodesics_from(vertices[self.samples])[vertices]
         found: FloatArray = np.abs(self.distances - images)
         return found
+
+    def likeness(self, vertices: IntArray) -> float:
+        """Correlation of the curvatures of corresponding vertices; front and back differ. *Shape:* ``(n_first,)``."""
+        here, there = self.first.curvature(_CURVATURE_FUNCTIONS), self.second.curvature(_CURVATURE_FUNCTIONS)[vertices]
+        here, there = here - here.mean(), there - there.mean()
+        return float(dot(here, there) / max(np.linalg.norm(here) * np.linalg.norm(there), 1e-12))
 
     # ------------------------------------------------------------------------------------------------------------- maps
     def _functional(self, vertices: IntArray, k: int) -> FloatArray:
@@ -187,6 +256,33 @@ class CoarsePair:
             distances = shape.geodesics_from(sources)
             signatures.append(distances / distances.max(0))  # proportions differ
         return self.refined(nearest_rows(*signatures), 8)
+
+    def from_tips(self) -> list[Map]:
+        """Maps by limb coordinates from the best matchings of tips; none if there are few tips.
+
+        Matchings compare the tree of distances between the tips: if limbs grow, a distance changes by the growth of
+        its two limbs, and what is left is the difference of the trunks.
+        """
+        tips, others = self.first.tips, self.second.tips
+        n = min(len(tips), len(others), _MOST_TIPS)
+        if n < _FEWEST_TIPS:
+            return []
+        orders = np.array(list(itertools.permutations(range(min(len(others), _MOST_TIPS + 2)), n)))
+        i, j = np.triu_indices(n, 1)
+        here, there = self.first.geodesics_from(tips)[tips], self.second.geodesics_from(others)[others]
+        changes = here[i, j] - there[orders[:, i], orders[:, j]]
+        growth = changes @ np.linalg.pinv(_pair_incidence(n)).T
+        rest = changes - growth @ _pair_incidence(n).T
+        costs = np.sqrt((rest**2).mean(1)) + _LIMB_LENGTH * growth.std(1)
+        best = orders[np.argsort(costs, kind="stable")[:N_MATCHINGS]]
+        return [self.from_limbs(np.stack([tips[:n], others[order]], axis=1)) for order in best]
+
+    def from_limbs(self, pairs: IntArray) -> Map:
+        """Map from limb coordinates, which works for any proportions. *Shape:* ``(n, 2)``, coarse vertices of both."""
+        here, there = (
+            shape.limb_coordinates(ends) for shape, ends in zip((self.first, self.second), pairs.T, strict=True)
+        )
+        return self.rated(nearest_rows(here, there))
 
     def from_spectra(self, n_signs: int, progress: ProgressReport) -> list[Map]:
         """The best maps from spectra, best first; the last is the best map to the mirrored target.
@@ -250,6 +346,18 @@ def nearest_rows(queries: FloatArray, rows: FloatArray) -> IntArray:
     return np.concatenate(
         [(part @ rows.T - half).argmax(1) for part in np.array_split(queries, len(queries) // 2048 + 1)]
     )
+
+
+def _pair_incidence(n: int) -> FloatArray:
+    """Sums over the two members of each pair of n items. *Shape:* ``(n (n - 1) / 2, n)``."""
+    i, j = np.triu_indices(n, 1)
+    return np.eye(n)[i] + np.eye(n)[j]
+
+
+def _limb_lengths(distances: FloatArray) -> FloatArray:
+    """Lengths of limbs from the distances between their tips, by least squares. *Shape:* ``(n, n) -> (n,)``."""
+    pairs = np.triu_indices(len(distances), 1)
+    return np.linalg.pinv(_pair_incidence(len(distances))) @ distances[pairs]
 
 
 def difference(points: FloatArray, others: FloatArray) -> float:

@@ -17,24 +17,36 @@ from torch_modal.keyframes.check import check_keyframes
 from torch_modal.progress import Progress, ProgressReport
 from torch_modal.registration.fit import COARSE_STAGES, FINE_STAGES, TemplateFit, sliding_freedom
 from torch_modal.registration.landmarks import landmark_table
-from torch_modal.registration.maps import FINE_FUNCTIONS, MORE_SIGNS, N_SIGNS, SAME, CoarsePair, Map, SpectralShape
+from torch_modal.registration.maps import (
+    COARSE_FUNCTIONS,
+    FINE_FUNCTIONS,
+    MORE_SIGNS,
+    N_SIGNS,
+    SAME,
+    CoarsePair,
+    Map,
+    SpectralShape,
+)
 from torch_modal.registration.report import LEAD, SLIDING, TRUSTED, Quality, Registration, judge, measure, ramp
 from torch_modal.registration.surface import MeshSurface, main_part, outward, referenced
 
-VERSION = 7  # part of the cache key: raise it when the algorithm changes
+VERSION = 8  # part of the cache key: raise it when the algorithm changes
 MIN_VERTICES = MORE_SIGNS + 3  # minimum number of vertices of a surface: two more than eigenfunctions
 MIN_LANDMARKS = 5  # minimum number of landmarks between different subjects: fewer do not determine the map
 _SURE_SCORE = 0.62  # score of a spectral map below which more initial maps are tried
-_SCORE_SHARE = 0.5  # weight of a map's score relative to the stretch of its fit
+_SCORE_SHARE = 0.5  # weight of a map's score and likeness relative to the stretch of its fit
 _NEAR_LANDMARK = 0.1  # largest landmark error of a spectral map, for a surface of unit area
 _RIVALS = 3  # maximum number of maps that are fitted
-_RIVAL_SCORE = 0.15  # largest difference to the best map, in score minus distortion
+# Largest difference to the best map, in score minus distortion: between two subjects, and for one.
+_RIVAL_SCORE = 0.2, 0.15
+_WHOLE = 90  # percentile of the distances between fits that tells whether they differ as a whole
 _CLOSE = 0.1  # cost above the best fit's up to which others count
 _SPECTRAL_REFINEMENTS = (True, True, False, False)  # of the map of each repeated fit
+_STRETCHED = 0.3  # stretch above which a fit between two subjects is repeated
 _CONVERGED = 0.3  # mean displacement of the vertices at convergence, in percent of the diagonal
 _WORSE = 0.05  # accepted increase of a candidate's cost
 _MOST = 0.8  # part of a vertex's distances that are right where the vertex is, though parts are missing
-_MISPLACED = 0.15, 0.05  # largest error of these, for a surface of unit area: no confidence, full confidence
+_MISPLACED = 0.20, 0.10  # largest error of these, for a surface of unit area: no confidence, full confidence
 _RESCALED = 0.02  # logarithm of the global scale above which the fit is repeated
 
 
@@ -44,11 +56,12 @@ class _Candidate(NamedTuple):
     x: FloatArray
     fit: TemplateFit
     quality: Quality
+    likeness: float
 
     @property
     def cost(self) -> float:
-        """Cost of a candidate: fit and distortion minus the score of the map."""
-        return self.quality.cost + self.found.distortion - _SCORE_SHARE * self.found.score
+        """Cost of a candidate: fit and distortion minus the score of the map and the likeness of curvatures."""
+        return self.quality.cost + self.found.distortion - _SCORE_SHARE * (self.found.score + self.likeness)
 
 
 def register(
@@ -120,6 +133,7 @@ def register(
         target_faces=found.target_faces[welded.vertex_of],
         barycentric=found.barycentric[welded.vertex_of],
         target_corners=corners[welded.vertex_of],
+        rivals=welded.scatter(found.rivals).to(checked.keyframes),
     )
 
 
@@ -166,27 +180,38 @@ class _RegistrationProblem:
         self.mirrored = -np.inf
 
     def solve(self) -> Registration:
-        rivals = self._rivals(self._maps())
-        candidates = sorted((self._coarse(rival) for rival in rivals), key=lambda one: one.cost)
+        candidates = sorted((self._coarse(found) for found in self._rivals(self._maps())), key=lambda one: one.cost)
         close = [self._refined(one) for one in candidates if one.cost < candidates[0].cost + _CLOSE]
         best, *others = sorted(close, key=lambda one: one.cost)
         # Advantage of the best fit over another one; most fits along other maps end at the best one.
         apart = [(one.cost - best.cost, np.linalg.norm(one.x - best.x, axis=1) / self.second.scale) for one in others]
-        leads = [lead for lead, distances in apart if np.percentile(distances, 98) > SAME]
+        # Differences of small parts lower the confidence of their vertices only.
+        leads = [lead if np.percentile(distances, _WHOLE) > SAME else np.inf for lead, distances in apart]
+        alike = [one for one, lead in zip(others, leads, strict=True) if ramp(lead, *LEAD) < TRUSTED]
+        rivals = [self._fine(one)[1] for one in alike]
         #: Confidence in the place of each coarse vertex beside other fits. *Shape:* ``(n,)``.
         self.unique = np.ones(len(self.first))
         for lead, distances in apart:
             self.unique[distances > SAME] = np.minimum(self.unique[distances > SAME], ramp(lead, *LEAD))
         best = self._rescaled(best)
-        return self._report(*self._fine(best), best, min(leads, default=np.inf))
+        return self._report(*self._fine(best), best, min(leads, default=np.inf), rivals)
 
     # ------------------------------------------------------------------------------------------------------------- maps
     def _maps(self) -> list[Map]:
         if len(self.marks):
             maps = [self.pair.from_landmarks(self.mark_vertices)]
-            return maps + [one for one in self._spectral(N_SIGNS) if self._agrees(one)] if self.same_subject else maps
+            if not self.same_subject:
+                return [*maps, self.pair.from_limbs(self.mark_vertices)]
+            return maps + [one for one in self._spectral(N_SIGNS) if self._agrees(one)]
         maps = self._spectral(N_SIGNS)
-        return maps if maps[0].score >= _SURE_SCORE else maps + self._spectral(MORE_SIGNS)
+        sure = maps[0].score >= _SURE_SCORE
+        if sure and self.same_subject:
+            return maps
+        tips = self.pair.from_tips()
+        maps += [self.pair.refined(found.vertices, COARSE_FUNCTIONS) for found in tips]
+        if not (self.same_subject or sure):  # proportions may differ so much that spectra do not match
+            maps += tips
+        return maps if sure or tips else maps + self._spectral(MORE_SIGNS)
 
     def _spectral(self, n_signs: int) -> list[Map]:
         *maps, other = self.pair.from_spectra(n_signs, self.progress)
@@ -207,7 +232,7 @@ class _RegistrationProblem:
         kept = [best]
         for found in others:
             lead = (found.score - found.distortion) - (best.score - best.distortion)
-            if len(kept) < _RIVALS and lead > -_RIVAL_SCORE and found.differs(kept):
+            if len(kept) < _RIVALS and lead > -_RIVAL_SCORE[self.same_subject] and found.differs(kept):
                 kept.append(found)
         return kept
 
@@ -223,7 +248,11 @@ class _RegistrationProblem:
                 placed = best_fit(rest, goal, areas).apply(rest).numpy()
             x = fit.follow_map(placed, places)
         x = fit.run(x, COARSE_STAGES, releases=2)
-        return _Candidate(found, scale, x, fit, measure(template, x, back)[0])
+        return _Candidate(found, scale, x, fit, measure(template, x, back)[0], self.pair.likeness(self._images(fit, x)))
+
+    def _images(self, fit: TemplateFit, x: FloatArray) -> IntArray:
+        """Coarse vertices of the target nearest to those of a fitted template. *Shape:* ``(n, 3) -> (n,)``."""
+        return self.second.placed.nearest_alike(x, fit.template.moved(x).vertex_normals)
 
     def _fit(self, template: MeshSurface, back: MeshSurface, images: IntArray, scale: float) -> TemplateFit:
         marks = self.marks * scale, self.mark_places
@@ -233,12 +262,11 @@ class _RegistrationProblem:
 
     def _refined(self, candidate: _Candidate) -> _Candidate:
         """Repeat the fit from the start with the map of its result, which accumulates no sliding, until convergence."""
-        if not self.same_subject:
+        if not self.same_subject and candidate.quality.stretch < _STRETCHED:
             return candidate
         most = candidate.cost + _WORSE
-        for spectral in _SPECTRAL_REFINEMENTS:
-            shape = self.first.placed.moved(candidate.x)
-            vertices = self.second.placed.nearest_alike(shape.vertices, shape.vertex_normals)
+        for spectral in _SPECTRAL_REFINEMENTS if self.same_subject else (False,):
+            vertices = self._images(candidate.fit, candidate.x)
             found = self.pair.refined(vertices, FINE_FUNCTIONS) if spectral else self.pair.rated(vertices)
             again = self._coarse(found)
             if again.cost > most:
@@ -273,10 +301,11 @@ class _RegistrationProblem:
         return found, everything
 
     # ----------------------------------------------------------------------------------------------------------- report
-    def _report(self, x: FloatArray, everything: FloatArray, best: _Candidate, lead: float) -> Registration:
+    def _report(
+        self, x: FloatArray, everything: FloatArray, best: _Candidate, lead: float, rivals: list[FloatArray]
+    ) -> Registration:
         quality, supported = measure(self.template, x, self.target)
-        coarse = best.fit.template.moved(best.x)
-        images = self.second.placed.nearest_alike(coarse.vertices, coarse.vertex_normals)
+        images = self._images(best.fit, best.x)
         rated = self.pair.rated(images)
         # Where sheets touch, the image of a sample may lie on the wrong one; the map has no such errors.
         score, distortion = rated.score, min(best.found.distortion, rated.distortion)
@@ -291,7 +320,9 @@ class _RegistrationProblem:
         lost = float(self.template.vertex_areas[supported < TRUSTED].sum() / self.template.area)
         quality = quality._replace(unsupported_area=max(quality.unsupported_area, lost))
         freedom = sliding_freedom(self.first, self.mark_vertices[:, 0])
-        confidence, said = judge(quality, score, distortion, errors, mirrored, lead, freedom, self.same_subject)
+        confidence, said = judge(
+            quality, score, distortion, best.likeness, errors, mirrored, lead, freedom, self.same_subject
+        )
         unique = np.minimum(self.unique[near], ramp(freedom, *SLIDING))
         of_vertices = np.full(len(everything), confidence)
         of_vertices[self.used] = np.minimum(supported, unique)
@@ -305,10 +336,12 @@ class _RegistrationProblem:
             distortion=distortion,
             **quality._asdict(),
             mirrored_lead=mirrored,
+            likeness=best.likeness,
             landmark_errors=torch.from_numpy(errors),
             target_faces=torch.from_numpy(closest.faces),
             barycentric=torch.from_numpy(closest.barycentric),
             target_corners=torch.from_numpy(corners),
+            rivals=torch.from_numpy(np.array(rivals).reshape(-1, *everything.shape) * self.unit + self.origin),
             warnings=said,
         )
 

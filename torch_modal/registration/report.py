@@ -17,6 +17,11 @@ TRUSTED = 0.5  # confidence below which a result is doubtful
 
 SLIDING = 0.9, 0.65  # freedom to slide along the target: no confidence, full confidence
 LEAD = 0.0, 0.1  # advantage over the best fit along another map: no confidence, full confidence
+# Score minus distortion of a map plus weighted likeness, between two subjects and for one, whose joints change the
+# curvature; advantage of a mirrored map.
+LIKENESS_SHARE = 1.5, 0.8
+MAP = (1.55, 1.75), (0.95, 1.25)
+MIRRORED = 0.3, 0.1
 _FAR = 0.01  # distance from the target above which a face is unsupported, in diagonals
 _SHRUNK = 0.2  # area change relative to the median below which a face is unsupported: missing parts collapse
 _STRAY = 0.03  # distance from the template above which a piece of the target is ignored, in diagonals
@@ -129,6 +134,8 @@ class Registration(NamedTuple):
     """Fraction of the template's area without a counterpart, such as a limb missing on the target."""
     mirrored_lead: float
     """Advantage of a mirrored map, in score minus distortion; minus infinity if none was computed."""
+    likeness: float
+    """Correlation of the curvatures of the template and of the target where it lies; at most 1."""
     landmark_errors: torch.Tensor
     """Distance of each landmark from its target. *Shape:* ``(n,)``."""
     target_faces: torch.Tensor
@@ -137,6 +144,8 @@ class Registration(NamedTuple):
     """Barycentric coordinates in that face. *Shape:* ``(V, 3)``."""
     target_corners: torch.Tensor
     """Vertices of the target at those corners. *Shape:* ``(V, 3)``."""
+    rivals: torch.Tensor
+    """Positions of other results that fit nearly as well, such as a mirrored one. *Shape:* ``(n, V, 3)``."""
     warnings: tuple[str, ...]
     """Reasons for a low confidence, with remedies."""
 
@@ -211,6 +220,7 @@ def judge(
     quality: Quality,
     map_score: float,
     distortion: float,
+    likeness: float,
     landmark_errors: FloatArray,
     mirrored_lead: float,
     lead: float,
@@ -233,11 +243,15 @@ def judge(
         (ramp(lead, *LEAD), "another map fits nearly as well"),
     ]
     if same_subject or not len(landmark_errors):
-        of_map = f"the map scores {map_score:.2f} with distances {distortion:.2f} off, right ones 0.7 and 0.1"
+        of_map = (
+            f"the map scores {map_score:.2f} with distances {distortion:.2f} off, right ones 0.6 and 0.1, and "
+            f"curvatures correlate by {likeness:.2f}, right ones 0.9: front and back may be exchanged"
+        )
         of_edges = f"edges change by {100 * quality.stretch:.0f} % in the mean"
+        likely = map_score - distortion + LIKENESS_SHARE[same_subject] * likeness
         criteria += [
-            (ramp(map_score - distortion, *((0.32, 0.70) if same_subject else (0.25, 0.50))), of_map),
-            (ramp(mirrored_lead, 0.15, 0.05), "the target looks like a mirror image of the template"),
+            (ramp(likely, *MAP[same_subject]), of_map),
+            (ramp(mirrored_lead, *MIRRORED), "the target looks like a mirror image of the template"),
             (ramp(quality.stretch, 0.35, 0.2) if same_subject else 1.0, of_edges),
         ]
     if len(landmark_errors):
