@@ -46,8 +46,7 @@ _LEAST_COUNTED = 0.3
 _CONSISTENT, _FEWEST = 0.12, 8
 # Tips: their smallest distance, the radius in which no vertex is more distant, and the numbers that are matched.
 _TIPS_APART, _TIP_RADIUS, _FEWEST_TIPS, _MOST_TIPS = 0.35, 0.25, 4, 6
-N_MATCHINGS = 4
-"""Number of matchings of tips that give maps."""
+_N_MATCHINGS = 4  # number of matchings of tips that give maps
 # Weight of differences of limb lengths relative to those of the tree between the limbs.
 _LIMB_LENGTH = 0.2
 _SHORTEST_LIMB = 0.1
@@ -87,15 +86,6 @@ class SpectralShape:
     def __len__(self) -> int:
         """Number of coarse vertices."""
         return len(self.coarse.vertices)
-
-    def wave_kernel_signatures(self) -> FloatArray:
-        """Wave kernel signatures (Aubry et al. 2011) of 40 energies, in unit columns. *Shape:* ``(n, 40)``."""
-        n_energies, logs = 40, np.log(np.maximum(self.eigenvalues[1:], 1e-9))
-        energies = np.linspace(logs[0], logs[-1] / 1.02, n_energies)
-        width = max(7 * (logs[-1] - logs[0]) / n_energies, 1e-9)
-        weights = np.exp(-((energies[:, None] - logs) ** 2) / (2 * width**2))
-        signatures = self.functions[:, 1:] ** 2 @ (weights / weights.sum(1, keepdims=True)).T
-        return signatures / np.linalg.norm(signatures, axis=0)
 
     def geodesics_from(self, sources: IntArray) -> FloatArray:
         """Distances along the surface by the heat method. *Shape:* ``(m,) -> (n, m)``."""
@@ -258,7 +248,7 @@ class CoarsePair:
         return self.refined(nearest_rows(*signatures), 8)
 
     def from_tips(self) -> list[Map]:
-        """Maps by limb coordinates from the best matchings of tips; none if there are few tips.
+        """Maps from the best matchings of tips; none if there are few tips.
 
         Matchings compare the tree of distances between the tips: if limbs grow, a distance changes by the growth of
         its two limbs, and what is left is the difference of the trunks.
@@ -268,17 +258,17 @@ class CoarsePair:
         if n < _FEWEST_TIPS:
             return []
         orders = np.array(list(itertools.permutations(range(min(len(others), _MOST_TIPS + 2)), n)))
+        here, there = self.first.geodesics_from(tips[:n])[tips[:n]], self.second.geodesics_from(others)[others]
+        changes = here - there[orders[:, :, None], orders[:, None]]
+        growth = _limb_lengths(changes)
         i, j = np.triu_indices(n, 1)
-        here, there = self.first.geodesics_from(tips)[tips], self.second.geodesics_from(others)[others]
-        changes = here[i, j] - there[orders[:, i], orders[:, j]]
-        growth = changes @ np.linalg.pinv(_pair_incidence(n)).T
-        rest = changes - growth @ _pair_incidence(n).T
-        costs = np.sqrt((rest**2).mean(1)) + _LIMB_LENGTH * growth.std(1)
-        best = orders[np.argsort(costs, kind="stable")[:N_MATCHINGS]]
+        trunks = (changes - growth[:, :, None] - growth[:, None])[:, i, j]
+        costs = np.sqrt((trunks**2).mean(1)) + _LIMB_LENGTH * growth.std(1)
+        best = orders[np.argsort(costs, kind="stable")[:_N_MATCHINGS]]
         return [self.from_limbs(np.stack([tips[:n], others[order]], axis=1)) for order in best]
 
     def from_limbs(self, pairs: IntArray) -> Map:
-        """Map from limb coordinates, which works for any proportions. *Shape:* ``(n, 2)``, coarse vertices of both."""
+        """Map from coordinates along limbs, for any proportions. *Shape:* ``(n, 2)``, coarse vertices of both."""
         here, there = (
             shape.limb_coordinates(ends) for shape, ends in zip((self.first, self.second), pairs.T, strict=True)
         )
@@ -287,8 +277,8 @@ class CoarsePair:
     def from_spectra(self, n_signs: int, progress: ProgressReport) -> list[Map]:
         """The best maps from spectra, best first; the last is the best map to the mirrored target.
 
-        The initial maps are all ``2**n_signs`` sign patterns of the lowest eigenfunctions, wave kernel signatures and
-        rigid alignments of principal axes. All are refined with few eigenfunctions, the best with all.
+        The initial maps are all ``2**n_signs`` sign patterns of the lowest eigenfunctions, and rigid alignments of
+        principal axes. All are refined with few eigenfunctions, the best with all.
         """
         starts, coarse = list(self._starts(n_signs)), []
         progress.expect(len(starts))
@@ -309,7 +299,6 @@ class CoarsePair:
         first, second, k = self.first, self.second, n_signs + 1
         for signs in itertools.product([1.0, -1.0], repeat=n_signs):
             yield nearest_rows(first.functions[:, :k], second.functions[:, :k] * [1.0, *signs]), k
-        yield nearest_rows(first.wave_kernel_signatures(), second.wave_kernel_signatures()), 6
         axes, centred_shapes = [], []
         for surface in (first.coarse, second.coarse):
             points = surface.vertices - np.average(surface.vertices, 0, surface.vertex_areas)
@@ -348,16 +337,11 @@ def nearest_rows(queries: FloatArray, rows: FloatArray) -> IntArray:
     )
 
 
-def _pair_incidence(n: int) -> FloatArray:
-    """Sums over the two members of each pair of n items. *Shape:* ``(n (n - 1) / 2, n)``."""
-    i, j = np.triu_indices(n, 1)
-    return np.eye(n)[i] + np.eye(n)[j]
-
-
 def _limb_lengths(distances: FloatArray) -> FloatArray:
-    """Lengths of limbs from the distances between their tips, by least squares. *Shape:* ``(n, n) -> (n,)``."""
-    pairs = np.triu_indices(len(distances), 1)
-    return np.linalg.pinv(_pair_incidence(len(distances))) @ distances[pairs]
+    """Lengths whose sums in pairs fit distances between tips by least squares. *Shape:* ``(..., n, n) -> (..., n)``."""
+    n, sums = distances.shape[-1], distances.sum(-1)
+    lengths: FloatArray = (sums - sums.sum(-1, keepdims=True) / (2 * n - 2)) / (n - 2)
+    return lengths
 
 
 def difference(points: FloatArray, others: FloatArray) -> float:

@@ -39,7 +39,7 @@ _NEAR_LANDMARK = 0.1  # largest landmark error of a spectral map, for a surface 
 _RIVALS = 3  # maximum number of maps that are fitted
 # Largest difference to the best map, in score minus distortion: between two subjects, and for one.
 _RIVAL_SCORE = 0.2, 0.15
-_WHOLE = 90  # percentile of the distances between fits that tells whether they differ as a whole
+_WHOLE = 70  # percentile of the distances between fits that tells whether they differ as a whole
 _CLOSE = 0.1  # cost above the best fit's up to which others count
 _SPECTRAL_REFINEMENTS = (True, True, False, False)  # of the map of each repeated fit
 _STRETCHED = 0.3  # stretch above which a fit between two subjects is repeated
@@ -320,9 +320,7 @@ class _RegistrationProblem:
         lost = float(self.template.vertex_areas[supported < TRUSTED].sum() / self.template.area)
         quality = quality._replace(unsupported_area=max(quality.unsupported_area, lost))
         freedom = sliding_freedom(self.first, self.mark_vertices[:, 0])
-        confidence, said = judge(
-            quality, score, distortion, best.likeness, errors, mirrored, lead, freedom, self.same_subject
-        )
+        confidence, said = judge(quality, score, best.likeness, errors, mirrored, lead, freedom, self.same_subject)
         unique = np.minimum(self.unique[near], ramp(freedom, *SLIDING))
         of_vertices = np.full(len(everything), confidence)
         of_vertices[self.used] = np.minimum(supported, unique)

@@ -17,11 +17,12 @@ TRUSTED = 0.5  # confidence below which a result is doubtful
 
 SLIDING = 0.9, 0.65  # freedom to slide along the target: no confidence, full confidence
 LEAD = 0.0, 0.1  # advantage over the best fit along another map: no confidence, full confidence
-# Score minus distortion of a map plus weighted likeness, between two subjects and for one, whose joints change the
-# curvature; advantage of a mirrored map.
-LIKENESS_SHARE = 1.5, 0.8
-MAP = (1.55, 1.75), (0.95, 1.25)
-MIRRORED = 0.3, 0.1
+MIRRORED = 0.3, 0.1  # advantage of the best map onto the mirrored target: no confidence, full confidence
+LOG_ODDS = 7.0
+"""Log-odds that a map is right whose score, likeness of curvatures and stretch are those of most right maps."""
+# Loss of log-odds per unit that each is worse, and the value where the loss begins. All are from a logistic regression
+# on pairs with known truth, of one subject and of two, apart from those of tests/benchmarks/people.py.
+SCORE, LIKENESS, STRETCH = (16.0, 0.85), (14.5, 0.92), (7.0, 0.08)
 _FAR = 0.01  # distance from the target above which a face is unsupported, in diagonals
 _SHRUNK = 0.2  # area change relative to the median below which a face is unsupported: missing parts collapse
 _STRAY = 0.03  # distance from the template above which a piece of the target is ignored, in diagonals
@@ -219,7 +220,6 @@ def ramp(value: Any, bad: float, good: float) -> Any:
 def judge(
     quality: Quality,
     map_score: float,
-    distortion: float,
     likeness: float,
     landmark_errors: FloatArray,
     mirrored_lead: float,
@@ -228,9 +228,6 @@ def judge(
     same_subject: bool,
 ) -> tuple[float, tuple[str, ...]]:
     """Confidence, the minimum of several criteria, and a message for each criterion that fails."""
-    advice = "look at the result, and give landmarks (five or more) on both meshes" + (
-        ", or more of them" if len(landmark_errors) else ""
-    )
     distance = max(quality.to_target.mean, quality.from_target.mean)
     criteria = [
         (ramp(distance, 1.0, 0.3), f"the mean distance of the surfaces is {distance:.2f} % of the diagonal"),
@@ -243,20 +240,24 @@ def judge(
         (ramp(lead, *LEAD), "another map fits nearly as well"),
     ]
     if same_subject or not len(landmark_errors):
-        of_map = (
-            f"the map scores {map_score:.2f} with distances {distortion:.2f} off, right ones 0.6 and 0.1, and "
-            f"curvatures correlate by {likeness:.2f}, right ones 0.9: front and back may be exchanged"
-        )
-        of_edges = f"edges change by {100 * quality.stretch:.0f} % in the mean"
-        likely = map_score - distortion + LIKENESS_SHARE[same_subject] * likeness
+        losses = {
+            f"the map scores {map_score:.2f}, right ones mostly 0.6 and more": SCORE[0] * (SCORE[1] - map_score),
+            f"curvatures correlate by {likeness:.2f}, in right maps mostly 0.8 and more: parts may be exchanged, such "
+            "as front and back": LIKENESS[0] * (LIKENESS[1] - likeness),
+            f"edges change by {100 * quality.stretch:.0f} % in the mean": STRETCH[0] * (quality.stretch - STRETCH[1]),
+        }
+        probability = 1 / (1 + np.exp(sum(max(loss, 0) for loss in losses.values()) - LOG_ODDS))
+        reasons = "; ".join(what for what, loss in losses.items() if 2 * loss > max(losses.values()))
         criteria += [
-            (ramp(likely, *MAP[same_subject]), of_map),
+            (probability, reasons),
             (ramp(mirrored_lead, *MIRRORED), "the target looks like a mirror image of the template"),
-            (ramp(quality.stretch, 0.35, 0.2) if same_subject else 1.0, of_edges),
         ]
     if len(landmark_errors):
         worst = int(landmark_errors.argmax())
         error = landmark_errors[worst]
         criteria.append((ramp(error, 8.0, 2.0), f"landmark {worst} is {error:.1f} % off its place"))
+    advice = "look at the result, and give landmarks (five or more) on both meshes" + (
+        ", or more of them" if len(landmark_errors) else ""
+    )
     said = tuple(f"{what}; {advice}" for value, what in criteria if value < TRUSTED)
     return float(min(value for value, _ in criteria)), said
