@@ -17,7 +17,7 @@ TRUSTED = 0.5  # confidence below which a result is doubtful
 
 SLIDING = 0.9, 0.65  # freedom to slide along the target: no confidence, full confidence
 LEAD = 0.0, 0.1  # advantage over the best fit along another map: no confidence, full confidence
-MIRRORED = 0.3, 0.1  # advantage of the best map onto the mirrored target: no confidence, full confidence
+MIRRORED = 0.18, 0.06  # advantage of the best map onto the mirrored target: no confidence, full confidence
 LOG_ODDS = 7.0
 """Log-odds that a map is right whose score, likeness of curvatures and stretch are those of most right maps."""
 # Loss of log-odds per unit that each is worse, and the value where the loss begins. All are from a logistic regression
