@@ -22,8 +22,8 @@ import torch
 import torch_modal as tm
 
 BOUNDS = {
-    "lines of code": 19110,
-    "functions": 1729,
+    "lines of code": 19410,
+    "functions": 1751,
     "docstrings that begin with no noun": 0,
     "functions of in-between": 151,
     "files of in-between": 32,
