@@ -9,7 +9,7 @@ from torch_modal.geometry.rotations import exp
 from torch_modal.geometry.triangle_frames import bent_sides, frames, sides
 from torch_modal.motion.decoder import bending_columns
 
-MOST_STRAIN = 2.0
+MOST_STRAIN = 1.0
 """Bound on the logarithm of a triangle's stretch: on a fine mesh, few triangles of a mode may have far more than on the
 coarse one on which amplitudes are found."""
 
