@@ -40,6 +40,7 @@ from torch_modal.registration.fit import ElasticSurface
 from torch_modal.registration.surface import places_between
 
 MOTIONS = {
+    "creature": ("", 2),
     "mh-hand-path": ("", 4),
     "husky": ("Gallop", 6),
     "fox": ("Gallop", 6),
@@ -51,7 +52,7 @@ MOTIONS = {
 SAMPLES = {
     "scans": ("mh-hand-path", "husky", "fox", "trex", "cow"),
     "template": ("husky", "fox", "trex", "velociraptor"),
-    "markers": ("mh-hand-path", "husky", "trex"),
+    "markers": ("creature", "mh-hand-path", "husky", "trex"),
     "noise": ("mh-hand-path", "husky", "trex"),
 }
 N_POINTS, N_MARKERS, LOST = 1500, 20, 0.1
@@ -63,6 +64,10 @@ Array = NDArray[np.float64]
 def motion(name: str) -> tuple[Tensor, Tensor]:
     """Frames and faces."""
     clip = MOTIONS[name][0]
+    if name == "creature":
+        sample = tm.load_sample(name)
+        frames = torch.stack([sample.keyframes, sample.truth], 1).flatten(0, 1)
+        return frames[:-1].double(), sample.faces  # the last leads on to the first
     if not clip:
         return keyframes_of(name)
     frames, faces, clips = animal(name)
@@ -192,7 +197,7 @@ def main() -> None:
         "doubtful over certain",
         "s",
     ]
-    check = "--samples markers --motions mh-hand-path"
+    check = "--samples markers --motions creature"
     with Table("completion", columns, options.keep, columns[-1:], check, labels=2) as table:
         for samples in options.samples:
             for name in SAMPLES[samples]:
