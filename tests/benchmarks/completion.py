@@ -30,6 +30,7 @@ from measures import NAN
 from numpy.typing import NDArray
 from results import Table, add_keep
 from scipy.spatial import cKDTree
+from spaces import markers
 from timing import limit_threads
 from torch import Tensor
 
@@ -55,7 +56,7 @@ SAMPLES = {
     "markers": ("creature", "mh-hand-path", "husky", "trex"),
     "noise": ("mh-hand-path", "husky", "trex"),
 }
-N_POINTS, N_MARKERS, LOST = 1500, 20, 0.1
+N_POINTS, LOST = 1500, 0.1
 NOISE_OF_SCANS, NOISE = 0.003, 0.01
 NEAR = 0.02  # of the diagonal, between a vertex that counts as seen and a point
 Array = NDArray[np.float64]
@@ -117,15 +118,6 @@ def scans(frames: Tensor, faces: Tensor, at: Sequence[int], size: float) -> list
     return observations
 
 
-def farthest(x: Tensor) -> Tensor:
-    """Vertices that are far from each other."""
-    chosen, distances = [0], (x - x[0]).norm(dim=-1)
-    while len(chosen) < N_MARKERS:
-        chosen.append(int(distances.argmax()))
-        distances = torch.minimum(distances, (x - x[chosen[-1]]).norm(dim=-1))
-    return torch.tensor(chosen)
-
-
 def noisy(frames: Tensor, at: Sequence[int], vertices: Tensor, lost: float, size: float) -> list[tm.Observation]:
     """Places of vertices, some of them lost."""
     rng, noise, observations = np.random.default_rng(0), NOISE * size / 3**0.5, []
@@ -159,7 +151,7 @@ def complete(name: str, samples: str) -> tuple[list[float], float]:
             fits.append(closest_points(start, rest, faces.numpy(), one))
         simple = torch.from_numpy(np.stack(fits))
     elif samples == "markers":
-        observations = noisy(frames, at, farthest(frames[0]), LOST, size)
+        observations = noisy(frames, at, markers(frames[0]), LOST, size)
         space = tm.ShapeSpace(tm.extract_bases(keyframes, faces, 10), faces)
         simple = torch.stack([space.fit(one.points, one.vertices).shape for one in observations])
     else:
