@@ -130,6 +130,16 @@ class TestTemplateAlone:
         with pytest.raises(ValueError, match="one shape alone"):
             found(4.0)
 
+    def test_a_loose_part_that_was_not_seen_stays_with_the_body(self, tube):
+        x, faces, diagonal = tube
+        eye = x[2, :40] * 0.1 + x[2].mean(0) + torch.tensor([0.0, 0.0, 0.15])
+        some = faces[(faces < 40).all(1)]
+        rest = torch.cat([x[2], eye])
+        scans = [scanned(x[i], faces, i, VIEWS[i], i, noise=0.003 * diagonal) for i in (1, 2, 3)]
+        found = tm.complete(rest, torch.cat([faces, some + x.shape[1]]), scans, progress=False)
+        assert bool(found.shapes.isfinite().all())
+        assert float((found.shapes[1, -40:] - eye).norm(dim=-1).max()) < 0.1 * diagonal
+
 
 class TestMarkersAndMeshes:
     def test_noise_of_meshes_is_removed(self, tube):

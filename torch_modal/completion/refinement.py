@@ -2,6 +2,7 @@
 
 import numpy as np
 import torch
+from scipy import sparse
 from torch import Tensor
 
 from torch_modal.arrays import FloatArray
@@ -35,6 +36,10 @@ ROUNDS, STEPS, PRODUCTS = 12, 2, 20
 """Rounds of new pairs, in each of which all vertices take steps, each with iterations of conjugate gradients."""
 LAST = (6, 60)
 """Steps after the last round, and their iterations."""
+
+
+HELD = 1e-4
+"""Weight of each vertex's place by modes, as :data:`WEIGHTS`."""
 
 
 class Refinement:
@@ -94,8 +99,10 @@ class Refinement:
         moved, n = x.numpy(), sum(len(cloud.points) for cloud in frame.clouds)
         surface = ElasticSurface(SampledSurface(moved, self.problem.mesh))
         unit = surface.stiffness * min(n, len(moved) / 2)
+        # Every part is held, also one that no point is near.
+        held = sparse.identity(len(moved), format="csr"), moved, np.full(len(moved), HELD * surface.stiffness)
         for weight, reach in zip(np.geomspace(*WEIGHTS, FOLLOWS), np.geomspace(*REACH, FOLLOWS), strict=True):
-            current, pulls = SampledSurface(moved, self.problem.mesh), []
+            current, pulls = SampledSurface(moved, self.problem.mesh), [held]
             for pairs in [*(cloud.places(current) for cloud in frame.clouds), *frame.markers]:
                 trust = robust(np.linalg.norm(pairs.places @ moved - pairs.points, axis=1), reach / OUTLIERS)
                 pulls.append((pairs.places, pairs.points, weight * unit * pairs.weights * trust))
