@@ -38,7 +38,7 @@ LAST = (6, 60)
 """Steps after the last round, and their iterations."""
 
 
-HELD = 1e-4
+ANCHOR = 1e-4
 """Weight of each vertex's place by modes, as :data:`WEIGHTS`."""
 
 
@@ -99,10 +99,10 @@ class Refinement:
         moved, n = x.numpy(), sum(len(cloud.points) for cloud in frame.clouds)
         surface = ElasticSurface(SampledSurface(moved, self.problem.mesh))
         unit = surface.stiffness * min(n, len(moved) / 2)
-        # Every part is held, also one that no point is near.
-        held = sparse.identity(len(moved), format="csr"), moved, np.full(len(moved), HELD * surface.stiffness)
+        # Every part is anchored, also one that no point is near.
+        anchor = sparse.identity(len(moved), format="csr"), moved, np.full(len(moved), ANCHOR * surface.stiffness)
         for weight, reach in zip(np.geomspace(*WEIGHTS, FOLLOWS), np.geomspace(*REACH, FOLLOWS), strict=True):
-            current, pulls = SampledSurface(moved, self.problem.mesh), [held]
+            current, pulls = SampledSurface(moved, self.problem.mesh), [anchor]
             for pairs in [*(cloud.places(current) for cloud in frame.clouds), *frame.markers]:
                 trust = robust(np.linalg.norm(pairs.places @ moved - pairs.points, axis=1), reach / OUTLIERS)
                 pulls.append((pairs.places, pairs.points, weight * unit * pairs.weights * trust))
