@@ -183,12 +183,12 @@ def carry(args: argparse.Namespace) -> None:
     passengers = tm.Passengers(shapes[0], faces, torch.from_numpy(cloud.positions).to(shapes))
     with ProgressReport(len(files), "meshes", False if args.quiet else None) as bar, torch.no_grad():
 
-        def rename_files() -> Iterator[tuple[Path, bytes]]:
+        def carry_each() -> Iterator[tuple[Path, bytes]]:
             for file, x in zip(files, shapes, strict=True):
                 parts = (passengers(x), passengers.rotations(x), passengers.gradients(x))
                 yield file, cloud.move(*(values.double().numpy() for values in parts))
                 bar.update()
 
-        write_files(rename_files())
+        write_files(carry_each())
     kind = "splats" if cloud.is_splats else "points"
     reporter(args)(f"{len(passengers)} {kind}: {files[0]} to {files[-1].name}")

@@ -89,7 +89,8 @@ def run(args: argparse.Namespace) -> None:
     write_sequence(args, files, frames, faces, asset, keyframe_indices=keys, times=when.tolist())
     if args.picture:
         chosen = torch.linspace(0, len(found.times) - 1, min(8, len(found.times))).round().long().tolist()
-        at = [int((found.times - one.time).abs().argmin()) for one in seen]
+        moments = sorted({one.time for one in seen})  # in the order of found.times, which may be estimated
+        at = [moments.index(one.time) for one in seen]
         tm.render_sequence(
             {"completed": found.shapes[chosen]},
             welded.faces,

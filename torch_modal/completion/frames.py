@@ -40,7 +40,7 @@ class ObservedPoints(NamedTuple):
         """Distances of the points from their places, and if normals agree. *Shape:* ``(n,)``."""
         if isinstance(self.seen, Cloud):
             return self.seen.closest(surface)[2:]
-        distances = np.linalg.norm(self.seen.places @ surface.vertices - self.seen.points, axis=1)
+        distances = self.seen.distances(surface.vertices)
         return distances, np.ones(len(distances), bool)
 
     def with_noise(self, surface: SampledSurface) -> "ObservedPoints":

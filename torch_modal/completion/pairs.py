@@ -42,6 +42,10 @@ class Pairs(NamedTuple):
     numbers: IntArray
     """Indices of the points among those observed. *Shape:* ``(n,)``."""
 
+    def distances(self, x: FloatArray) -> FloatArray:
+        """Distances of the points from their places on a shape. *Shape:* ``(V, 3) -> (n,)``."""
+        return np.linalg.norm(self.places @ x - self.points, axis=1)
+
 
 def join_features(points: FloatArray, normals: FloatArray | None) -> FloatArray:
     """Points with their normals, as places of which near ones are alike. *Shape:* ``(n, 3), (n, 3) -> (n, 6)``."""

@@ -89,7 +89,7 @@ class Refinement:
                 factor = float(np.clip(np.median(ratios), 0.5, 2.0))
                 self.of_known = float(np.clip(self.of_known * factor**2, *STIFFNESSES))
         if self.contact:
-            x = torch.cat([self._separate(solve) for solve in solves])
+            x = self._separate(solves)
         return x, solves
 
     def _follow(self, frame: Frame, x: Tensor) -> Tensor:
@@ -104,7 +104,7 @@ class Refinement:
         for weight, reach in zip(np.geomspace(*WEIGHTS, FOLLOWS), np.geomspace(*REACH, FOLLOWS), strict=True):
             current, pulls = SampledSurface(moved, self.problem.mesh), [anchor]
             for pairs in [*(cloud.places(current) for cloud in frame.clouds), *frame.markers]:
-                trust = robust(np.linalg.norm(pairs.places @ moved - pairs.points, axis=1), reach / OUTLIERS)
+                trust = robust(pairs.distances(moved), reach / OUTLIERS)
                 pulls.append((pairs.places, pairs.points, weight * unit * pairs.weights * trust))
             moved = surface.follow(moved, pulls)
         return torch.from_numpy(moved)
@@ -115,33 +115,36 @@ class Refinement:
         for sample in frame.samples:
             seen, n = sample.seen, len(sample.observation.points)
             pairs, factor = (seen.places(surface), STIFFNESS) if isinstance(seen, Cloud) else (seen, self.of_known)
-            trust = robust(np.linalg.norm(pairs.places @ surface.vertices - pairs.points, axis=1), sample.noise)
+            trust = robust(pairs.distances(surface.vertices), sample.noise)
             springs.append(pairs._replace(weights=factor / sample.noise**2 * n * pairs.weights * trust))
             numbers.append(np.full(len(pairs.points), sample.number))
         points = PointEnergy(springs)
         x = self.fine.relax(x, rests, (steps,), lambda *_: [points])
         return LastSolve(x, self.fine.energy, rests, points, np.concatenate(numbers))
 
-    def _separate(self, solve: LastSolve) -> Tensor:
-        """Push apart the parts of a shape that pass through each other, but for what whole shapes do.
+    def _separate(self, solves: list[LastSolve]) -> Tensor:
+        """Push apart the parts of each shape that pass through each other, but for what whole shapes do.
 
-        *Shape:* ``(1, V, 3)``.
+        *Shape:* ``(T, V, 3)``.
         """
-
-        def relax(x: Tensor, some: Tensor, extra: ExtraEnergies) -> Tensor:
-            one_step = ((1, PRODUCTS),)
-            return self.fine.relax(x, solve.rests, one_step, lambda *chunk: [solve.points, *extra(*chunk)])
-
         template = self.problem.template.numpy()
         areas = torch.from_numpy(vertex_areas(template, self.problem.mesh.faces))
         pairs = self.backend.crossings(self.problem.mesh, template)
-        search = ContactSearch(self.mesh, self.problem.whole, areas, 1, pairs, template)
-        return separate(solve.x, relax, search)[0]
+        search, shapes = ContactSearch(self.mesh, self.problem.whole, areas, 1, pairs, template), []
+        for solve in solves:
+
+            def relax(x: Tensor, _: Tensor, extra: ExtraEnergies, solve: LastSolve = solve) -> Tensor:
+                one_step = ((1, PRODUCTS),)
+                return self.fine.relax(x, solve.rests, one_step, lambda *chunk: [solve.points, *extra(*chunk)])
+
+            search.watched[:] = False  # each shape by itself
+            shapes.append(separate(solve.x, relax, search)[0])
+        return torch.cat(shapes)
 
     @staticmethod
     def _noise_ratios(frame: Frame, x: Tensor) -> list[float]:
         """Squared distances of points from their known places, over those that their noise explains."""
-        misses = [np.linalg.norm(one.places @ x.numpy() - one.points, axis=1) for one in frame.markers]
+        misses = [one.distances(x.numpy()) for one in frame.markers]
         noises = [one.noise for one in frame.samples if isinstance(one.seen, Pairs)]
         return [
             float(np.mean(np.minimum(each / noise, OUTLIERS) ** 2)) / 3

@@ -79,7 +79,7 @@ class PoseSearch:
         surface = self.surface(base, pose)
         total = PRIOR * float(self.stiffness[:-6] @ pose.amplitudes**2)
         for own in seen.markers:
-            off = (np.linalg.norm(own.places @ surface.vertices - own.points, axis=1) / seen.unit) ** 2
+            off = (own.distances(surface.vertices) / seen.unit) ** 2
             total += float(own.weights @ (off / (1 + off)))
         return total + sum(cloud.score(surface, seen.unit) for cloud in seen.clouds)
 
