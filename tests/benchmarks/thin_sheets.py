@@ -2,7 +2,7 @@
 
     python tests/benchmarks/thin_sheets.py [--only TEXT ...] [--peer-python FILE] [--picture FILE.png]
 
-Mean relative errors of edge lengths at t = 1/4, 1/2 and 3/4 of sheets in closed form (tests/sheets.py), by modes of the
+Mean relative errors of edge lengths at t = 1/4, 1/2 and 3/4 of the sheets of moving_sheets.py, by modes of the
 surface. Morphomatics joins where it is installed, or with ``--peer-python``. ``--picture`` draws the sheets instead.
 """
 
@@ -20,8 +20,8 @@ from cases import HALF, Case, KeyframeSet
 from error_pictures import look
 from measures import Yardstick
 from methods import METHODS, UnavailableError, add_peer, peer_python
+from moving_sheets import SHEETS, sheet
 from results import Table, add_keep, wanted
-from sheets import SHEETS, sheet
 from timing import limit_threads, untimed
 
 import torch_modal as tm
