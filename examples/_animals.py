@@ -57,23 +57,23 @@ def _fatter(cone: Cone) -> Cone:
 def tips(cones: tuple[Cone, ...]) -> Array:
     """Eight places a person would pick: nose, tail, paws, ears. *Shape:* ``(8, 3)``."""
     nose = cones[7]
-    found = [np.array([nose.b[0] + nose.rb, *nose.b[1:]])]
+    places = [np.array([nose.b[0] + nose.rb, *nose.b[1:]])]
     for name in TIPS:
         cone = [cone for cone in cones if cone.bone == name][-1]
         along = np.subtract(cone.b, cone.a)
-        found.append(np.array(cone.b) + cone.rb * along / np.linalg.norm(along))
-    return np.array(found)
+        places.append(np.array(cone.b) + cone.rb * along / np.linalg.norm(along))
+    return np.array(places)
 
 
 def held_out(cones: tuple[Cone, ...]) -> Array:
     """Places to judge by: back, belly, and the outer sides of the legs, each at the middle of a cone."""
-    found = []
+    places = []
     for bone, direction in (("waist", [0, 1.0, 0]), ("waist", [0, -1.0, 0]), ("neck", [0, 0, 1.0])):
-        found.append(_beside(cones, bone, direction))
+        places.append(_beside(cones, bone, direction))
     for bone in SIDES:
         for side, sign in (("right", 1.0), ("left", -1.0)):
-            found.append(_beside(cones, f"{bone}-{side}", [0, 0, sign]))
-    return np.array(found)
+            places.append(_beside(cones, f"{bone}-{side}", [0, 0, sign]))
+    return np.array(places)
 
 
 def _beside(cones: tuple[Cone, ...], bone: str, direction: list[float]) -> Array:

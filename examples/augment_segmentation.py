@@ -98,12 +98,12 @@ def main(seeds: int = 3, steps: int = 400, arms: Sequence[str] = ("none", "linea
     sample = load_sample("hand")
     parts = torch.from_numpy(parts_of("hand", sample.keyframes[0].numpy()))
     space = tm.ShapeSpace(tm.extract_bases(sample.keyframes, sample.faces, n_modes=30), sample.faces)
-    found = {}
+    scores = {}
     for arm in arms:
         networks = [trained(pool_of(arm, space), parts, seed, steps) for seed in range(seeds)]
-        found[arm] = torch.tensor([mean_iou(network, sample.truth, parts) for network in networks])
-        print(f"{arm:<12}{100 * found[arm].mean():6.1f} ± {100 * found[arm].std(correction=0):.1f} % IoU", flush=True)
-    return found
+        scores[arm] = torch.tensor([mean_iou(network, sample.truth, parts) for network in networks])
+        print(f"{arm:<12}{100 * scores[arm].mean():6.1f} ± {100 * scores[arm].std(correction=0):.1f} % IoU", flush=True)
+    return scores
 
 
 if __name__ == "__main__":

@@ -83,8 +83,8 @@ def penalties(faces: Tensor) -> dict[str, Penalty]:
 def errors(x: Tensor, truth: Tensor, faces: Tensor) -> list[float]:
     """Mean distance and mean relative error of the edges, both in percent."""
     edges = faces[:, [0, 1, 1, 2, 2, 0]].view(-1, 2).T
-    found, true = ((y[:, edges[0]] - y[:, edges[1]]).norm(dim=-1) for y in (x, truth))
-    return [100 * float((x - truth).norm(dim=-1).mean()), 100 * float(((found - true).abs() / true.mean()).mean())]
+    lengths, true = ((y[:, edges[0]] - y[:, edges[1]]).norm(dim=-1) for y in (x, truth))
+    return [100 * float((x - truth).norm(dim=-1).mean()), 100 * float(((lengths - true).abs() / true.mean()).mean())]
 
 
 def test(decoder: nn.Module, codes: Tensor, truth: Tensor, faces: Tensor) -> list[float]:
@@ -105,15 +105,15 @@ def test(decoder: nn.Module, codes: Tensor, truth: Tensor, faces: Tensor) -> lis
 
 def main(steps: int = 1000, arms: Sequence[str] = ARMS) -> dict[str, list[float]]:
     """Print the table: by arm, errors of reconstruction (distance, edges) and of interpolation."""
-    sample, found = load_sample("creature"), {}
+    sample, table = load_sample("creature"), {}
     faces, size = sample.faces, (sample.keyframes[0].amax(0) - sample.keyframes[0].amin(0)).norm()
     poses, truth = sample.keyframes / size, (sample.truth / size).float()
     print(f"{'%':<18}{'reconstruction, edges':>24}{'interpolation, edges':>24}")
     for arm in arms:
         decoder, codes = train(*training_set(arm, poses, faces), len(poses), steps, penalties(faces).get(arm))
-        found[arm] = test(decoder, codes[: len(poses)], truth, faces)
-        print(f"{arm:<18}" + "".join(f"{value:12.2f}" for value in found[arm]), flush=True)
-    return found
+        table[arm] = test(decoder, codes[: len(poses)], truth, faces)
+        print(f"{arm:<18}" + "".join(f"{value:12.2f}" for value in table[arm]), flush=True)
+    return table
 
 
 if __name__ == "__main__":

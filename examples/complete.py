@@ -65,30 +65,30 @@ def main(folder: Path, n_points: int = 1500) -> dict[str, float]:
         observations.append(tm.Observation(time, points, normals, noise=NOISE * diagonal, view=view))
 
     keyframes = sample.keyframes[[FIRST, LAST]]
-    found = tm.complete(keyframes, sample.faces, observations, times=[FIRST, LAST])
-    alone = tm.Path(keyframes, sample.faces, times=[FIRST, LAST])(keyframes, found.times)
+    completion = tm.complete(keyframes, sample.faces, observations, times=[FIRST, LAST])
+    alone = tm.Path(keyframes, sample.faces, times=[FIRST, LAST])(keyframes, completion.times)
 
     folder.mkdir(parents=True, exist_ok=True)
     frames = torch.linspace(FIRST, LAST, 25, dtype=torch.float64)
     ends = [0, len(frames) - 1]
     tm.save_animation(
-        found(frames), sample.faces, folder / "complete.glb", fps=24, keyframe_indices=ends, overwrite=True
+        completion(frames), sample.faces, folder / "complete.glb", fps=24, keyframe_indices=ends, overwrite=True
     )
     tm.render_sequence(
-        {"completed": found.shapes, "true": truth},
+        {"completed": completion.shapes, "true": truth},
         sample.faces,
         folder / "complete.png",
         titles=[f"t = {time:g}" for time in times],
         keyframe_indices=[],
         view=sample.view,
-        colors={"completed": 1 - found.confidence},
+        colors={"completed": 1 - completion.confidence},
         color_label="1 - confidence",
         points={"seen": [one.points for one in observations]},
         overwrite=True,
     )
     return {
         name: float((x - truth).norm(dim=-1).mean()) / diagonal
-        for name, x in (("path", alone), ("completed", found.shapes))
+        for name, x in (("path", alone), ("completed", completion.shapes))
     }
 
 

@@ -28,11 +28,11 @@ def nearest(made: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
 
     *Shape:* ``(N, V, 3), (M, V, 3) -> (M, V, 3), (M,)``.
     """
-    found = []
+    closest = []
     for x in truth:
         moved = tm.align(made, x)
-        found.append(moved[(moved - x).norm(dim=-1).mean(1).argmin()])
-    shapes = torch.stack(found)
+        closest.append(moved[(moved - x).norm(dim=-1).mean(1).argmin()])
+    shapes = torch.stack(closest)
     return shapes, (shapes - truth).norm(dim=-1).mean(1)
 
 
@@ -66,12 +66,12 @@ def main(out: Path, n: int = 500, rounds: int = 1) -> dict[str, float]:
     last = made["members"]
     for number in range(1, rounds + 1):
         last = made[f"round {number}"] = next_round(given, last, generator)
-    found = {name: nearest(shapes, truth) for name, shapes in made.items()}
-    means = {name: float(distances.mean()) for name, (_, distances) in found.items()}
+    matches = {name: nearest(shapes, truth) for name, shapes in made.items()}
+    means = {name: float(distances.mean()) for name, (_, distances) in matches.items()}
     for name, mean in means.items():
         print(f"{name:<12}{100 * mean:6.2f} % of the diagonal, {mean / means['mixtures']:.2f} of mixtures' distance")
     six = [0, 1, 3, 4, 5, 6]
-    shown = {name: found[name][0][six] for name in ("given", "mixtures", "members")}
+    shown = {name: matches[name][0][six] for name in ("given", "mixtures", "members")}
     out.mkdir(parents=True, exist_ok=True)
     tm.render_sequence(
         {"test": truth[six], **shown},

@@ -29,7 +29,7 @@ TIMES = {"slender": 0.0, "stout": 4.5}
 class Morph(NamedTuple):
     """What came out."""
 
-    found: tm.Registration
+    registration: tm.Registration
     frames: torch.Tensor
     """From the slender animal to the stout one. *Shape:* ``(N, V, 3)``."""
     faces: torch.Tensor
@@ -56,17 +56,17 @@ def main(out: Path, levels: int = 3, cell: float | None = None, n_modes: int = 3
     slender, stout = (galloping(name, TIMES[name], cells[name]) for name in bodies)
     tm.save_mesh(slender, faces, out / "slender.obj", overwrite=True)
     tm.save_mesh(stout, stout_faces, out / "stout.obj", overwrite=True)
-    found = tm.register(slender, faces, stout, stout_faces, landmarks=landmarks, same_subject=False)
-    print(found.summary())
+    registration = tm.register(slender, faces, stout, stout_faces, landmarks=landmarks, same_subject=False)
+    print(registration.summary())
 
-    keyframes = torch.stack([torch.from_numpy(slender), found.positions])
+    keyframes = torch.stack([torch.from_numpy(slender), registration.positions])
     frames = tm.subdivide(keyframes, faces, levels, n_modes=n_modes)
     places = tm.keyframe_places(2, levels)
     tm.save_animation(frames, faces, out / "morph.glb", keyframe_indices=places, ping_pong=True, overwrite=True)
     rows = {"torch_modal": frames, "linear": tm.linear_sequence(keyframes, places)}
     tm.render_sequence(rows, faces, out / "morph.png", columns=5, keyframe_indices=places, overwrite=True)
     print(f"{len(frames)} frames of {len(slender)} vertices in {out}: morph.glb, morph.png")
-    return Morph(found, frames, torch.from_numpy(faces), out)
+    return Morph(registration, frames, torch.from_numpy(faces), out)
 
 
 if __name__ == "__main__":

@@ -182,5 +182,5 @@ if __name__ == "__main__":
     parser.add_argument("--meshes", type=Path, nargs="+")
     args = parser.parse_args()
     for seed in args.seeds:
-        found = main(args.frames, args.steps, seed, args.meshes)
-        print(f"seed {seed}: " + ", ".join(f"{name} {100 * error:.2f}" for name, error in found.items()), flush=True)
+        errors = main(args.frames, args.steps, seed, args.meshes)
+        print(f"seed {seed}: " + ", ".join(f"{name} {100 * error:.2f}" for name, error in errors.items()), flush=True)

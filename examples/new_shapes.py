@@ -28,11 +28,11 @@ RIDGE = 0.03
 
 def markers(x: Tensor) -> Tensor:
     """Vertices that are far from each other. *Shape:* ``(V, 3) -> (N_MARKERS,)``."""
-    found, distances = [0], (x - x[0]).norm(dim=-1)
-    while len(found) < N_MARKERS:
-        found.append(int(distances.argmax()))
-        distances = torch.minimum(distances, (x - x[found[-1]]).norm(dim=-1))
-    return torch.tensor(found)
+    vertices, distances = [0], (x - x[0]).norm(dim=-1)
+    while len(vertices) < N_MARKERS:
+        vertices.append(int(distances.argmax()))
+        distances = torch.minimum(distances, (x - x[vertices[-1]]).norm(dim=-1))
+    return torch.tensor(vertices)
 
 
 def linear_fit(poses: Tensor, points: Tensor, vertices: Tensor) -> Tensor:
@@ -119,11 +119,11 @@ def main(out: Path, n: int = 200, n_modes: int = 15) -> dict[str, list[float]]:
         vertices = markers(poses[k])
         points = poses[k, vertices]
         space = tm.ShapeSpace([bases[i] for i in rest], faces)
-        found = {"fitted": space.fit(points, vertices).shape, "linear span": linear_fit(poses[rest], points, vertices)}
-        for name, x in {"20 markers": poses[k], **found}.items():
+        fitted = {"fitted": space.fit(points, vertices).shape, "linear span": linear_fit(poses[rest], points, vertices)}
+        for name, x in {"20 markers": poses[k], **fitted}.items():
             shown, all_faces = with_dots(x, faces, points, 0.012 * diagonal)
             rows[name].append(shown)
-        for name, x in found.items():
+        for name, x in fitted.items():
             off = 100 * (x - poses[k]).norm(dim=-1) / diagonal
             errors[name].append(float(off.mean()))
             colors[name].append(torch.nn.functional.pad(off, (0, len(shown) - len(off))))

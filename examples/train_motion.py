@@ -11,7 +11,7 @@ network in four kinds of coordinates:
 - *vertices*: all coordinates.
 
 All are judged on strides of other animals that none has seen: from their first two shapes, the rest of the stride is
-told step by step.
+predicted step by step.
 
     python examples/train_motion.py [--animals 4] [--steps 300] [--seeds 5] [--out out/motion.png]
 """
@@ -36,7 +36,7 @@ N_FRAMES = 24
 N_MODES, N_KEYFRAMES = 30, 4
 N_TEST = 4
 AHEAD = 4
-"""Steps that are told one from the other in training."""
+"""Steps that are predicted one from the other in training."""
 REACH = (0.7, 1.2)
 """All turns of the joints of fore legs, hind legs and spine, times numbers between these."""
 HIDDEN = 64
@@ -70,12 +70,12 @@ class Space(NamedTuple):
 class Learned(NamedTuple):
     """What one network has learned, on animals that were not trained on; in percent of the diagonal."""
 
-    held: float
+    reconstruction: float
     """Mean distance of the vertices when the true codes are decoded: what the coordinates cannot hold."""
     one: float
     """Of the shape that follows two true ones."""
     stride: float
-    """Of all shapes of a stride that is told from its first two."""
+    """Of all shapes of a stride that is predicted from its first two."""
     edges: float
     """Mean relative error of their edge lengths."""
     shapes: Tensor
@@ -133,8 +133,8 @@ def spaces(data: Strides, n_modes: int) -> dict[str, Space]:
     decoder = motion.decoder
 
     def amplitudes(strides: Tensor) -> Tensor:
-        found = [motion.fit(stride, motion.times) for stride in strides]
-        return torch.stack([torch.cat([each.amplitudes, 100 * each.motions], 1) for each in found])
+        fits = [motion.fit(stride, motion.times) for stride in strides]
+        return torch.stack([torch.cat([each.amplitudes, 100 * each.motions], 1) for each in fits])
 
     def bent(codes: Tensor, frames: Tensor) -> Tensor:
         return decoder(codes[:, :-6], frames.double(), codes[:, -6:] / 100)
@@ -197,16 +197,16 @@ class Next(nn.Module):
         )
 
 
-def told(net: Next, codes: Tensor, first: Tensor, n: int) -> tuple[Tensor, Tensor]:
+def predict(net: Next, codes: Tensor, first: Tensor, n: int) -> tuple[Tensor, Tensor]:
     """Codes that follow two, step by step, and their frame numbers. *Shape:* ``(B, 2, n), (B,)``."""
     before, last = codes.unbind(1)
-    found, frames = [], []
+    codes_after, frames = [], []
     for step in range(n):
         frame = (first + 2 + step) % N_FRAMES
         before, last = last, net(before, last, frame)
-        found.append(last)
+        codes_after.append(last)
         frames.append(frame)
-    return torch.stack(found, 1), torch.stack(frames, 1)
+    return torch.stack(codes_after, 1), torch.stack(frames, 1)
 
 
 def train(data: Strides, space: Space, steps: int, batch: int = 6, rate: float = 5e-3, seed: int = 0) -> Learned:
@@ -219,7 +219,7 @@ def train(data: Strides, space: Space, steps: int, batch: int = 6, rate: float =
         animal = torch.randint(len(data.train), (batch,), generator=generator)
         first = torch.randint(N_FRAMES, (batch,), generator=generator)
         start = torch.stack([space.train[animal, first], space.train[animal, (first + 1) % N_FRAMES]], 1)
-        codes, frames = told(net, start, first, AHEAD)
+        codes, frames = predict(net, start, first, AHEAD)
         x = space.decode(codes.flatten(0, 1), frames.flatten())
         loss = (x - data.train[animal[:, None], frames].flatten(0, 1)).square().sum(-1).mean()
         optimizer.zero_grad()
@@ -240,15 +240,15 @@ def judged(data: Strides, space: Space, net: Next) -> Learned:
     def off(x: Tensor, truth: Tensor) -> float:
         return 100 * float((x - truth).norm(dim=-1).mean())
 
-    held = off(decoded(space.test, everything), data.test)
+    reconstruction = off(decoded(space.test, everything), data.test)
     before, last = space.test[:, :-2].flatten(0, 1), space.test[:, 1:-1].flatten(0, 1)
     frames = everything[:, 2:].flatten()
     one = off(space.decode(net(before, last, frames), frames), data.test[:, 2:].flatten(0, 1))
-    codes, frames = told(net, space.test[:, :2], torch.zeros(N_TEST, dtype=torch.int64), N_FRAMES - 2)
+    codes, frames = predict(net, space.test[:, :2], torch.zeros(N_TEST, dtype=torch.int64), N_FRAMES - 2)
     x, truth = decoded(codes, frames), data.test[:, 2:]
     lengths, true_lengths = edge_lengths(x, data.faces), edge_lengths(truth, data.faces)
     edges = 100 * float((lengths / true_lengths - 1).abs().mean())
-    return Learned(held, one, off(x, truth), edges, x[0])
+    return Learned(reconstruction, one, off(x, truth), edges, x[0])
 
 
 def edge_lengths(x: Tensor, faces: Tensor) -> Tensor:
@@ -257,18 +257,18 @@ def edge_lengths(x: Tensor, faces: Tensor) -> Tensor:
     return (corners - corners.roll(1, -2)).norm(dim=-1)
 
 
-def draw(data: Strides, found: dict[str, Learned], out: Path) -> None:
+def draw(data: Strides, results: dict[str, Learned], out: Path) -> None:
     """Some shapes of the first test animal's stride in each kind of coordinates, coloured by their distance."""
     shown = torch.linspace(0, N_FRAMES - 2, 5).long()
     given = data.test[0, 1:2]
     truth = torch.cat([given, data.test[0, 2:]])[shown]
-    told = {name: torch.cat([given, each.shapes])[shown] for name, each in found.items()}
-    errors = {name: 100 * (x - truth).norm(dim=-1) for name, x in told.items()}
+    predicted = {name: torch.cat([given, each.shapes])[shown] for name, each in results.items()}
+    errors = {name: 100 * (x - truth).norm(dim=-1) for name, x in predicted.items()}
     label = "distance from the truth in % of the bounding box"
     out.parent.mkdir(parents=True, exist_ok=True)
     titles = ["given"] + [f"{step} steps" for step in shown[1:].tolist()]
     tm.render_sequence(
-        {"truth": truth, **told},
+        {"truth": truth, **predicted},
         data.faces,
         out,
         titles=titles,
@@ -294,10 +294,10 @@ def main(
         n_modes: Amplitudes of a frame.
     """
     data = strides(n_animals, cell, torch.Generator().manual_seed(seed))
-    found = {}
+    results = {}
     for name, space in spaces(data, n_modes).items():
-        found[name] = train(data, space, steps, rate=RATES.get(name, 5e-3), seed=seed)
-    return data, found
+        results[name] = train(data, space, steps, rate=RATES.get(name, 5e-3), seed=seed)
+    return data, results
 
 
 if __name__ == "__main__":
@@ -307,15 +307,13 @@ if __name__ == "__main__":
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--out", type=Path, default=None, metavar="FILE")
     arguments = parser.parse_args()
-    print("| seed | coordinates | held | next shape | whole stride | its edges |\n|---|---|---|---|---|---|")
+    print("| seed | coordinates | reconstruction | next shape | whole stride | its edges |\n|---|---|---|---|---|---|")
     for seed in range(arguments.seeds):
         started = time.process_time()
-        data, found = main(arguments.animals, arguments.steps, seed)
-        for name, each in found.items():
-            print(
-                f"| {seed} | {name} | {each.held:.2f} | {each.one:.2f} | {each.stride:.2f} | {each.edges:.2f} |",
-                flush=True,
-            )
+        data, results = main(arguments.animals, arguments.steps, seed)
+        for name, each in results.items():
+            numbers = [f"{x:.2f}" for x in (each.reconstruction, each.one, each.stride, each.edges)]
+            print(f"| {seed} | {name} | {' | '.join(numbers)} |", flush=True)
         if arguments.out is not None and seed == 0:
-            draw(data, found, arguments.out)
+            draw(data, results, arguments.out)
         print(f"({time.process_time() - started:.0f} s)", flush=True)

@@ -58,7 +58,7 @@ class Learned(NamedTuple):
     shapes: Tensor
     """The shapes decoded from the mean of those. *Shape:* ``(3, V, 3)``."""
     timing_error: float
-    """Mean distance of a told from the true time; the motion takes 1."""
+    """Mean distance of the predicted from the true time; the motion takes 1."""
     vertex_error: float
     """Root mean square distance over all vertices, in percent of the bounding-box diagonal."""
     edge_error: float
@@ -178,7 +178,7 @@ def edge_lengths(x: Tensor, faces: Tensor) -> Tensor:
 
 
 def draw(data: Data, result: Result, out: Path) -> None:
-    """Losses, told times, and the decoded shapes, in one picture."""
+    """Losses, predicted times, and the decoded shapes, in one picture."""
     from matplotlib.figure import Figure
     from matplotlib.image import imread
 
@@ -215,7 +215,9 @@ def draw(data: Data, result: Result, out: Path) -> None:
     falling.set(xlabel="step of Adam", ylabel="distance of markers [%]", ylim=(0, None), title="what is trained on")
     falling.legend(frameon=False)
     timing.plot([0, 1], [0, 1], color="0.7", lw=1, zorder=0)
-    timing.set(xlabel="true time", ylabel="told time", xlim=(0, 1), ylim=(0, 1), title="times, learned without labels")
+    timing.set(
+        xlabel="true time", ylabel="predicted time", xlim=(0, 1), ylim=(0, 1), title="times, learned without labels"
+    )
     timing.legend(frameon=False)
     axes = right.subplots()
     axes.imshow(shapes)
@@ -256,9 +258,9 @@ if __name__ == "__main__":
     parser.add_argument("--out", type=Path, default=Path("out") / "timing.png")
     arguments = parser.parse_args()
     started = time.perf_counter()
-    found = main(arguments.steps, arguments.out)
+    results = main(arguments.steps, arguments.out)
     print("                       markers first -> last   time off   vertices off   edges off")
-    for name, learned in found._asdict().items():
+    for name, learned in results._asdict().items():
         print(
             f"{name:20s} {learned.losses[0]:12.2f} % -> {learned.losses[-1]:.2f} %   {learned.timing_error:8.3f}   "
             f"{learned.vertex_error:10.2f} %   {learned.edge_error:7.2f} %"
