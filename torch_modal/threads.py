@@ -1,4 +1,4 @@
-"""Batches on all cores: chunks of samples in Python threads, forward and backward.
+"""Work on all cores: functions in Python threads, and batches as chunks of samples, forward and backward.
 
 Kernels take one core of a CPU and release the interpreter's lock; torch's own threads hardly help. Here one thread
 computes one chunk at a time, with torch's own threads at one. The chunks do not depend on the number of threads, and so
@@ -9,12 +9,13 @@ import os
 import threading
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from functools import cache, partial
 from typing import Any, TypeVar
 
 import torch
+from threadpoolctl import OpenBLASController, ThreadpoolController
 from torch import Tensor
 
 from torch_modal import trees
@@ -25,6 +26,10 @@ Result = TypeVar("Result")
 # Vertices of a chunk: at most, but for rounding; and at least, as each takes some milliseconds whatever its size.
 MOST_VERTICES = 40_000
 LEAST_VERTICES = 8_000
+
+
+class StoppedError(Exception):
+    """Raised in threads that are cancelled by another failure or Ctrl-C; never reaches the caller of the package."""
 
 
 class _Here(threading.local):
@@ -46,7 +51,7 @@ def warn(text: str, number: int, category: type[Warning]) -> None:
 @cache
 def _pool(n: int) -> ThreadPoolExecutor:
     # The number of torch's threads is set for one thread alone. Threads stay: launches of kernels are kept by thread.
-    return ThreadPoolExecutor(n, "in-betweens", torch.set_num_threads, (1,))
+    return ThreadPoolExecutor(n, "torch_modal", torch.set_num_threads, (1,))
 
 
 if hasattr(os, "register_at_fork"):
@@ -70,14 +75,55 @@ def alone() -> Iterator[None]:
         _HERE.n_threads = before
 
 
-def run(work: Sequence[Callable[[], Result]]) -> list[Result]:
+class _OneBlasThread:
+    """Number of active `one_blas_thread` contexts, and the limits that the last one restores."""
+
+    lock = threading.Lock()
+    count = 0
+    limits: Any = None
+
+
+@contextmanager
+def one_blas_thread() -> Iterator[None]:
+    """Limit BLAS to one thread; context manager and decorator.
+
+    The matrix products here are small, and busy-waiting BLAS threads cost ten times the work. In most BLAS builds the
+    limit belongs to the process, so the last context restores it; in some it belongs to the thread, so every thread
+    enters one.
+    """
+    state = _OneBlasThread
+    with state.lock:
+        limits = ThreadpoolController().select(user_api="blas").limit(limits=1)
+        if state.count == 0:
+            state.limits = limits
+        state.count += 1
+    try:
+        yield
+    finally:
+        with state.lock:
+            state.count -= 1
+            if state.count == 0:
+                # Later versions of threadpoolctl accept the limit from its first thread only, unless that is cleared.
+                getattr(OpenBLASController, "clear_controlling_thread", lambda **_: None)(force=True)
+                state.limits.__exit__(None, None, None)
+
+
+def run(
+    work: Sequence[Callable[[], Result]], most: int | None = None, stop: threading.Event | None = None
+) -> list[Result]:
     """Results of functions, in threads, as many as torch has; each has the modes of gradients and inference of here.
 
-    An error is raised, and Ctrl-C ends the call, once no thread computes any more. Within such a thread, and where
-    torch has one, the functions run one after another.
+    The first error is raised, and Ctrl-C ends the call, once no thread computes any more. Within such a thread, and
+    where torch has one, the functions run one after another.
+
+    Args:
+        work: The functions.
+        most: Largest number of threads, to bound memory; at least one is used.
+        stop: Event that is set at the first error or Ctrl-C, for functions that check it and raise `StoppedError`.
     """
+    n = n_threads() if most is None else min(n_threads(), max(most, 1))
     # Transforms, forward mode and dispatch modes belong to this thread: others would not have them.
-    if min(n_threads(), len(work)) < 2 or within_transforms() or current_dispatch_mode() is not None:
+    if min(n, len(work)) < 2 or within_transforms() or current_dispatch_mode() is not None:
         with alone():
             return [compute() for compute in work]
     recording, inference = torch.is_grad_enabled(), torch.is_inference_mode_enabled()
@@ -89,10 +135,17 @@ def run(work: Sequence[Callable[[], Result]]) -> list[Result]:
 
     futures: list[Future[Any]] = []
     try:
-        futures.extend(_pool(n_threads()).submit(within, compute) for compute in work)
-        # A signal that another thread receives ends no wait of this one, which then looks for it by itself.
-        while wait(futures, timeout=0.2).not_done:
-            pass
+        futures.extend(_pool(n).submit(within, compute) for compute in work)
+        pending = set(futures)
+        while pending:
+            # A signal that another thread receives ends no wait of this one, which then looks for it by itself.
+            done, pending = wait(pending, timeout=0.2, return_when=FIRST_EXCEPTION)
+            for future in done:
+                future.result()
+    except BaseException:
+        if stop is not None:
+            stop.set()
+        raise
     finally:
         for future in futures:
             future.cancel()
@@ -147,7 +200,7 @@ def by_chunks(compute: Callable[[Any], Any], samples: Any, n_vertices: int, clos
         if recording:
             output = _Chunks.apply(results, sizes, *tensors)
         else:
-            output = [_join(each) for each in zip(*(outputs for _, outputs in results(*tensors)), strict=True)]
+            output = [torch.cat(each) for each in zip(*(outputs for _, outputs in results(*tensors)), strict=True)]
     return trees.fill(skeletons[0], output)
 
 
@@ -163,7 +216,7 @@ class _Chunks(torch.autograd.Function):
         holder.graphs = graphs = ctx.results(*tensors)
         ctx.save_for_backward(holder, *tensors)
         each = list(zip(*(results for _, results in graphs), strict=True))
-        joined = [_join([x.detach() for x in parts]) for parts in each]
+        joined = [torch.cat([x.detach() for x in parts]) for parts in each]
         constant = [not any(x.requires_grad for x in parts) for parts in each]
         ctx.mark_non_differentiable(*(x for x, alone in zip(joined, constant, strict=True) if alone))
         return tuple(joined)
@@ -177,27 +230,16 @@ class _Chunks(torch.autograd.Function):
         if again or graphs is None:
             graphs = ctx.results(*saved)
 
-        def gradients(i: int) -> Sequence[Tensor | None]:
+        def gradients(i: int) -> Sequence[Tensor]:
             inputs, results = graphs[i]
             to = [x for x, need in zip(inputs, needed, strict=True) if need]
             pairs = [(y, x.split(sizes)[i]) for y, x in zip(results, grads, strict=True) if x is not None]
             pairs = [(y, x) for y, x in pairs if y.requires_grad]
             if not pairs:
-                return [None] * len(to)
+                return [torch.zeros_like(x) for x in to]
             outputs, slopes = zip(*pairs, strict=True)
-            return torch.autograd.grad(outputs, to, slopes, retain_graph=True, create_graph=again, allow_unused=True)
+            options = {"retain_graph": True, "create_graph": again, "materialize_grads": True}
+            return torch.autograd.grad(outputs, to, slopes, **options)
 
         each = zip(*run([partial(gradients, i) for i in range(len(sizes))]), strict=True)
-        sums = (_gradient(x.split(sizes), next(each)) if need else None for x, need in zip(saved, needed, strict=True))
-        return None, None, *sums
-
-
-def _gradient(tensors: Sequence[Tensor], parts: Sequence[Tensor | None]) -> Tensor | None:
-    """Gradients of chunks as one; None if no chunk has one."""
-    if all(own is None for own in parts):
-        return None
-    return _join([torch.zeros_like(x) if own is None else own for x, own in zip(tensors, parts, strict=True)])
-
-
-def _join(parts: Sequence[Tensor]) -> Tensor:
-    return parts[0] if len(parts) == 1 else torch.cat(list(parts))
+        return None, None, *(torch.cat(next(each)) if need else None for need in needed)

@@ -14,9 +14,10 @@ from benchmarks.quadratic_tetrahedra import quadratic_modes
 from conftest import COARSE
 from solids import as_mesh, box, eigenmodes, lumped_mass, surface, together
 
+from torch_modal import threads
 from torch_modal.geometry.canonical import to_canonical
 from torch_modal.keyframes.check import MeshError, MeshWarning
-from torch_modal.modes import carrying, eigen, extract, parallel
+from torch_modal.modes import carrying, eigen, extract
 from torch_modal.modes import lattice as lattice_module
 from torch_modal.modes.eigen import ElasticModes, ModalAnalysisError
 from torch_modal.modes.extract import extract_bases, extract_modes
@@ -135,7 +136,7 @@ def test_untrustworthy_problems_are_refused() -> None:
     solid = box((4, 2, 2), (2.0, 1.0, 1.0))
     k, mass = arap_hessian(solid), lumped_mass(solid)
     anchored = k + sp.diags(np.r_[np.ones(3), np.zeros(k.shape[0] - 3)])
-    with pytest.raises(ModalAnalysisError, match="six rigid motions"):
+    with pytest.raises(ModalAnalysisError, match="the rigid motions"):
         eigenmodes(sp.csc_matrix(anchored), sp.diags(mass), solid.vertices, 4)
     indefinite = k - 0.1 * sp.diags(np.repeat(mass, 3))
     with pytest.raises(ModalAnalysisError):
@@ -305,7 +306,7 @@ def test_threads_change_nothing(boxed: Mesh, monkeypatch: pytest.MonkeyPatch) ->
     keyframes = np.stack([vertices * (1.0, 1.0, 1.0 + 0.02 * i) for i in range(6)])
     found = []
     for cpus in (1, 4, 4):
-        monkeypatch.setattr(parallel, "n_cpus", lambda cpus=cpus: cpus)
+        monkeypatch.setattr(threads, "n_threads", lambda cpus=cpus: cpus)
         found.append(extract_bases(keyframes, faces, 5, cache=False))
     for alone, one, other in zip(*found, strict=True):
         np.testing.assert_array_equal(alone.modes, one.modes)
@@ -323,7 +324,7 @@ def test_keyframes_are_meshed_at_the_same_time(boxed: Mesh, monkeypatch: pytest.
             together.wait(timeout=30)  # passes only if three are in here
         return lattice_module.lattice()
 
-    monkeypatch.setattr(parallel, "n_cpus", lambda: 3)
+    monkeypatch.setattr(threads, "n_threads", lambda: 3)
     monkeypatch.setattr(TetWild, "fill", wait_for_the_others)
     monkeypatch.setattr(carrying, "MAX_FIT", -1.0)  # each needs its own
     four = np.stack([vertices] * 4)

@@ -1,42 +1,35 @@
 """Work in threads: all of it, as many at a time as allowed, and an end when one fails."""
 
 import threading
-import time
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from torch_modal.modes import eigen, extract, parallel
+from torch_modal.modes import eigen, extract
 from torch_modal.modes.extract import extract_modes
-from torch_modal.modes.parallel import StoppedError, one_blas_thread, run_all
+from torch_modal.threads import StoppedError, one_blas_thread, run
 
 
-@pytest.fixture(params=[1, 3])
-def cpus(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> int:
-    monkeypatch.setattr(parallel, "n_cpus", lambda: request.param)
-    return request.param
-
-
-def test_results_are_in_order(cpus: int) -> None:
-    def work(index: int) -> int:
-        time.sleep(0.01 * (5 - index))
-        return index * index
-
-    assert run_all(work, 5, threading.Event(), 5) == [0, 1, 4, 9, 16]
-    assert run_all(work, 0, threading.Event(), 5) == []
+@pytest.fixture(autouse=True)
+def three_threads() -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    yield
+    torch.set_num_threads(before)
 
 
 @pytest.mark.parametrize("bound", [0, 2, 9])
-def test_as_many_at_once_as_processors(cpus: int, bound: int) -> None:
+def test_as_many_at_once_as_allowed(bound: int) -> None:
     running, most, lock = 0, 0, threading.Lock()
-    allowed = min(cpus, max(bound, 1))
+    allowed = min(3, max(bound, 1))
     together = threading.Barrier(allowed)
 
-    def work(index: int) -> None:
+    def work(index: int) -> int:
         nonlocal running, most
         with lock:
             running += 1
@@ -44,35 +37,13 @@ def test_as_many_at_once_as_processors(cpus: int, bound: int) -> None:
         together.wait(timeout=30)  # passes only if so many are in here
         with lock:
             running -= 1
+        return index
 
-    run_all(work, 2 * cpus, threading.Event(), bound)
+    assert run([partial(work, index) for index in range(6)], bound) == [*range(6)]
     assert most == allowed
 
 
-def test_ctrl_c_while_work_is_handed_out_ends_what_has_begun(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(parallel, "n_cpus", lambda: 2)
-    stop, begun, told = threading.Event(), threading.Event(), []
-
-    def work(index: int) -> None:
-        begun.set()
-        told.append(stop.wait(30))
-
-    class Interrupted(ThreadPoolExecutor):
-        def submit(self, *given: Any) -> Any:
-            if not begun.is_set():
-                future = super().submit(*given)
-                assert begun.wait(30)
-                return future
-            raise KeyboardInterrupt
-
-    monkeypatch.setattr(parallel, "ThreadPoolExecutor", Interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        run_all(work, 2, stop, 2)
-    assert told == [True]
-
-
-def test_the_first_error_ends_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(parallel, "n_cpus", lambda: 2)
+def test_the_first_error_ends_the_others() -> None:
     stop, begun, ended = threading.Event(), [], []
 
     def work(index: int) -> None:
@@ -85,11 +56,10 @@ def test_the_first_error_ends_the_others(monkeypatch: pytest.MonkeyPatch) -> Non
         raise StoppedError
 
     with pytest.raises(ValueError, match="no luck"):
-        run_all(work, 6, stop, 6)
-    # The second ran beside the first and saw the flag; at most one more was begun before the rest was called off.
+        run([partial(work, index) for index in range(6)], 2, stop)
+    # The second ran next to the first and saw the event; at most one more began before the rest was cancelled.
     assert sorted(begun) in ([0, 1], [0, 1, 2])
     assert sorted(ended) == [index for index in sorted(begun) if index > 0]
-    assert not any(thread.name.startswith("torch_modal") for thread in threading.enumerate())
 
 
 def blas_threads() -> set[int]:

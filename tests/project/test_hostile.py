@@ -16,7 +16,7 @@ from hostile_inputs import CASES, EITHER, ERROR
 from torch.utils.data import DataLoader, Dataset
 
 import torch_modal as tm
-from torch_modal.modes.parallel import n_cpus
+from torch_modal.threads import n_threads
 
 ROOT = Path(tm.__file__).parents[1]
 TESTS = Path(__file__).parents[1]
@@ -131,7 +131,7 @@ def test_ctrl_c_ends_all_of_several_workers(tmp_path: Path) -> None:
     process = start(tmp_path / "cache", EACH)
     try:
         end = time.monotonic() + 60
-        while len(workers := workers_of(process.pid)) < min(2, n_cpus()):
+        while len(workers := workers_of(process.pid)) < min(2, n_threads()):
             assert process.poll() is None and time.monotonic() < end
             time.sleep(0.01)
         process.send_signal(signal.SIGINT)

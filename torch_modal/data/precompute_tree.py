@@ -14,7 +14,7 @@ from tqdm import tqdm
 from torch_modal.data.precompute_set import DONE, Options, Record, run_set
 from torch_modal.data.tree import find_keyframe_sets
 from torch_modal.extras import require
-from torch_modal.modes.parallel import n_cpus
+from torch_modal.threads import n_threads
 
 RETRIES = 2
 """Retries of a task that raised an error on a cluster: a machine may lack the package or the folders."""
@@ -104,7 +104,7 @@ def precompute_tree(
 def _executor(workers: int | None, scheduler: str | None) -> Iterator[tuple[Executor, Any]]:
     """An executor of threads that each wait for the process of one set, or of a Dask cluster; and its stop event."""
     if not scheduler:
-        with ThreadPoolExecutor(workers or n_cpus(), thread_name_prefix="torch_modal-set") as executor:
+        with ThreadPoolExecutor(workers or n_threads(), thread_name_prefix="torch_modal-set") as executor:
             yield executor, threading.Event()
         return
     # Sets of a dead worker go to others, until one has killed several (distributed.scheduler.allowed-failures).

@@ -67,16 +67,15 @@ class ElasticModes(NamedTuple):
 
 
 def lowest_modes(body: ElasticBody, n_modes: int) -> ElasticModes:
-    """Lowest elastic modes of a body, at most ``3N - 6``.
+    """Lowest elastic modes of a body, at most ``3N - 6`` for each connected component.
 
     Shift-invert Lanczos with a negative shift: ``K + shift M`` is positive definite and has the modes of ``K``. Rigid
-    motions are known and projected out, so that Lanczos need not find six equal eigenvalues. Connected components are
-    solved separately for the same reason. Small problems are solved densely. The first of the largest components of
-    each mode is positive.
+    motions of the components are known and projected out, so that Lanczos need not find as many equal eigenvalues.
+    Small problems are solved densely. The first of the largest components of each mode is positive.
 
     Returns:
         The modes. Rigid motions of connected components against each other come first, six for each further component,
-        beside the ``n_modes`` requested ones.
+        in addition to the ``n_modes`` requested ones.
 
     Raises:
         ModalAnalysisError: Rigid motions have energy, the stiffness is indefinite, all modes are zero modes, or a
@@ -91,31 +90,60 @@ def lowest_modes(body: ElasticBody, n_modes: int) -> ElasticModes:
         shift = 1 / float((np.ptp(positions, axis=0) ** 2).sum())
     inertia = sp.kron(mass, sp.identity(3), format="csr")
     n_pieces, piece = connected_components(_vertex_graph(k), directed=False)
-    if n_pieces == 1:
-        return _component_modes(k, inertia, positions, n_modes, shift, largest_residual)
-
     rigid = np.zeros((k.shape[0], N_RIGID * n_pieces))
-    eigenvalues, modes, n_zero = [], [], N_RIGID * n_pieces
     for index in range(n_pieces):
         vertices = np.flatnonzero(piece == index)
         rows = _unknowns(vertices)
-        block, block_inertia = sp.csc_matrix(k[rows][:, rows]), inertia[rows][:, rows]
-        n_own = min(n_modes, 3 * len(vertices) - N_RIGID)
-        component = _component_modes(block, block_inertia, positions[vertices], n_own, shift, largest_residual)
-        whole = np.zeros((len(rigid), n_own))
-        whole[rows] = component.modes
-        modes.append(whole)
-        eigenvalues.append(component.eigenvalues)
-        rigid[rows, N_RIGID * index : N_RIGID * (index + 1)] = rigid_motions(positions[vertices], block_inertia)
-        n_zero += component.n_zero - N_RIGID
-    # The rigid motions of components, without the rigid motions of the whole.
-    whole_rigid = rigid_motions(positions, inertia)
-    relative = rigid @ scipy.linalg.qr(rigid.T @ (inertia @ whole_rigid))[0][:, N_RIGID:]
-    order = np.argsort(np.concatenate(eigenvalues), kind="stable")[:n_modes]
-    columns = np.concatenate([relative, np.concatenate(modes, axis=1)[:, order]], axis=1)
-    values = np.concatenate([np.zeros(relative.shape[1]), np.concatenate(eigenvalues)[order]])
-    rigid_eigenvalues = np.linalg.eigvalsh(whole_rigid.T @ (k @ whole_rigid))
-    return ElasticModes(values, columns * _signs(columns), rigid_eigenvalues, n_zero, n_pieces)
+        columns = slice(N_RIGID * index, N_RIGID * (index + 1))
+        rigid[rows, columns] = rigid_motions(positions[vertices], inertia[rows][:, rows])
+    n_modes = min(n_modes, k.shape[0] - rigid.shape[1])
+    momentum = inertia @ rigid
+    if k.shape[0] < DENSE_BELOW or 2 * n_modes > k.shape[0]:
+        complement = scipy.linalg.qr(momentum)[0][:, rigid.shape[1] :]
+        matrices = (complement.T @ (matrix @ complement) for matrix in (k, inertia))
+        span = complement @ scipy.linalg.eigh(*matrices, subset_by_index=(0, n_modes - 1))[1]
+    else:
+        span = _lanczos(k, inertia, sp.csr_matrix(rigid), sp.csr_matrix(momentum), n_modes, shift)
+
+    # Rayleigh-Ritz, after which modes are orthonormal up to rounding.
+    span = _orthonormal(span - rigid @ (momentum.T @ span), inertia)
+    forces = k @ span
+    restricted = span.T @ forces
+    eigenvalues, rotation = np.linalg.eigh((restricted + restricted.T) / 2)
+    modes, forces = span @ rotation, forces @ rotation
+    # Of the rigid motions of components, the first six mixes are rigid motions of the whole.
+    mixes = scipy.linalg.qr(momentum.T @ rigid_motions(positions, inertia))[0]
+    energies = mixes.T @ (rigid.T @ (k @ rigid)) @ mixes
+
+    n_zero = int((eigenvalues < ZERO * shift).sum())
+    if eigenvalues[0] < -ZERO * shift:
+        raise ModalAnalysisError(
+            f"the stiffness is indefinite: its lowest eigenvalue is {eigenvalues[0]:.2e}; the mesh is likely degenerate"
+        )
+    if n_zero == n_modes:
+        raise ModalAnalysisError(
+            f"all of the lowest {n_zero} modes are motions without deformation: the mesh consists of parts that hang "
+            "together on vertices or edges; join them, or request more modes"
+        )
+    first_elastic, not_rigid = eigenvalues[n_zero], np.abs(np.linalg.eigvalsh(energies)).max()
+    if not not_rigid < RIGID_TOLERANCE * first_elastic:
+        raise ModalAnalysisError(
+            f"the rigid motions have eigenvalues up to {not_rigid:.2e}, which is not zero compared with the "
+            f"first elastic one, {first_elastic:.2e}; the mesh is degenerate"
+        )
+    impulses = inertia @ modes
+    residuals = np.linalg.norm(forces - impulses * eigenvalues, axis=0)
+    residual = (residuals / (np.maximum(eigenvalues, first_elastic) * np.linalg.norm(impulses, axis=0))).max()
+    if not residual < largest_residual:
+        raise ModalAnalysisError(
+            f"the modes leave a relative residual of {residual:.2e} (allowed: {largest_residual:g}); the mesh is "
+            "likely degenerate"
+        )
+    modes = np.concatenate([rigid @ mixes[:, N_RIGID:], modes], axis=1)
+    # Zero eigenvalues of hinges may be -1e-13; their roots must exist.
+    eigenvalues = np.append(np.zeros(rigid.shape[1] - N_RIGID), np.maximum(eigenvalues, 0.0))
+    rigid_eigenvalues = np.linalg.eigvalsh(energies[:N_RIGID, :N_RIGID])
+    return ElasticModes(eigenvalues, modes * _signs(modes), rigid_eigenvalues, rigid.shape[1] + n_zero, n_pieces)
 
 
 def rigid_motions(positions: FloatArray, inertia: sp.csr_matrix) -> FloatArray:
@@ -132,59 +160,8 @@ def rigid_motions(positions: FloatArray, inertia: sp.csr_matrix) -> FloatArray:
     return _orthonormal(motions.reshape(-1, N_RIGID), inertia)
 
 
-def _component_modes(
-    k: sp.csc_matrix, inertia: sp.csr_matrix, positions: FloatArray, n_modes: int, shift: float, largest_residual: float
-) -> ElasticModes:
-    """Lowest elastic modes of a connected component, with checks."""
-    rigid = rigid_motions(positions, inertia)
-    momentum = inertia @ rigid
-    if k.shape[0] < DENSE_BELOW or 2 * n_modes > k.shape[0]:
-        complement = scipy.linalg.qr(momentum)[0][:, N_RIGID:]
-        matrices = (complement.T @ (matrix @ complement) for matrix in (k, inertia))
-        span = complement @ scipy.linalg.eigh(*matrices, subset_by_index=(0, n_modes - 1))[1]
-    else:
-        span = _lanczos(k, inertia, rigid, momentum, n_modes, shift)
-
-    # Rayleigh-Ritz, after which modes are orthonormal up to rounding.
-    span = _orthonormal(span - rigid @ (momentum.T @ span), inertia)
-    forces = k @ span
-    restricted = span.T @ forces
-    eigenvalues, rotation = np.linalg.eigh((restricted + restricted.T) / 2)
-    modes, forces = span @ rotation, forces @ rotation
-    rigid_eigenvalues = np.linalg.eigvalsh(rigid.T @ (k @ rigid))
-
-    n_zero = int((eigenvalues < ZERO * shift).sum())
-    if eigenvalues[0] < -ZERO * shift:
-        raise ModalAnalysisError(
-            f"the stiffness is indefinite: its lowest eigenvalue is {eigenvalues[0]:.2e}; the mesh is likely degenerate"
-        )
-    if n_zero == n_modes:
-        raise ModalAnalysisError(
-            f"all of the lowest {n_zero} modes are motions without deformation: the mesh consists of parts that hang "
-            "together on vertices or edges; join them, or request more modes"
-        )
-    first_elastic, not_rigid = eigenvalues[n_zero], np.abs(rigid_eigenvalues).max()
-    if not not_rigid < RIGID_TOLERANCE * first_elastic:
-        raise ModalAnalysisError(
-            f"the six rigid motions have eigenvalues up to {not_rigid:.2e}, which is not zero compared with the "
-            f"first elastic one, {first_elastic:.2e}; the mesh is degenerate"
-        )
-    impulses = inertia @ modes
-    residuals = np.linalg.norm(forces - impulses * eigenvalues, axis=0)
-    residual = (residuals / (np.maximum(eigenvalues, first_elastic) * np.linalg.norm(impulses, axis=0))).max()
-    if not residual < largest_residual:
-        raise ModalAnalysisError(
-            f"the modes leave a relative residual of {residual:.2e} (allowed: {largest_residual:g}); the mesh is "
-            "likely degenerate"
-        )
-    # Zero eigenvalues of hinges may be -1e-13; their roots must exist.
-    return ElasticModes(
-        np.maximum(eigenvalues, 0.0), modes * _signs(modes), rigid_eigenvalues, N_RIGID + n_zero, n_pieces=1
-    )
-
-
 def _lanczos(
-    k: sp.csc_matrix, inertia: sp.csr_matrix, rigid: FloatArray, momentum: FloatArray, n_modes: int, shift: float
+    k: sp.csc_matrix, inertia: sp.csr_matrix, rigid: sp.csr_matrix, momentum: sp.csr_matrix, n_modes: int, shift: float
 ) -> FloatArray:
     """Lowest eigenvectors that are M-orthogonal to the rigid motions, by ARPACK. *Shape:* ``(3N, n_modes)``."""
     n, shifted = k.shape[0], k + shift * inertia

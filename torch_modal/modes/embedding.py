@@ -5,9 +5,9 @@ import scipy.sparse as sp
 from scipy.spatial import cKDTree
 
 from torch_modal.arrays import FloatArray, IntArray
-from torch_modal.modes.parallel import n_cpus
 from torch_modal.modes.stiffness import hat_gradients
 from torch_modal.modes.tetrahedra import Tetrahedra
+from torch_modal.threads import n_threads
 
 N_NEIGHBOURS = 12
 MAX_RINGS = 6
@@ -100,7 +100,7 @@ def closest_tetrahedra(points: FloatArray, tetrahedra: Tetrahedra) -> IntArray:
         n_candidates = min(n_candidates, len(centroids))
         outside = []
         for chunk in _chunks(left):
-            tets = tree.query(points[chunk], n_candidates, workers=n_cpus())[1].reshape(len(chunk), n_candidates)
+            tets = tree.query(points[chunk], n_candidates, workers=n_threads())[1].reshape(len(chunk), n_candidates)
             offset = points[chunk, None] - centroids[tets]
             barycentric = 0.25 + (gradients[tets] @ offset[..., None])[..., 0]
             inside = (barycentric * heights[tets]).min(axis=2)  # signed distance, positive inside

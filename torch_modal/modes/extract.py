@@ -22,7 +22,6 @@ from torch_modal.modes.basis import ModalBasis
 from torch_modal.modes.carrying import Carrier
 from torch_modal.modes.eigen import N_RIGID, ElasticBody, ModalAnalysisError, lowest_modes
 from torch_modal.modes.lattice import Lattice
-from torch_modal.modes.parallel import StoppedError, one_blas_thread, run_all
 from torch_modal.modes.sheet import n_coarse_faces, sheet_body
 from torch_modal.modes.solid import Solid
 from torch_modal.modes.stiffness import HESSIAN_FORMS, HessianForm
@@ -30,6 +29,7 @@ from torch_modal.modes.surface import CanonicalSurface, self_proximity
 from torch_modal.modes.tetrahedra import Mesher, TetrahedralizationError
 from torch_modal.modes.tetwild import Auto, TetWild
 from torch_modal.progress import Progress, ProgressReport, logger
+from torch_modal.threads import StoppedError, one_blas_thread, run
 
 Method = Literal["auto", "solid", "shell"]
 METHODS: tuple[Method, ...] = ("auto", "solid", "shell")
@@ -280,6 +280,7 @@ class _Extraction:
     ) -> list[Arrays]:
         """Modes of all key-frames, from the cache or computed in as many threads as fit into memory."""
 
+        @one_blas_thread()
         def modes(index: int) -> Arrays:
             surface = self.surfaces[index]
             arrays = {"points": surface.points, "faces": surface.faces, **inputs}
@@ -287,7 +288,8 @@ class _Extraction:
             self.bar.update()
             return result
 
-        return run_all(modes, len(self.surfaces), self.stop, VERTICES_AT_ONCE // n_vertices)
+        work = [functools.partial(modes, index) for index in range(len(self.surfaces))]
+        return run(work, VERTICES_AT_ONCE // n_vertices, self.stop)
 
     def _mesh(self, index: int) -> Solid:
         with self.stage(index, "tetrahedra"):

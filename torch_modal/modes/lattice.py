@@ -17,7 +17,6 @@ from torch_modal.arrays import BoolArray, FloatArray, IntArray
 from torch_modal.geometry.canonical import CANONICAL_SIZE
 from torch_modal.geometry.connectivity import Connectivity, connected_pieces
 from torch_modal.modes.bisection import bisect
-from torch_modal.modes.parallel import n_cpus
 from torch_modal.modes.surface import CanonicalSurface, SurfaceSamples, clearances
 from torch_modal.modes.tetrahedra import (
     Tetrahedra,
@@ -27,6 +26,7 @@ from torch_modal.modes.tetrahedra import (
     tet_volumes,
     without_debris,
 )
+from torch_modal.threads import n_threads
 
 VERSION = "whole"
 """Part of the cache key: change it when the algorithm changes."""
@@ -166,7 +166,7 @@ class Indicator:
         values = map_coordinates(self.values, ((points - self.low) / self.spacing).T, order=1, mode="nearest")
         doubtful = np.flatnonzero(values < SURELY_INSIDE)
         reach = NEARBY * self.spacing
-        distance, nearest = self.samples.tree.query(points[doubtful], distance_upper_bound=reach, workers=n_cpus())
+        distance, nearest = self.samples.tree.query(points[doubtful], distance_upper_bound=reach, workers=n_threads())
         # Beyond the boundary of an open surface there is no tangent plane.
         near = np.isfinite(distance) & np.append(self.has_sides, False)[nearest]
         doubtful, nearest = doubtful[near], nearest[near]
@@ -228,7 +228,7 @@ def _fit(filled: Tetrahedra, indicator: Indicator) -> Tetrahedra:
     sizes = np.full(len(filled.vertices), np.inf)
     np.minimum.at(sizes, filled.tets.reshape(-1), np.repeat(np.cbrt(6 * volumes), 4))
     rim = np.unique(filled.tets[np.asarray(filled.inside) < 1 - LEAST_INSIDE])
-    distance, nearest = samples.tree.query(filled.vertices[rim], workers=n_cpus())
+    distance, nearest = samples.tree.query(filled.vertices[rim], workers=n_threads())
     near = distance < REACH * sizes[rim]
     rim, nearest = rim[near], nearest[near]
     height = np.einsum("vi,vi->v", filled.vertices[rim] - samples.points[nearest], samples.normals[nearest])
@@ -257,7 +257,7 @@ def _fit(filled: Tetrahedra, indicator: Indicator) -> Tetrahedra:
     if solid_volumes(fitted).sum() < LEAST_KEPT * solid_volumes(filled).sum():
         return filled
     reach = 1.5 * sizes[filled.tets].max(axis=1).max()
-    distance, _ = cKDTree(fitted.vertices).query(samples.points, distance_upper_bound=reach, workers=n_cpus())
+    distance, _ = cKDTree(fitted.vertices).query(samples.points, distance_upper_bound=reach, workers=n_threads())
     return fitted if np.isfinite(distance).all() else filled
 
 

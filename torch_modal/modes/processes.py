@@ -10,7 +10,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from torch_modal.modes.parallel import StoppedError
+from torch_modal.threads import StoppedError
 
 POLL = 0.5
 

@@ -12,7 +12,7 @@ from torch_modal.geometry.canonical import CANONICAL_SIZE, in_order, to_canonica
 from torch_modal.geometry.connectivity import vertex_areas
 from torch_modal.geometry.inspect import FLATNESS, principal_extents, signed_volume
 from torch_modal.geometry.vectors import vertex_normals
-from torch_modal.modes.parallel import n_cpus
+from torch_modal.threads import n_threads
 
 _DIAGONAL_RANGE = (1e-90, 1e90)
 MOST_SAMPLES = 60_000
@@ -148,7 +148,7 @@ def self_proximity(surface: CanonicalSurface) -> float:
     tree = cKDTree(points)
     opposed = np.zeros(len(points), dtype=bool)
     for gap in (1 / 16, 1 / 8, 1 / 4, 1 / 2):  # beyond half the gap, the opposing side is nearer than the point itself
-        nearest = tree.query(points + gap * NEAR * CANONICAL_SIZE * normals, workers=n_cpus())[1]
+        nearest = tree.query(points + gap * NEAR * CANONICAL_SIZE * normals, workers=n_threads())[1]
         opposed |= np.einsum("vi,vi->v", normals, normals[nearest]) < OPPOSED
     areas = vertex_areas(surface.points, surface.faces)[::step]
     return float(areas[opposed].sum() / areas.sum())
@@ -167,7 +167,7 @@ def clearances(surface: CanonicalSurface) -> tuple[FloatArray, FloatArray]:
         left, radius = seen, np.full(len(seen), MOST * CANONICAL_SIZE / 2)
         for _ in range(MOST_SHRINKINGS):
             point, direction = samples.points[left], side * samples.normals[left]
-            nearest = samples.tree.query(point + radius[:, None] * direction, workers=n_cpus())[1]
+            nearest = samples.tree.query(point + radius[:, None] * direction, workers=n_threads())[1]
             across = samples.points[nearest] - point
             height = np.einsum("vi,vi->v", across, direction)
             smaller = np.einsum("vi,vi->v", across, across) / (2 * np.maximum(height, 1e-300))
