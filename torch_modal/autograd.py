@@ -34,7 +34,12 @@ current_dispatch_mode: Callable[[], Any] = _get_current_dispatch_mode
 
 def is_traced(x: Tensor) -> bool:
     """True for a tensor without data (torch.compile, export, fake and meta tensors), so that no kernel can use it."""
-    return torch.compiler.is_compiling() or type(x) not in (Tensor, torch.nn.Parameter) or x.is_meta
+    return torch.compiler.is_compiling() or has_no_data(x)
+
+
+def has_no_data(x: Tensor) -> bool:
+    """True for a fake or meta tensor."""
+    return type(x) not in (Tensor, torch.nn.Parameter) or x.is_meta
 
 
 def within_transforms() -> bool:
@@ -54,7 +59,7 @@ def is_eager(*tensors: Tensor) -> bool:
     if torch.compiler.is_compiling():
         return False
     within = within_transforms()
-    return not any(is_traced(x) or (within and is_transformed(x)) for x in tensors)
+    return not any(has_no_data(x) or (within and is_transformed(x)) for x in tensors)
 
 
 def is_vmapped(x: Tensor) -> bool:

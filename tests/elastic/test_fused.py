@@ -518,8 +518,7 @@ class TestBackend:
             "x = torch.zeros(1, 3, 3, dtype=torch.float64); own = torch.zeros(1, 2, dtype=torch.float64); "
             "two = torch.zeros(2, 3, 3, dtype=torch.float64); four = torch.zeros(4, 3, 3, dtype=torch.float64); "
             "launch(kernels('procrustes').mean_pose, (1,), [two, four, own, two.clone(), x]); "
-            "sys.exit(any(f'torch_modal.elastic.kernels.{name}' in sys.modules "
-            "for name in ('quasi_newton', 'steps')))"
+            "sys.exit('torch_modal.elastic.kernels.steps' in sys.modules)"
         )
         folder = Path(tm.__file__).parents[1]
         result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, cwd=folder)

@@ -8,7 +8,6 @@ import importlib.util
 import warnings
 from collections.abc import Callable, Sequence
 from functools import cache
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -17,21 +16,18 @@ from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.elastic.crossings import WarpPairs
 from torch_modal.elastic.distortion import Distortion, KernelDistortion
 from torch_modal.elastic.energy import Energy
-from torch_modal.elastic.kernel_energy import KernelEnergy, volumes_by_kernel
+from torch_modal.elastic.kernel_energy import KernelEnergy
 from torch_modal.elastic.kernel_steps import KernelFineEnergy
 from torch_modal.elastic.kernels.launch import kernels, launch, load_kernels
 from torch_modal.elastic.modal import KernelModalEnergy, ModalEnergy
 from torch_modal.elastic.procrustes import mean_pose as mean_pose_by_kernel
-from torch_modal.elastic.quasi_newton import update
 from torch_modal.elastic.rotations import WarpRotations
 from torch_modal.elastic.steps import FineEnergy
 from torch_modal.elastic.term import Mesh, Term
 from torch_modal.errors import MissingPackageError
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.local_rotations import LocalRotations
-from torch_modal.geometry.poisson import Poisson
 from torch_modal.geometry.procrustes import mean_pose
-from torch_modal.geometry.rigid import signed_volumes
 
 
 class TorchBackend:
@@ -41,10 +37,7 @@ class TorchBackend:
     that it is faster at, and returns to these where it cannot serve; both give the same numbers, up to rounding.
     """
 
-    quasi_newton: Callable[..., Any] | None = None
-    """A faster :func:`torch_modal.elastic.minimise.bfgs_update`, if there is one."""
-
-    mean_pose, signed_volumes = staticmethod(mean_pose), staticmethod(signed_volumes)
+    mean_pose = staticmethod(mean_pose)
 
     def load(self) -> None:
         """Load what takes long, so that the first call does not wait for it."""
@@ -52,10 +45,6 @@ class TorchBackend:
     def rotations(self, mesh: Connectivity, references: Tensor) -> LocalRotations:
         """Local rotations of triangles between shapes near references. *Shape:* ``(K, V, 3)``."""
         return LocalRotations(mesh, references)
-
-    def poisson(self, mesh: Connectivity, weights: Tensor) -> Poisson:
-        """Shapes from edge vectors. *Shape:* ``(E,)``."""
-        return Poisson(mesh, weights)
 
     def modal_energy(self, energy: Energy, mesh: Mesh, columns: Tensor) -> ModalEnergy:
         """Terms in the amplitudes of columns, for the modal solve. *Shape:* ``(n, V, 3)``."""
@@ -81,8 +70,7 @@ class WarpBackend(TorchBackend):
         MissingPackageError: Warp is not installed.
     """
 
-    quasi_newton, mean_pose = staticmethod(update), staticmethod(mean_pose_by_kernel)
-    signed_volumes = staticmethod(volumes_by_kernel)
+    mean_pose = staticmethod(mean_pose_by_kernel)
 
     def __init__(self) -> None:
         if importlib.util.find_spec("warp") is None:

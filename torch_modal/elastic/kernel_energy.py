@@ -9,7 +9,6 @@ from typing import Any, Literal, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from torch_modal.autograd import is_eager
 from torch_modal.elastic import volume
 from torch_modal.elastic.bend import NEEDLE, NEEDLE_OF_STEPS
 from torch_modal.elastic.energy import AssembledTerm, Energy, Reference, RestShapes
@@ -17,7 +16,6 @@ from torch_modal.elastic.kernels.function import run_by_torch, run_operation
 from torch_modal.elastic.kernels.launch import launch, make_once, of_elements
 from torch_modal.elastic.term import KernelFunctions, Mesh
 from torch_modal.elastic.volume import Volume
-from torch_modal.geometry.rigid import signed_volumes
 from torch_modal.geometry.vectors import inverse
 
 
@@ -175,20 +173,6 @@ def by_kernels(energy: Energy, mesh: Mesh) -> list[KernelTerm | None]:
         functions = term.kernel_functions(n) if fits and not energy.sampled else None
         terms.append(None if functions is None else KernelTerm(summand, functions))
     return terms
-
-
-def volumes_by_kernel(x: Tensor, faces: Tensor) -> Tensor:
-    """:func:`torch_modal.geometry.rigid.signed_volumes` in one pass, without a gradient; of faces of int32."""
-    if not is_eager(x):
-        return signed_volumes(x, faces)
-    shapes = x.detach().double().contiguous()
-    sizes = shapes.new_zeros(*x.shape[:-2], 2, 3)
-    launch(
-        make_once(volume.kernels).sizes,
-        (sizes.numel() // 6, len(faces)),
-        [faces, x.shape[-2], shapes, None, sizes, 0, None],
-    )
-    return sizes[..., 1, 0].to(x)
 
 
 class Pass(nn.Module):

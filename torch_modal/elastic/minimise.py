@@ -171,7 +171,7 @@ def minimise(
             if 2 * n_active <= len(state.row):
                 _put(whole, state)
                 state = trees.rows(state, torch.nonzero(state.length).flatten())
-            state = _evaluate_step(energy, state)
+            state = bfgs_update(state, *energy.value_and_gradient(state.there.squeeze(-1), state.placement))
         _put(whole, state)
         # A Hessian at the new place may help the others, if they have moved.
         rows = rows[(norm[rows] > goal[rows]) & ~below_rounding[rows] & (n_steps[rows] > before)]
@@ -199,18 +199,13 @@ def _put(whole: tuple[Tensor, ...], state: State) -> None:
         values[state.row] = new_values
 
 
-def _evaluate_step(energy: AmplitudeEnergy, state: State) -> State:
-    """One evaluation: a step where the energy falls, a shorter one next where it does not."""
-    value, slope = energy.value_and_gradient(state.there.squeeze(-1), state.placement)
-    by_kernel = getattr(energy, "quasi_newton", None)
-    if by_kernel is None or value.device.type != "cpu" or {state.a.dtype, slope.dtype} != {torch.float64}:
-        return bfgs_update(state, value, slope[..., None])
-    return by_kernel(state, SHORTEST, value, slope)
-
-
 def bfgs_update(state: State, value: Tensor, slope: Tensor) -> State:
-    """The state after an evaluation at its next place. *Shape:* ``(B,), (B, n, 1)``."""
+    """The state after an evaluation at its next place: a step where the energy falls, else a shorter one next.
+
+    *Shape:* ``(B,), (B, n)``.
+    """
     a, there, gradient, inverse, length = state.a, state.there, state.gradient, state.inverse, state.length
+    slope = slope[..., None]
     norm = torch.linalg.vector_norm(slope, dim=(1, 2))
     # Energies are sums of squares. They may rise by their rounding, and where the gradient falls, by the effect of the
     # rounding of positions.

@@ -55,11 +55,6 @@ class WarpRotations(LocalRotations):
             return super().right_hand_side(shapes, weights, poisson)
         return run_operation(_RightHandSide(self, poisson), shapes, weights)[0].to(shapes)
 
-    def turns(self, first: Tensor, second: Tensor) -> Tensor:
-        """Overrides the base class."""
-        quaternions, sign, _ = self.signed_quaternions(torch.stack([first, second], 1).double())
-        return (sign[..., None] * quaternions).movedim(-1, 0).to(first)
-
     def signed_quaternions(self, shapes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Quaternions between two shapes, their signs, frames and stretches, ``(B, F, 4), (B, F), (B, F, 12)``."""
         quaternions, areas, frames = (shapes.new_empty(len(shapes), len(self.faces), n) for n in (4, 1, 12))

@@ -5,6 +5,7 @@ from torch import Tensor, nn
 from torch_modal.elastic.backend import TorchBackend
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.local_rotations import weights_per_length
+from torch_modal.geometry.poisson import Poisson
 
 
 class RotationBlend(nn.Module):
@@ -22,7 +23,7 @@ class RotationBlend(nn.Module):
     def __init__(self, mesh: Connectivity, references: Tensor, backend: TorchBackend) -> None:
         super().__init__()
         self.rotations = backend.rotations(mesh, references)
-        self.poisson = backend.poisson(mesh, weights_per_length(mesh, references))
+        self.poisson = Poisson(mesh, weights_per_length(mesh, references))
 
     def forward(self, shapes: Tensor, weights: Tensor, straight: Tensor) -> Tensor:
         """The weighted mean of K shapes.

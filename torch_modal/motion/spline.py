@@ -12,6 +12,7 @@ from torch_modal.geometry.canonical import own_order
 from torch_modal.geometry.clusters import beyond_a_turn
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.local_rotations import Trajectory, weights_per_length
+from torch_modal.geometry.poisson import Poisson
 from torch_modal.geometry.rigid import best_rotation, centroid
 from torch_modal.geometry.rotations import exp, log
 from torch_modal.geometry.triangle_frames import frames_of
@@ -98,7 +99,7 @@ class Spline(nn.Module):
         order = own_order([x.numpy() for x in references], mesh.faces)  # as of in-betweens, whose frame contact shares
         self.alignment = KeyframeAlignment(references[order], mesh, backend)
         self.register_buffer("times", times.clone(), persistent=False)
-        self.poisson = backend.poisson(mesh, weights_per_length(mesh, references))
+        self.poisson = Poisson(mesh, weights_per_length(mesh, references))
         first = backend.rotations(mesh, references[:2])
         #: Local rotations of each interval. The tree of the first serves all in which neighbours have the same
         #: quaternion sign by it, and so by every tree, and in which nothing goes beyond a full turn.

@@ -19,7 +19,6 @@ from torch_modal.elastic import bend, stretch, volume
 from torch_modal.progress import ProgressReport
 
 Module = Literal[
-    "quasi_newton",
     "steps",
     "rotations",
     "rotations_adjoint",
@@ -27,7 +26,7 @@ Module = Literal[
     "crossings",
 ]
 PACKAGE = "torch_modal.elastic.kernels"
-IN_BETWEENS: tuple[Module, ...] = ("procrustes", "rotations", "quasi_newton", "steps")
+IN_BETWEENS: tuple[Module, ...] = ("procrustes", "rotations", "steps")
 """The modules for in-betweens without gradients."""
 NO_DRIVER = b"Warp CUDA warning: Could not find or load the NVIDIA CUDA driver"
 """What Warp says where there is no GPU, with no setting that turns it off: in every run, it looks like an error."""
