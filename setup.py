@@ -23,7 +23,6 @@ def description_for_pypi() -> str:
 
 
 EXTRAS = {
-    "pictures": ["pyvista>=0.46"],  # pictures and videos in better light, on the graphics card
     "video": ["imageio[ffmpeg]>=2.28"],  # MP4
     "usd": ["usd-core>=24.5"],
     # Meshes of different connectivity; libigl's AABB tree came to Python with 2.6.
@@ -110,6 +109,7 @@ setup(
                 "pygltflib>=1.16",
                 "selenium>=4.20",
                 "viser>=1.1",  # examples/live.py
+                "pyvista>=0.46",  # bodies of the benchmarks
                 "h5py>=3.11",
             ],
             *["build>=1.2", "twine>=6.1", "check-wheel-contents>=0.6", "setuptools>=77"],

@@ -20,7 +20,7 @@ from torch_modal.data.samples import load_sample
 from torch_modal.geometry.canonical import CANONICAL_SIZE
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.inbetween.regions import fitting_error, segments
-from torch_modal.view.drawing import Scene, draw
+from torch_modal.view.drawing import draw_shape
 from torch_modal.view.picture import BETWEEN_COLOR, ERROR_COLORS, KEYFRAME_COLOR, fit_into_cells, view_rotation
 
 matplotlib.use("Agg")
@@ -130,7 +130,8 @@ def _scale(values: FloatArray) -> matplotlib.cm.ScalarMappable:
 def _images(points: FloatArray, paint: FloatArray, faces: Tensor, half: FloatArray) -> NDArray[np.uint8]:
     """*Shape:* ``(S, V, 3)`` in view coordinates, and colours in [0, 1]."""
     pixels = np.maximum((420 * half / half.max()).round(), 1).astype(np.int64)
-    return draw(Scene(points, (255 * paint).round().astype(np.uint8), faces.numpy(), half, pixels), "auto")
+    each = zip(points, paint, strict=True)
+    return np.stack([draw_shape(x, colors, faces.numpy(), half, pixels) for x, colors in each])
 
 
 if __name__ == "__main__":

@@ -22,7 +22,6 @@ def files(capsule: tuple[np.ndarray, np.ndarray], tmp_path: Path, monkeypatch: p
     x, faces = (torch.from_numpy(each) for each in capsule)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(drawing, "SMOOTH_FACES", 1000)
-    monkeypatch.setattr(drawing, "_draw_in_child", drawing._draw_matplotlib)  # a second each, not five
     tm.save_mesh(x, faces, "template.obj")
     tm.save_mesh(x + torch.tensor([3.0, 0, 0]), faces, "later.obj")
     for i in range(10):

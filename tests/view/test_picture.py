@@ -1,6 +1,4 @@
-"""Single images and sheets of them by both renderers, looked at through their pixels."""
-
-import sys
+"""Single images and sheets of them, looked at through their pixels."""
 
 import numpy as np
 import pytest
@@ -30,31 +28,16 @@ def drawn(image, level=250):
     return (np.asarray(image).astype(int)[..., :3] < level).any(axis=-1)
 
 
-def scene(points, pixels=100, color=(200, 60, 60)):
-    points = np.asarray(points, dtype=float)
-    colors = np.broadcast_to(np.array(color, dtype=np.uint8), points.shape).copy()
-    return drawing.Scene(points, colors, np.asarray(BALL.faces), np.array([2.5, 2.5]), np.array([pixels, pixels]))
+def draw(points, colors=(0.8, 0.24, 0.24), faces=BALL.faces):
+    colors = np.broadcast_to(colors, np.shape(points))
+    return drawing.draw_shape(points, colors, np.asarray(faces), np.array([2.5, 2.5]), np.array([100, 100]))
 
 
-@pytest.fixture(params=["pyvista", "matplotlib"])
-def draw(request):
-    if request.param == "matplotlib":
-        return drawing._draw_matplotlib
-
-    def in_child(what):
-        try:
-            return drawing._draw_in_child(what)
-        except RuntimeError as error:
-            pytest.skip(f"pyvista cannot render on this machine: {error}")
-
-    return in_child
-
-
-def test_both_renderers_draw_to_scale(draw):
+def test_shapes_are_drawn_to_scale():
     """A ball of radius r at (x, y) covers a disc of known place and area: the camera, in pixels."""
     ball = np.asarray(BALL.vertices)
-    images = draw(scene([ball, ball + np.array([1, 0.5, 0]), 2 * ball, ball + np.array([0, 0, 40])]))
-    assert images.shape == (4, 100, 100, 3) and images.dtype == np.uint8
+    images = [draw(x) for x in (ball, ball + np.array([1, 0.5, 0]), 2 * ball, ball + np.array([0, 0, 40]))]
+    assert images[0].shape == (100, 100, 3) and images[0].dtype == np.uint8
     for image, (x, y, radius) in zip(images, [(0, 0, 1), (1, 0.5, 1), (0, 0, 2), (0, 0, 1)], strict=True):
         mask = drawn(image, level=160)  # between paper and paint: half of a pixel on the rim is covered
         rows, columns = np.nonzero(mask)
@@ -67,27 +50,19 @@ def test_both_renderers_draw_to_scale(draw):
     assert upper > lower + 8  # the light comes from above
 
 
-def test_near_hides_far(draw):
+def test_near_hides_far():
     """Two shapes in one: the nearer (larger z), green, covers the red one, in either order."""
     ball = np.asarray(BALL.vertices)
     vertices = np.concatenate([ball, 0.8 * ball + [0, 0, 3]])
     for flip in (False, True):
         points = vertices * [1, 1, -1] if flip else vertices
-        colors = np.repeat(np.array([[200, 0, 0], [0, 200, 0]], dtype=np.uint8), len(ball), axis=0)
+        colors = np.repeat([[0.8, 0, 0], [0, 0.8, 0]], len(ball), axis=0)
         faces = np.concatenate([BALL.faces, BALL.faces + len(ball)])
-        what = drawing.Scene(points[None], colors[None], faces, np.array([2.5, 2.5]), np.array([100, 100]))
-        middle = draw(what)[0, 45:55, 45:55].mean(axis=(0, 1))
+        middle = draw(points, colors, faces)[45:55, 45:55].mean(axis=(0, 1))
         assert (middle[0] > middle[1]) == flip
 
 
 # ------------------------------------------------------------------------------------------------------------- sheets
-def render_or_skip(*args, **options):
-    try:
-        return render_sequence(*args, **options)
-    except RuntimeError as error:
-        pytest.skip(f"{error}")
-
-
 def shapes_on(path):
     """The shapes on a sheet, in reading order: area, centre x, centre y, mean colour of each."""
     image = np.asarray(Image.open(path).convert("RGB")).astype(int)
@@ -101,13 +76,12 @@ def shapes_on(path):
     return sorted(found, key=lambda shape: (round(shape[2] / 100), shape[1]))
 
 
-@pytest.mark.parametrize("renderer", ["pyvista", "matplotlib"])
-def test_sheet_has_every_shape_at_its_place(tmp_path, renderer):
+def test_sheet_has_every_shape_at_its_place(tmp_path):
     """Rows and columns of discs: their radii are those of the frames, key-frames have the other colour."""
     frames = growing()
     out = tmp_path / "new" / "sheet.png"
     rows = {"grows": frames, "shrinks": torch.tensor(frames[::-1].copy(), requires_grad=True)}
-    path = render_or_skip(rows, torch.tensor(np.asarray(BALL.faces)), out, renderer=renderer)
+    path = render_sequence(rows, torch.tensor(np.asarray(BALL.faces)), out)
     assert path == out and list(out.parent.iterdir()) == [out]
     shapes = shapes_on(out)
     assert len(shapes) == 10
@@ -124,7 +98,7 @@ def test_sheet_has_every_shape_at_its_place(tmp_path, renderer):
 
 
 def test_columns_and_keyframes_are_chosen(tmp_path):
-    options = {"renderer": "matplotlib", "overwrite": True}
+    options = {"overwrite": True}
     rows, faces, out = {"a": growing(9)}, np.asarray(BALL.faces), tmp_path / "a.png"
     largest = np.pi * (picture.CELL_PIXELS / 2 / picture.MARGIN) ** 2
 
@@ -152,7 +126,7 @@ def test_titles_stand_above_the_columns(tmp_path):
     given = [["t = 0", "t = 0.5", "t = 1"], ["t = 0", "mode 2", "t = 1"]]
     sheets = []
     for titles in (None, *given):
-        render_sequence(rows, faces, tmp_path / "a.png", titles=titles, renderer="matplotlib", overwrite=True)
+        render_sequence(rows, faces, tmp_path / "a.png", titles=titles, overwrite=True)
         sheets.append(np.asarray(Image.open(tmp_path / "a.png").convert("RGB")).astype(int))
     np.testing.assert_array_equal(sheets[0], sheets[1], "times are the default")
     changed = np.argwhere(np.abs(sheets[0] - sheets[2]).sum(2) > 0)
@@ -165,7 +139,7 @@ def test_numbers_become_colours_with_one_bar(tmp_path):
     """The first row is 0 (the scale's light end), the second 5 (its dark end), the third has none."""
     frames, faces = growing(3), np.asarray(BALL.faces)
     colors = {"zero": np.zeros(frames.shape[:2]), "five": torch.full(frames.shape[:2], 5.0)}
-    options = {"colors": colors, "color_label": "error (%)", "renderer": "matplotlib"}
+    options = {"colors": colors, "color_label": "error (%)"}
     rows = {"zero": frames, "five": frames, "plain": frames}
     path = render_sequence(rows, faces, tmp_path / "a.png", **options)
     *_, last = everything = shapes_on(path)  # the bar stands to the right of the last column
@@ -174,7 +148,7 @@ def test_numbers_become_colours_with_one_bar(tmp_path):
     assert np.ptp(zero) < 10 and zero.min() > 130  # grey, light
     assert five[0] > 2 * five[1] and five.max() < 100  # dark red
     assert plain[2] > plain[0] + 20  # the colour of an in-between
-    plain_sheet = render_sequence(rows, faces, tmp_path / "b.png", renderer="matplotlib")
+    plain_sheet = render_sequence(rows, faces, tmp_path / "b.png")
     assert Image.open(path).width > Image.open(plain_sheet).width + 50  # room for the bar
 
 
@@ -183,7 +157,7 @@ def test_clouds_lie_where_their_shapes_are(tmp_path):
     dots = np.concatenate([trimesh.sample.sample_surface(BALL, 15_000, seed=0)[0], [[99.0, 0, 0]]])
     points = [torch.tensor(dots * radius + [7, 1, 0]) for radius in (1, 1.5, 2)]
     frames = growing(3) + np.array([7.0, 1, 0])
-    options = {"renderer": "matplotlib", "view": (0, 0), "up": "y", "columns": [0, 2]}
+    options = {"view": (0, 0), "up": "y", "columns": [0, 2]}
     path = render_sequence({"ball": frames}, BALL.faces, tmp_path / "a.png", points={"seen": points}, **options)
     image = np.asarray(Image.open(path).convert("RGB")).astype(int)
     places = ndimage.find_objects(ndimage.label(ndimage.binary_closing(drawn(image), iterations=8))[0])
@@ -255,44 +229,11 @@ def test_what_rests_stays_and_what_travels_is_followed():
     assert np.abs(moved).max() <= 1.0 + 1e-12
 
 
-def test_without_pyvista_matplotlib_draws_and_says_nothing(tmp_path, monkeypatch):
-    monkeypatch.setattr(drawing.importlib.util, "find_spec", lambda name: None)
-    rows, faces = {"a": growing(3)}, np.asarray(BALL.faces)
-    path = render_sequence(rows, faces, tmp_path / "auto.png")
-    assert path.read_bytes() == render_sequence(rows, faces, tmp_path / "m.png", renderer="matplotlib").read_bytes()
-    with pytest.raises(RuntimeError, match=r"pip install torch_modal\[pictures\]"):
-        render_sequence(rows, faces, tmp_path / "no.png", renderer="pyvista")
-
-
-@pytest.mark.parametrize(
-    ("code", "reason"),
-    [
-        ("import os, signal; os.kill(os.getpid(), signal.SIGSEGV)", "signal SIGSEGV"),
-        ("raise ImportError('No module named pyvista')", "exit code 1.*No module named pyvista"),
-        ("import time; time.sleep(60)", "no result after the timeout of 0.5 s"),
-        ("pass", "left no images"),
-        ("import numpy as np; np.save('images.npy', np.full((3, 2, 2, 3), 255, np.uint8))", "empty"),
-    ],
-)
-def test_failures_of_the_child_fall_back_to_matplotlib(tmp_path, monkeypatch, code, reason):
-    monkeypatch.setattr(drawing, "package_command", lambda _: [sys.executable, "-c", code])
-    if "sleep" in code:
-        monkeypatch.setattr(drawing, "CHILD_SECONDS", 0.5)
-    rows, faces = {"a": growing(3)}, np.asarray(BALL.faces)
-    with pytest.warns(UserWarning, match=f"{reason}.*matplotlib"):
-        path = render_sequence(rows, faces, tmp_path / "auto.png")
-    expected = render_sequence(rows, faces, tmp_path / "plain.png", renderer="matplotlib")
-    assert path.read_bytes() == expected.read_bytes() and len(shapes_on(path)) == 3
-    with pytest.raises(RuntimeError, match=reason):
-        render_sequence(rows, faces, tmp_path / "no.png", renderer="pyvista")
-    assert not (tmp_path / "no.png").exists()
-
-
 def test_existing_pictures_stay_unless_asked_and_nothing_is_left_behind(tmp_path, monkeypatch):
     rows, faces, out = {"a": growing(2)}, np.asarray(BALL.faces), tmp_path / "a.png"
     out.write_text("mine")
     with pytest.raises(FileExistsError, match=r"a\.png exists.*--overwrite"):
-        render_sequence(rows, faces, out, renderer="matplotlib")
+        render_sequence(rows, faces, out)
 
     def refused(*_):
         raise PermissionError("held by another program")
@@ -300,14 +241,14 @@ def test_existing_pictures_stay_unless_asked_and_nothing_is_left_behind(tmp_path
     with monkeypatch.context() as patch:
         patch.setattr("os.replace", refused)
         with pytest.raises(PermissionError):
-            render_sequence(rows, faces, out, renderer="matplotlib", overwrite=True)
+            render_sequence(rows, faces, out, overwrite=True)
     assert out.read_text() == "mine" and list(tmp_path.iterdir()) == [out]
-    render_sequence(rows, faces, out, renderer="matplotlib", overwrite=True)
+    render_sequence(rows, faces, out, overwrite=True)
     assert Image.open(out).format == "PNG"
 
 
 def test_a_picture_is_written_as_pdf(tmp_path):
-    path = render_sequence({"": growing(2)}, np.asarray(BALL.faces), tmp_path / "a.pdf", renderer="matplotlib")
+    path = render_sequence({"": growing(2)}, np.asarray(BALL.faces), tmp_path / "a.pdf")
     assert path.read_bytes().startswith(b"%PDF")
 
 
@@ -318,7 +259,6 @@ def test_a_picture_is_written_as_pdf(tmp_path):
         ({"frames_by_row": {"a": growing(3), "b": growing(4)}}, r"'a' \(3, 162, 3\), 'b' \(4, 162, 3\)"),
         ({"frames_by_row": {"a": growing(3)[0]}}, r"frames_by_row\['a'\].*frames\[None\]|\(162, 3\)"),
         ({"out": "a.jpg"}, r"\.png or \.pdf.*a\.jpg"),
-        ({"renderer": "opengl"}, "opengl"),
         ({"columns": 0}, "columns must be at least 1"),
         ({"titles": ["first"]}, "titles stand above 3 columns, got 1"),
         ({"columns": [0, 3]}, r"columns.*0 to 2.*\[0, 3\]"),

@@ -17,13 +17,12 @@ from torch_modal.io.formats import ANIMATION_FORMATS, Animation, Timing, resampl
 from torch_modal.io.write import check_frames, check_indices, check_suffix, refuse_existing
 from torch_modal.motion.skin import bake
 from torch_modal.progress import Progress, ProgressReport
-from torch_modal.view.drawing import ByteArray, Scene, draw
+from torch_modal.view.drawing import ByteArray, draw_shape
 from torch_modal.view.picture import BETWEEN_COLOR, fit_into_cells, view_rotation
 
 logger = logging.getLogger("torch_modal")
 
 PIXELS = 640  # the longer side of a picture of a video
-PICTURES_AT_ONCE = 24  # drawn by one process of the renderer
 
 
 def require_packages(path: Path) -> None:
@@ -169,11 +168,10 @@ def _pictures(animation: Animation) -> list[ByteArray]:
     points, half = fit_into_cells(points[None])
     # H.264 stores colour for blocks of two by two.
     size = np.maximum((PIXELS * half / half.max() / 2).round() * 2, 2).astype(np.int64)
-    paint = np.broadcast_to((np.array(BETWEEN_COLOR) * 255).round().astype(np.uint8), points[0].shape)
+    paint = np.broadcast_to(BETWEEN_COLOR, points[0, 0].shape)
     images: list[ByteArray] = []
     with ProgressReport(len(unique), "pictures", animation.progress, unit="picture") as report:
-        for start in range(0, len(unique), PICTURES_AT_ONCE):
-            chunk = slice(start, start + PICTURES_AT_ONCE)
-            images += list(draw(Scene(points[0, chunk], paint[chunk].copy(), faces, half, size), "auto"))
-            report.update(len(images) - start)
+        for shape in points[0]:
+            images.append(draw_shape(shape, paint, faces, half, size))
+            report.update()
     return [images[number] for number in which.reshape(-1)]

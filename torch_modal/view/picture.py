@@ -1,6 +1,6 @@
 """A picture that compares rows of shapes: one row a method, one column a time.
 
-All shapes are turned into view coordinates (x right, y up, z to the viewer), a renderer (drawing.py) draws each into an
+All shapes are turned into view coordinates (x right, y up, z to the viewer), drawing.py draws each into an
 image of its own, and the sheet is set from these images.
 """
 
@@ -17,7 +17,7 @@ from torch_modal.arrays import Array, FloatArray, IntArray
 from torch_modal.io.files import write_file
 from torch_modal.io.formats import PICTURES
 from torch_modal.io.write import check_frames, check_indices, check_suffix, refuse_existing, to_numpy
-from torch_modal.view.drawing import ByteArray, Scene, draw, draw_points
+from torch_modal.view.drawing import ByteArray, draw_points, draw_shape
 
 KEYFRAME_COLOR = (0.91, 0.60, 0.36)  # warm: given
 BETWEEN_COLOR = (0.62, 0.71, 0.82)  # cool: computed
@@ -162,7 +162,6 @@ def render_sequence(
     colors: Mapping[str, Array] | None = None,
     color_label: str = "",
     points: Mapping[str, Sequence[Array]] | None = None,
-    renderer: Literal["auto", "pyvista", "matplotlib"] = "auto",
     overwrite: bool = False,
 ) -> Path:
     """Draw rows of shapes side by side, all seen by the same camera at the same scale.
@@ -184,8 +183,6 @@ def render_sequence(
             percentile of what is shown, with an arrow if there is more. *Shape of each:* ``(N, V)``.
         color_label: Name of the numbers in ``colors``, with their unit.
         points: Rows of clouds, drawn above the shapes as dots: a cloud for each frame. *Shape of each:* ``(n, 3)``.
-        renderer: ``"auto"`` is pyvista where it is installed (extra ``pictures``), otherwise matplotlib; also, with a
-            warning, where pyvista cannot render.
         overwrite: Replace the file if it exists.
 
     Returns:
@@ -194,12 +191,9 @@ def render_sequence(
     Raises:
         ValueError: An argument cannot be used; the message says why.
         FileExistsError: The file exists and ``overwrite`` is off.
-        RuntimeError: ``renderer="pyvista"`` and pyvista cannot render here.
     """
     path = Path(out)
     fmt = check_suffix(path, PICTURES)[1:]
-    if renderer not in ("auto", "pyvista", "matplotlib"):
-        raise ValueError(f"renderer must be auto, pyvista or matplotlib, got {renderer!r}")
     check_view(view, up)
     refuse_existing(path, overwrite)
 
@@ -237,10 +231,12 @@ def render_sequence(
     if colors:
         color_bar = _paint(paint, colors, rows, shapes[0].shape[:2], chosen), color_label
     pixels = np.maximum((CELL_PIXELS * half / half.max()).round(), 1).astype(np.int64)
-    each = (-1, *shown.shape[2:])
-    paint = (paint * 255).round().astype(np.uint8).reshape(each)
-    images = draw(Scene(placed.reshape(each), paint, triangles, half, pixels), renderer)
-    images = images.reshape(*shown.shape[:2], *images.shape[1:])
+    images = np.stack(
+        [
+            [draw_shape(x, colors, triangles, half, pixels) for x, colors in zip(*row, strict=True)]
+            for row in zip(placed, paint, strict=True)
+        ]
+    )
     moved = placed[0, :, 0] - shown[0, :, 0] @ rotation.T  # of the first row, into the cells
     for label, row in reversed(clouds.items()):
         seen = [row[n] @ rotation.T + move for n, move in zip(chosen, moved, strict=True)]
