@@ -1,4 +1,4 @@
-"""Sizes of a page of shapes, with positions and with bones, and the pictures of docs/viewing.md.
+"""Sizes of a page of shapes, and the pictures of docs/viewing.md.
 
     python tests/benchmarks/page.py [--only hand]
     python tests/benchmarks/page.py --pictures docs/images
@@ -36,11 +36,8 @@ def measure(name: str, folder: Path) -> list[str]:
     """A line of the table."""
     sample = load_sample(name)
     shapes = tm.subdivide(sample.keyframes[:2], sample.faces, LEVELS)
-    cells = [f"{name}, {len(shapes)} shapes of {shapes.shape[1]:,} vertices"]
-    for bones in (0, 40):
-        path = tm.show(shapes, sample.faces, bones=bones).save(folder / "page.html", overwrite=True)
-        cells.append(f"{path.stat().st_size / 1e6:.2f} MB")
-    return cells
+    path = tm.show(shapes, sample.faces).save(folder / "page.html", overwrite=True)
+    return [f"{name}, {len(shapes)} shapes of {shapes.shape[1]:,} vertices", f"{path.stat().st_size / 1e6:.2f} MB"]
 
 
 def save(chrome: Chrome, path: Path) -> None:
@@ -97,7 +94,7 @@ def main() -> None:
         if given.pictures:
             draw(given.pictures, Path(folder))
             return
-        with Table("page", ["", "positions", "`bones=40`"], given.keep, check="--only hand") as table:
+        with Table("page", ["", "size"], given.keep, check="--only hand") as table:
             for name in given.only:
                 table.add(*measure(name, Path(folder)))
 

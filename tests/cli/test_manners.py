@@ -5,7 +5,6 @@ import logging
 import os
 import signal
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -32,18 +31,9 @@ def test_a_bar_is_shown_on_terminals(
     with ProgressReport(0, "first", progress) as report:
         report.expect(2)
         report.update()
-        report.describe("second")
+        report.set_description("second")
     said = capsys.readouterr().err
     assert ("second" in said and "1/2" in said) if shown else said == ""
-
-
-def test_the_clock_of_a_bar_goes_on_during_a_long_step(capsys: pytest.CaptureFixture[str]) -> None:
-    with ProgressReport(1, "long", True):
-        end, said = time.monotonic() + 20, ""
-        while "[00:01" not in said and time.monotonic() < end:
-            time.sleep(0.1)
-            said += capsys.readouterr().err
-    assert "[00:01" in said and "[00:00" in said
 
 
 def test_verbose_says_what_is_written(

@@ -1,11 +1,9 @@
 """Skins and principal shapes in GLB files: by the letter of glTF, and in other programs where these are installed."""
 
 import json
-import re
 import shutil
 import subprocess
 import tracemalloc
-from importlib import resources
 from pathlib import Path
 
 import gltf_validator
@@ -227,32 +225,6 @@ def node(script: str, *arguments: object) -> str:
     """What a script prints."""
     command = ["node", "-e", script, *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, check=True, timeout=120).stdout
-
-
-@pytest.mark.skipif(shutil.which("node") is None, reason="node is not installed")
-def test_a_page_computes_the_frames_of_a_skin(tmp_path):
-    x, faces = triangles_of_tube(90)
-    frames = np.stack([turn.apply(bend(x, 0.01 + 0.2 * n)) for n, turn in enumerate(SPIN)])
-    frames = np.concatenate([frames, frames[::-1], frames])  # long enough for bones to be smaller
-    skin = tm.bake(frames, faces, 12)
-    plain, page = tm.show(frames, faces), tm.show(frames, faces, bones=12)
-    assert skin.error < 1e-3 and len(page.html) < len(plain.html)
-    group = json.loads(re.search(r'id="data">(.*?)</script>', page.html, re.S).group(1))["groups"][0]
-    (tmp_path / "data").write_text(json.dumps(group["sequences"][0]))
-    library = (resources.files("torch_modal.view") / "page_assets" / "meshes.js").read_text()
-    run = """
-    const s = JSON.parse(require("fs").readFileSync(process.argv[1]));
-    const [v, n] = [Number(process.argv[2]), Number(process.argv[3])];
-    (async () => {
-      const frames = await unpackSkin(await unpackFrames(s.frames, 1, v), s.weights, s.transforms, n);
-      console.log(JSON.stringify(frames.map((frame) => [...frame])));
-    })();"""
-    found = np.array(json.loads(node(library + run, tmp_path / "data", len(x), len(frames)))).reshape(frames.shape)
-    shapes = found * group["step"] + group["origin"]
-    assert np.abs(shapes - skin.shapes().numpy()).max() < TOLERANCE * DIAGONAL
-    # Too few bones, and sequences too short, are stored as frames.
-    assert "transforms" not in tm.show(frames, faces, bones=1).html.split('id="data"')[1].split("</script>")[0]
-    assert "transforms" not in tm.show(FRAMES[:2], FACES, bones=12).html.split('id="data"')[1].split("</script>")[0]
 
 
 THREE = """

@@ -271,7 +271,6 @@ def test_gradients_reach_a_term(motion: Shapes) -> None:
         *((lambda path, x, at=at: path(x, at), "between the times of .*, 0 and 4") for at in (-0.1, 4.2, math.nan)),
         (lambda path, x: path(x[:4], 0.5), r"shape \(\.\.\., 5, 164, 3\); got \(4, 164, 3\)"),
         (lambda path, x: path(x.expand(2, -1, -1, -1), torch.rand(3)), r"keyframes \(2,\), t \(3,\); for"),
-        (lambda path, x: path.insert(2.0), "already"),
     ],
 )
 def test_what_a_call_refuses(call: Any, message: str, path: Path, motion: Shapes) -> None:

@@ -36,8 +36,6 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
     add("--up", choices=("y", "z"), help="what is up (default: Y, unless the first shape is flat in Y)")
     text = "write the page there, as .html (default: a temporary file, opened)"
     add("--page", type=file_name(PAGES), metavar="FILE", help=text)
-    text = "with --page: store sequences as bones where these are within 0.1 %% of the diagonal; 0: never (default: 40)"
-    add("--bones", type=number(int, 0), metavar="N", default=40, help=text)
     text = "a page to pick landmarks of two meshes or more; it starts with the landmarks of FILE, if given"
     add("--landmarks", nargs="?", const=True, metavar="FILE", help=text)
     add_common(sub, "replace the file if it exists (default: refuse)", cache_dir=None)
@@ -120,8 +118,7 @@ def _sequences(sequences: list[list[Path]], args: argparse.Namespace) -> tuple[P
             raise ValueError(f"--linear needs {ends} among the key-frames, got {' '.join(map(str, keys))}")
         names.append("linear")
         shapes.append(tm.linear_sequence(torch.from_numpy(first[keys]), [*keys, n] if cyclic else keys).numpy())
-    bones = args.bones if args.page else 0  # a page that opens at once keeps nobody waiting
-    page = tm.show(dict(zip(_number_names(names), shapes, strict=True)), faces, **options, title=names[0], bones=bones)
+    page = tm.show(dict(zip(_number_names(names), shapes, strict=True)), faces, **options, title=names[0])
     times = f"{len(shapes)} x " if len(shapes) > 1 else ""
     return page, f"{times}{n} shapes of {first.shape[1]} vertices"
 

@@ -331,7 +331,7 @@ class _Extraction:
         """Report a stage of a key-frame, unless the work was cancelled; errors name the key-frame if it has others."""
         if self.stop.is_set():
             raise StoppedError
-        self.bar.describe(f"key-frame {index + 1}/{self.n_keyframes}: {what}")
+        self.bar.set_description(f"key-frame {index + 1}/{self.n_keyframes}: {what}")
         try:
             yield
         except (MeshError, TetrahedralizationError, ModalAnalysisError) as error:

@@ -81,7 +81,6 @@ def show(
     up: Literal["y", "z"] | None = None,
     title: str = "torch_modal",
     height: int = 600,
-    bones: int = 0,
 ) -> Page:
     """A page that shows sequences of shapes, in a notebook or saved: play, orbit, compare, pick and follow vertices.
 
@@ -102,8 +101,6 @@ def show(
         up: ``"y"`` or ``"z"``; by default Y, unless the first shape is flat in Y.
         title: Of the page.
         height: In pixels, in a notebook.
-        bones: Store sequences as skins (:func:`torch_modal.bake`) of at most so many bones, where their error is below
-            0.1 % of the diagonal and the page becomes smaller.
 
     Returns:
         The page. Notebooks show it; ``save(path)`` writes it.
@@ -123,7 +120,7 @@ def show(
     if cyclic and n > 1 and not all(np.array_equal(frames[0], frames[-1]) for frames in shapes):
         stamps = np.append(stamps, stamps[-1] + (stamps[-1] - stamps[0]) / (n - 1))  # when the first comes again
     data = {"n_frames": n, "times": stamps.tolist(), "has_times": times is not None, "fps": float(fps)}
-    return _page([pack_group(checked, triangles, view, up, bones)], title, height, **data, keyframes=keyframes)
+    return _page([pack_group(checked, triangles, view, up)], title, height, **data, keyframes=keyframes)
 
 
 def show_landmarks(

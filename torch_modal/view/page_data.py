@@ -9,9 +9,6 @@ Two frames predict the next one of a smooth motion well. Frame n is stored as
 
 with r_1 = q_1 - q_0, small numbers around zero. They are folded to positive numbers (0, -1, 1, -2, ... -> 0, 1, 2,
 3, ...), split into planes of low and of high bytes (almost all zeros), and deflated.
-
-Where bones follow a sequence within :data:`LARGEST_BONE_ERROR` and take less room, it is stored as its first frame,
-weights and transforms instead, from which the page computes the frames.
 """
 
 import base64
@@ -23,11 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torch_modal.arrays import FloatArray, IntArray
-from torch_modal.geometry.skin import STEPS
-from torch_modal.motion.skin import bake
 from torch_modal.view.picture import up_axis, view_rotation
 
-LARGEST_BONE_ERROR = 1e-3  # largest error of bones, over the diagonal
 GRID_STEPS = 65_535  # steps of the grid along the longest side
 
 
@@ -36,7 +30,6 @@ def pack_group(
     faces: IntArray,
     view: tuple[float, float] | None = None,
     up: Literal["y", "z"] | None = None,
-    bones: int = 0,
 ) -> dict[str, Any]:
     """Pack shapes that share faces, a grid and a camera; lengths are in steps of the grid, which begins at ``origin``.
 
@@ -60,10 +53,7 @@ def pack_group(
         "n_vertices": len(first),
         "n_faces": len(faces),
         "faces": pack_faces(faces),
-        "sequences": [
-            {"name": name, **pack_sequence(sequences[name], frames, faces, origin, step, bones)}
-            for name, frames in numbers.items()
-        ],
+        "sequences": [{"name": name, "frames": pack_frames(frames)} for name, frames in numbers.items()],
         "view": {
             "front": rotation[2].tolist(),
             "centre": (0.5 * (low + high) @ rotation).tolist(),
@@ -71,26 +61,6 @@ def pack_group(
             "world_up": [0, 1, 0] if up_axis(first, up) == "y" else [0, 0, 1],
         },
     }
-
-
-def pack_sequence(
-    shapes: FloatArray, numbers: NDArray[np.uint16], faces: IntArray, origin: FloatArray, step: float, bones: int
-) -> dict[str, Any]:
-    """Pack shapes ``(N, V, 3)``, also given in steps of the grid, as frames or as a skin of at most ``bones`` bones."""
-    plain: dict[str, Any] = {"frames": pack_frames(numbers)}
-    usable = bones and len(shapes) > 1 and shapes.shape[1] >= max(bones, 4) and np.ptp(shapes[0], axis=0).any()
-    skin = bake(shapes, faces, bones) if usable else None
-    if skin is None or skin.error > LARGEST_BONE_ERROR:
-        return plain
-    weights, transforms = (skin.weights.numpy() * STEPS).round(), skin.transforms.numpy()[:, :, :3]
-    # From steps of the grid to steps of the grid.
-    transforms[..., 3] = (transforms[..., :3] @ origin + transforms[..., 3] - origin) / step
-    packed = {
-        "frames": pack_frames(numbers[:1]),
-        "weights": _pack(weights.T.astype(np.int32)),
-        "transforms": base64.b64encode(transforms.astype("<f4").tobytes()).decode("ascii"),
-    }
-    return packed if sum(map(len, packed.values())) < len(plain["frames"]) else plain
 
 
 def pack_frames(numbers: NDArray[np.uint16]) -> str:

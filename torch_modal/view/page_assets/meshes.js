@@ -52,31 +52,6 @@ async function unpackFrames(text, nFrames, nVertices) {
   return frames;
 }
 
-/** Shapes of a skin: its rest shape, moved by bones (page_data.py) with weights for each vertex, one bone after another. */
-async function unpackSkin([rest], weightText, transformText, nFrames) {
-  const planes = await inflate(bytesOfBase64(weightText));
-  const transforms = new Float32Array(bytesOfBase64(transformText).buffer);
-  const nVertices = rest.length / 3;
-  const nBones = transforms.length / (12 * nFrames);
-  const n = nBones * nVertices;
-  if (planes.length !== 4 * n) throw new Error("the bones of this page are damaged");
-  const frames = Array.from({ length: nFrames }, () => new Float32Array(rest.length));
-  for (let i = 0; i < n; i++) {
-    const weight = signed(planes[i] | (planes[n + i] << 8) | (planes[2 * n + i] << 16)) / 65535;
-    if (!weight) continue;
-    const bone = Math.floor(i / nVertices);
-    const v = 3 * (i % nVertices);
-    const [x, y, z] = rest.subarray(v, v + 3);
-    for (let f = 0; f < nFrames; f++) {
-      for (let axis = 0, at = 12 * (f * nBones + bone); axis < 3; axis++, at += 4) {
-        const moved = transforms[at] * x + transforms[at + 1] * y + transforms[at + 2] * z + transforms[at + 3];
-        frames[f][v + axis] += weight * moved;
-      }
-    }
-  }
-  return frames;
-}
-
 /** Each edge once: a Uint32Array of pairs, the smaller index first. */
 function edgesOf(faces) {
   const keys = new Float64Array(faces.length);

@@ -391,9 +391,8 @@ async function actorsOf(group, nFrames) {
   group.faces = await unpackFaces(group.faces, group.n_faces);
   group.edges = edgesOf(group.faces);
   group.orbit = new Orbit(group.view);
-  const sequences = group.sequences.map(async ({ name, frames, weights, transforms }) => {
-    const given = await unpackFrames(frames, weights ? 1 : nFrames, group.n_vertices);
-    return new Actor(group, name, weights ? await unpackSkin(given, weights, transforms, nFrames) : given);
+  const sequences = group.sequences.map(async ({ name, frames }) => {
+    return new Actor(group, name, await unpackFrames(frames, nFrames, group.n_vertices));
   });
   return Promise.all(sequences);
 }
