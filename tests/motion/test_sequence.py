@@ -11,8 +11,6 @@ from torch import Tensor
 
 import torch_modal as tm
 from torch_modal.elastic.backend import TorchBackend, WarpBackend
-from torch_modal.geometry import connectivity
-from torch_modal.geometry.rigid import blend
 from torch_modal.inbetween.settings import Objective, Solver
 from torch_modal.layers.mid_shape import MidShape
 from torch_modal.motion import subdivide as sequence
@@ -119,16 +117,15 @@ def test_presets_are_those_of_the_layers(scattered: Shapes) -> None:
 # ---------------------------------------------------------------------------------------------- the shapes between
 
 
-def test_recursion_by_hand(scattered: Shapes) -> None:
-    """Two levels of the joint space are three mid-shapes with the modes of both ends."""
+def test_a_pair_has_the_shapes_of_the_layer(scattered: Shapes) -> None:
     pair = scattered.pick(1, 2)
-    frames = subdivide(pair.keyframes, pair.faces, 2, bases=pair.bases, progress=False, **COARSE)
-    layer = MidShape(pair.bases, pair.faces, **COARSE)
-    middle = layer(*pair.keyframes)
-    by_hand = [pair.keyframes[0], layer(pair.keyframes[0], middle), middle, layer(middle, pair.keyframes[1])]
-    for frame, truth in zip(frames, by_hand, strict=False):
-        assert largest(frame - truth) < 1e-9
-    assert largest(middle - pair.keyframes.mean(0)) > 0.1, "nothing would tell it from linear interpolation"
+    frames = subdivide(pair.keyframes, pair.faces, n_frames=6, bases=pair.bases, progress=False, **COARSE)
+    layer = tm.InBetween(pair.bases, pair.faces, **COARSE)
+    t = torch.linspace(0, 1, 6, dtype=torch.float64)
+    torch.testing.assert_close(frames, layer(*pair.keyframes, t), rtol=0, atol=1e-9)
+    assert largest(frames[1] - torch.lerp(*pair.keyframes, 0.2)) > 0.1, (
+        "nothing would tell it from linear interpolation"
+    )
 
 
 def test_cycle_closes(scattered: Shapes) -> None:
@@ -144,20 +141,6 @@ def test_cycle_closes(scattered: Shapes) -> None:
         turned.keyframes, turned.faces, 1, cyclic=True, smooth=False, bases=turned.bases, progress=False, **COARSE
     )
     assert torch.equal(other, cycle.roll(-2, 0))
-
-
-def test_fill_lies_on_the_geodesics_between_subdivided_shapes(scattered: Shapes) -> None:
-    pair = scattered.pick(0, 1)
-    options: dict[str, Any] = {"bases": pair.bases, "progress": False, **COARSE}
-    shapes = subdivide(pair.keyframes, pair.faces, 1, **options)
-    filled = subdivide(pair.keyframes, pair.faces, 1, n_frames=7, **options)
-    weights = torch.from_numpy(connectivity.vertex_areas(pair.keyframes[0].numpy(), pair.faces.numpy()))
-    for i, frame in enumerate(filled):
-        position = 2 * i / 6
-        left = min(int(position), 1)
-        t = torch.tensor(position - left, dtype=torch.float64)
-        assert largest(frame - blend(shapes[left], shapes[left + 1], t, weights)) < 1e-9
-    assert largest(filled[3] - shapes[1]) < 1e-9
 
 
 def test_paired_space_borrows_the_nearest_modes(scattered: Shapes) -> None:

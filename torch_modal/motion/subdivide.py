@@ -3,7 +3,6 @@
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import nullcontext
 from dataclasses import replace
 from itertools import pairwise
 from typing import Any
@@ -13,9 +12,8 @@ from torch import Tensor
 
 from torch_modal.elastic.backend import choose
 from torch_modal.errors import MeshWarning
-from torch_modal.geometry.connectivity import Connectivity, vertex_areas
+from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.crossings import Crossings, require_contact
-from torch_modal.geometry.rigid import blend
 from torch_modal.inbetween.results import report
 from torch_modal.inbetween.settings import Objective, Preset, Settings, Solver, settings
 from torch_modal.keyframes.check import check_keyframes
@@ -25,7 +23,6 @@ from torch_modal.modes.extract import bases_of_checked
 from torch_modal.motion.path import Path
 from torch_modal.passengers.proxy import Proxy, proxy_size
 from torch_modal.progress import Progress, ProgressReport
-from torch_modal.threads import alone
 from torch_modal.times import check_times, fill_times
 
 MAX_LEVELS = 12
@@ -54,9 +51,9 @@ def subdivide(
     """Fill a sequence of key-frames with physically plausible shapes.
 
     With three key-frames or more, the result follows a :class:`torch_modal.Path`, smooth in time: a spline, which
-    needs no modes unless there are contacts or terms beyond Eq. 5. Otherwise each level inserts a mid-shape between all
-    neighbours, which then serves as a key-frame of the next level (section 3.3 of the paper), with the modes of the
-    key-frames around it: of both in the joint space, of the nearest in the paired space.
+    needs no modes unless there are contacts or terms beyond Eq. 5. Two key-frames give the shapes of
+    :class:`torch_modal.InBetween`. With ``preset="paper"`` each level inserts a mid-shape between all neighbours, which
+    then serves as a key-frame of the next level with the modes of the nearest key-frame (section 3.3 of the paper).
 
     Args:
         keyframes: Vertex positions, two key-frames or more, in any units. *Shape:* ``(K, V, 3)``.
@@ -69,8 +66,8 @@ def subdivide(
         cyclic: True where the last key-frame leads on to the first. The sequence then ends one frame before it would
             repeat the first key-frame.
         n_frames: Number of frames of the result, evenly in time. The key-frames keep their places in it
-            (:func:`keyframe_places`): frames are even within each interval. Pairs alone are filled linearly between
-            their subdivided shapes, along the geodesic of the rigid motion. Default: ``2**levels`` to each interval.
+            (:func:`keyframe_places`): frames are even within each interval. Not with ``preset="paper"``. Default:
+            ``2**levels`` to each interval.
         times: When the key-frames are, as for :class:`torch_modal.Path`. Default: evenly.
         smooth: False treats each pair of key-frames alone. Default: True where there are three key-frames or more, in
             the joint space.
@@ -111,10 +108,10 @@ def subdivide(
     if carrier:
         keyframes, faces = check_keyframes(carrier.keyframes, carrier.faces)
     chosen = settings(preset, objective, solver, contact, None, mu, regions)
-    if smooth is None:
-        smooth = n_keys > 2 and chosen.objective.space == "joint"
-    if smooth and chosen.objective.space == "paired":
-        raise ValueError("the paired space (Eq. 4) knows pairs only: smooth=True needs space='joint'")
+    recursive = chosen.objective.space == "paired"
+    if recursive and (smooth or n_frames is not None):
+        raise ValueError("the paired space (Eq. 4) knows the middle of a pair only: leave out smooth and n_frames")
+    smooth = not recursive and n_keys > 2 if smooth is None else smooth
     if chosen.objective.contact:
         require_contact()
     needs_modes = chosen.objective.contact or bool(chosen.objective.terms) or not (smooth and n_keys > 2)
@@ -129,20 +126,16 @@ def subdivide(
     made = keyframes.detach() if made is None else made
     if len(made) != n_keys:
         raise ValueError(f"each key-frame needs its basis: got {len(made)} bases for {n_keys} key-frames")
-    # With contact, pairs are not subdivided either: what was done at one time would not fit what was done at the next.
-    by_path = smooth or chosen.objective.contact
     sequence = keyframes.new_empty(places[-1] + 1, *keyframes.shape[1:])
-    total = (len(places) - 1) * (1 if by_path else levels)
-    threads = nullcontext() if by_path else alone()  # splines are torch's work
-    with ProgressReport(total, "in-between shapes", progress) as bar, torch.no_grad(), threads:
-        if by_path:
-            path = Path(made, faces.cpu(), times, cyclic, smooth, objective=chosen.objective, solver=chosen.solver)
-            parts = _follow_path(path.to(keyframes.device), keyframes, faces, places)
+    with ProgressReport(len(places) - 1, "in-between shapes", progress) as bar, torch.no_grad():
+        if recursive:
+            intervals = _subdivide_pairs(keyframes, faces, made, levels, len(places) - 1, chosen)
         else:
-            parts = _subdivide_pairs(keyframes, faces, made, places, levels, n_frames, chosen, bar)
-        for i, shapes in enumerate(parts):
+            path = Path(made, faces.cpu(), times, cyclic, smooth, objective=chosen.objective, solver=chosen.solver)
+            intervals = _follow_path(path.to(keyframes.device), keyframes, faces, places)
+        for i, shapes in enumerate(intervals):
             sequence[places[i]], sequence[places[i] + 1 : places[i + 1]] = keyframes[i], shapes
-            bar.update(int(by_path))
+            bar.update()
         sequence[-1] = keyframes[-1]
     sequence = sequence[:-1] if cyclic else sequence
     return carrier.carry(sequence, places, originals) if carrier else sequence
@@ -164,41 +157,25 @@ def _follow_path(path: Path, keyframes: Tensor, faces: Tensor, places: Sequence[
 
 
 def _subdivide_pairs(
-    keyframes: Tensor,
-    faces: Tensor,
-    bases: Sequence[ModalBasis] | Tensor,
-    places: Sequence[int],
-    levels: int,
-    n_frames: int | None,
-    chosen: Settings,
-    bar: ProgressReport,
+    keyframes: Tensor, faces: Tensor, bases: Sequence[ModalBasis] | Tensor, levels: int, n: int, chosen: Settings
 ) -> Iterator[Tensor]:
-    """Shapes between the key-frames of each interval, of the pair alone."""
+    """Shapes between the key-frames of each of n intervals, by recursive subdivision in the paired space."""
     mesh = Connectivity(faces.cpu().numpy(), keyframes.shape[1])
-    weights = torch.from_numpy(vertex_areas(keyframes[0].cpu().double().numpy(), mesh.faces)).to(keyframes)
     edges = torch.tensor(mesh.edges, device=keyframes.device)
-    for i, n in enumerate(b - a for a, b in pairwise(places)):
-        ends = (i, (i + 1) % len(keyframes))
+    for ends in ([i, (i + 1) % len(keyframes)] for i in range(n)):
         layers: dict[tuple[int, int], MidShape] = {}
-        for a, b in [(0, 1)] if chosen.objective.space == "joint" else [(0, 1), (0, 0), (1, 1)]:
-            pair = bases[[ends[a], ends[b]]] if isinstance(bases, Tensor) else [bases[ends[a]], bases[ends[b]]]
-            solver = chosen.solver if a < b else replace(chosen.solver, regions=0)
-            layers[a, b] = MidShape(pair, faces.cpu(), objective=chosen.objective, solver=solver).to(keyframes.device)
-            layers[a, b].in_between.core.local = layers[0, 1].in_between.core.local  # the originals' regions
-        shapes = keyframes[list(ends)]
+        for pair in [(0, 1), (0, 0), (1, 1)]:
+            both = [ends[k] for k in pair]
+            chosen_bases = bases[both] if isinstance(bases, Tensor) else [bases[k] for k in both]
+            solver = chosen.solver if pair == (0, 1) else replace(chosen.solver, regions=0)
+            layers[pair] = MidShape(chosen_bases, faces.cpu(), objective=chosen.objective, solver=solver)
+            layers[pair].to(keyframes.device).in_between.core.local = layers[0, 1].in_between.core.local
+        shapes = keyframes[ends]
         for _ in range(levels):
-            if chosen.objective.space == "joint":
-                mids = layers[0, 1](shapes[:-1], shapes[1:])
-            else:
-                nearest = _nearest_ends(shapes, edges)
-                each = zip(nearest[:-1], nearest[1:], shapes[:-1], shapes[1:], strict=True)
-                mids = torch.stack([layers[a, b](x, y) for a, b, x, y in each])
+            nearest = _nearest_ends(shapes, edges)
+            each = zip(pairwise(nearest), shapes[:-1], shapes[1:], strict=True)
+            mids = torch.stack([layers[pair](x, y) for pair, x, y in each])
             shapes = torch.cat([torch.stack([shapes[:-1], mids], 1).flatten(0, 1), shapes[-1:]])
-            bar.update()
-        if n_frames is not None:
-            known, shapes = shapes, shapes.new_empty(n + 1, *shapes.shape[1:])
-            for body in layers[0, 1].in_between.vertices:
-                shapes[:, body] = _resample(known[:, body], n, weights[body])
         yield shapes[1:-1]
 
 
@@ -298,10 +275,3 @@ def _report_contacts(keyframes: Tensor, faces: Tensor, left: int, total: int) ->
         )
     for message in messages:
         warnings.warn(message, MeshWarning, stacklevel=5)
-
-
-def _resample(shapes: Tensor, intervals: int, weights: Tensor) -> Tensor:
-    """Even times over one interval of key-frames. *Shape:* ``(n + 1, V, 3) -> (intervals + 1, V, 3)``."""
-    position = torch.linspace(0, len(shapes) - 1, intervals + 1, dtype=shapes.dtype, device=shapes.device)
-    left = position.floor().long().clamp_max(len(shapes) - 2)
-    return blend(shapes[left], shapes[left + 1], position - left, weights)
