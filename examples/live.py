@@ -25,7 +25,6 @@ from torch_modal.data.samples import load_sample
 
 GIVEN, COMPUTED, TRAIL = (232, 153, 92), (158, 181, 209), (74, 120, 171)
 N_AMPLITUDES = 4
-TRAIL_POINTS = 81
 SLACK = 1e-6
 """Part of the mean compliance by which handles may be missed, so that close handles do not conflict."""
 
@@ -71,11 +70,10 @@ class Live:
     def __init__(self, keyframes: Tensor, faces: Tensor, port: int = 8080, n_modes: int = 20) -> None:
         keyframes = keyframes.double()
         bases = tm.extract_bases(keyframes, faces, n_modes)
+        path = tm.Path(bases, faces)
         self.faces = faces
-        self.path = tm.Path(keyframes, faces)
-        self.shapes = keyframes.clone()
-        times, modes = self.path.times, bases[0].modes[:N_AMPLITUDES]
-        self.decoder = tm.ModalDecoder(keyframes, faces, times, keyframes[0], modes)
+        self.editor = tm.PathEditor(path, keyframes)
+        self.decoder = tm.ModalDecoder(keyframes, faces, path.times, keyframes[0], bases[0].modes[:N_AMPLITUDES])
         low, high = keyframes.amin((0, 1)), keyframes.amax((0, 1))
         self.centre, self.size = (low + high) / 2, (high - low).norm()
         self.lock = threading.Lock()  # viser calls back in threads of its own
@@ -90,7 +88,7 @@ class Live:
         for shape, basis in zip(keyframes, bases, strict=True):
             self.add_keyframe(len(self.keyframes), shape, basis)
         gui = self.server.gui
-        self.time = gui.add_slider("Time", 0.0, float(times[-1]), 0.01, 0.5)
+        self.time = gui.add_slider("Time", 0.0, float(path.times[-1]), 0.01, 0.5)
         gui.add_button("Pin", hint="Makes a key-frame of the present shape").on_click(lambda _: self.insert())
         with gui.add_folder("Amplitudes"):
             self.amplitudes = [gui.add_slider(f"Mode {i + 1}", -20.0, 20.0, 0.1, 0.0) for i in range(N_AMPLITUDES)]
@@ -127,7 +125,7 @@ class Live:
         """Put a handle on a vertex of a key-frame, where it is now."""
         if vertex in keyframe.handles:
             return
-        place = self.to_scene(self.shapes[self.keyframes.index(keyframe), vertex])
+        place = self.to_scene(self.editor.keyframes[self.keyframes.index(keyframe), vertex])
         control = self.server.scene.add_transform_controls(
             f"{keyframe.ghost.name}/{vertex}", scale=0.25, disable_rotations=True, depth_test=False, position=place
         )
@@ -145,24 +143,22 @@ class Live:
         """Make a key-frame of the present shape, with the modes of the nearest one."""
         with self.lock, torch.no_grad():
             when = self.time.value
-            times = self.path.times
-            if bool((times == when).any()):
+            nearest = int((self.editor.path.times - when).abs().argmin())
+            try:
+                number = self.editor.insert(when, self.shape())
+            except ValueError:  # at this time there is one
                 return
-            number, nearest = int((times < when).sum()), int((times - when).abs().argmin())
-            shape, times = self.shape(), torch.cat([times[times < when], times.new_tensor([when]), times[times > when]])
-            self.shapes = torch.cat([self.shapes[:number], shape[None], self.shapes[number:]])
-            self.path = tm.Path(self.shapes, self.faces, times)
             self.edited = {i + (i >= number) for i in self.edited}
-            self.decoder = self.decoder.with_keyframes(self.shapes, times)
-            self.add_keyframe(number, shape, self.keyframes[nearest].basis)
+            self.decoder = self.decoder.with_keyframes(self.editor.keyframes, self.editor.path.times)
+            self.add_keyframe(number, self.editor.keyframes[number].clone(), self.keyframes[nearest].basis)
         self.changed.set()
 
     def shape(self) -> Tensor:
         """The motion at the slider's time, with its amplitudes. *Shape:* ``(V, 3)``."""
         amplitudes = torch.tensor([slider.value for slider in self.amplitudes], dtype=torch.float64)
         if not amplitudes.any():
-            return self.path(self.shapes, self.time.value)
-        return self.decoder(amplitudes, self.time.value, keyframes=self.shapes)
+            return self.editor.path(self.editor.keyframes, self.time.value)
+        return self.decoder(amplitudes, self.time.value, keyframes=self.editor.keyframes)
 
     @torch.no_grad()
     def update(self) -> None:
@@ -171,12 +167,11 @@ class Live:
             for number in self.edited:
                 keyframe = self.keyframes[number]
                 places = torch.tensor(np.array([control.position for control in keyframe.handles.values()]))
-                self.shapes[number] = keyframe.bent(places * (self.size / 2) + self.centre)
-                keyframe.ghost.vertices = self.to_scene(self.shapes[number])
+                self.editor.replace(number, keyframe.bent(places * (self.size / 2) + self.centre))
+                keyframe.ghost.vertices = self.to_scene(self.editor.keyframes[number])
             self.mesh.vertices = self.to_scene(self.shape())
             if self.edited:
-                times = self.path.times
-                shapes = self.path(self.shapes, torch.linspace(times[0], times[-1], TRAIL_POINTS))
+                shapes = self.editor.shapes()
                 for vertex in {v for keyframe in self.keyframes for v in keyframe.handles}:
                     trail = self.to_scene(shapes[:, vertex])
                     self.server.scene.add_spline_catmull_rom(f"/trail {vertex}", trail, color=TRAIL)

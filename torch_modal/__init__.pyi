@@ -63,8 +63,10 @@ from .modes.lattice import Lattice as Lattice
 from .modes.tetrahedra import TetrahedralizationError as TetrahedralizationError
 from .modes.tetwild import TetWild as TetWild
 from .motion.decoder import ModalDecoder as ModalDecoder
+from .motion.editor import PathEditor as PathEditor
 from .motion.path import Path as Path
 from .motion.skin import bake as bake
+from .motion.spline import Explanation as Explanation
 from .motion.subdivide import frame_times as frame_times
 from .motion.subdivide import keyframe_places as keyframe_places
 from .motion.subdivide import linear_sequence as linear_sequence

@@ -58,6 +58,12 @@ def fill_times(times: Tensor, counts: Sequence[int]) -> Tensor:
     return torch.cat([torch.linspace(a, b, n + 1, dtype=times.dtype)[:-1] for a, b, n in ends]).to(times.device)
 
 
+def wrap_times(t: Tensor, times: Tensor) -> Tensor:
+    """Times modulo the period of a cycle. *Shape:* ``(B,), (K + 1,) -> (B,)``."""
+    period = times[-1] - times[0]
+    return t - period * torch.floor((t.detach() - times[0]) / period)
+
+
 def locate_times(
     t: Tensor, times: Tensor, cyclic: bool, rounding: float = 0.0, of: str = "key-frame"
 ) -> tuple[Tensor, Tensor]:
@@ -76,8 +82,7 @@ def locate_times(
     """
     scale = torch.maximum(t.detach().abs(), times.abs().amax())
     if cyclic:
-        period = times[-1] - times[0]
-        t = t - period * torch.floor((t.detach() - times[0]) / period)
+        t = wrap_times(t, times)
     if rounding:
         differences = times - t.detach()[:, None]
         to_nearest = differences.gather(1, differences.abs().argmin(1, keepdim=True))[:, 0]

@@ -71,6 +71,7 @@ CALLS: dict[str, Callable[[Shapes], Tensor]] = {
     "Path": lambda s: tm.Path(s.bases, s.faces)(s.keyframes, 2 * TIMES),
     "Path, torch": lambda s: tm.Path(s.bases, s.faces, solver=tm.Solver(backend="torch"))(s.keyframes, 2 * TIMES),
     "Path, pairs": lambda s: tm.Path(s.bases, s.faces, smooth=False)(s.keyframes, 2 * TIMES),
+    "PathEditor": lambda s: tm.PathEditor(tm.Path(s.bases, s.faces), s.keyframes, 3).shapes(),
     "subdivide": lambda s: tm.subdivide(s.keyframes, s.faces, 1, bases=s.bases, progress=False),
     "subdivide, a pair": lambda s: tm.subdivide(s.keyframes[:2], s.faces, 1, n_modes=6, n_frames=6, progress=False),
 }

@@ -1,13 +1,16 @@
 """Motion through many key-frames: its laws, its gradients, and how close it comes to known motions."""
 
+import dataclasses
 import math
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from conftest import Shapes
 from scipy.interpolate import CubicSpline
 from shapes import diagonal, edge_error, largest
+from sheets import cylinder, rectangle, rolled
 from terms import Area
 from torch import Tensor, nn
 
@@ -271,6 +274,7 @@ def test_gradients_reach_a_term(motion: Shapes) -> None:
         *((lambda path, x, at=at: path(x, at), "between the times of .*, 0 and 4") for at in (-0.1, 4.2, math.nan)),
         (lambda path, x: path(x[:4], 0.5), r"shape \(\.\.\., 5, 164, 3\); got \(4, 164, 3\)"),
         (lambda path, x: path(x.expand(2, -1, -1, -1), torch.rand(3)), r"keyframes \(2,\), t \(3,\); for"),
+        (lambda path, x: path.insert(2.0), "already"),
     ],
 )
 def test_what_a_call_refuses(call: Any, message: str, path: Path, motion: Shapes) -> None:
@@ -315,6 +319,92 @@ def test_the_sample_creature() -> None:
     assert edges < 0.5 * worse
 
 
+# ----------------------------------------------------------------------------------------------------------- editing
+
+
+def edited(shapes: Shapes, i: int, **options: Any) -> int:
+    """How many intervals are computed again after a key-frame has changed."""
+    path = Path(shapes.keyframes, shapes.faces, **options)
+    editor = tm.PathEditor(path, shapes.keyframes, steps=3)
+    before, other, computed = editor.shapes(), shapes.keyframes.clone(), []
+    torch.testing.assert_close(before, path(shapes.keyframes, editor.times()), rtol=0, atol=1e-9)
+    other[i] += 0.1
+    path.register_forward_pre_hook(lambda *_: computed.append(1))
+    editor.replace(i, other[i])
+    after, n = editor.shapes(), len(computed)
+    assert torch.equal(editor.shapes(), after) and len(computed) == n
+    torch.testing.assert_close(after, path(other, editor.times()), rtol=0, atol=1e-5)
+    assert torch.equal(shapes.keyframes[i] + 0.1, other[i]), "the caller's key-frames stay"
+    return n
+
+
+def test_a_change_of_a_pair_is_local(bars: Shapes) -> None:
+    assert edited(bars.pick(0, 1, 2, 1, 0, 2), 1, smooth=False) == 2
+    assert edited(bars.pick(0, 1, 2, 1, 0, 2), 0, smooth=False) == 1
+
+
+@pytest.mark.parametrize("cyclic", [False, True])
+def test_a_change_of_a_spline_fades(small_bars: Shapes, cyclic: bool) -> None:
+    """It reaches all of it, a quarter as far at each key-frame; what nobody sees is not computed again."""
+    assert 8 <= edited(small_bars.pick(*[0, 1, 2, 1] * 10), 1, cyclic=cyclic) <= 25
+
+
+def test_a_pinned_in_between_becomes_a_keyframe(motion: Shapes, path: Path) -> None:
+    editor = tm.PathEditor(path, motion.keyframes, steps=2)
+    passing = path(motion.keyframes, 2.3)
+    assert editor.insert(2.3) == 3
+    assert editor.path.times.tolist() == [0, 1, 2, 2.3, 3, 4]
+    assert editor.times()[4:9].tolist() == pytest.approx([2, 2.15, 2.3, 2.65, 3])
+    torch.testing.assert_close(editor.shapes()[6], passing, rtol=0, atol=1e-12)
+    moved = passing + 0.05
+    editor.replace(3, moved)
+    assert torch.equal(editor.path(editor.keyframes, 2.3), moved)
+    editor.replace(-1, motion.keyframes[-1] + 0.1)  # counted from the end
+    torch.testing.assert_close(editor.shapes(), editor.path(editor.keyframes, editor.times()), rtol=0, atol=1e-9)
+    for number, shape, error, message in (
+        (6, moved, IndexError, "out of bounds"),
+        (0, moved * math.nan, ValueError, "not finite"),
+    ):
+        with pytest.raises(error, match=message):
+            editor.replace(number, shape)
+    assert path.insert(2.0 + 1e-9).times.tolist() == [0, 1, 2, 2.0 + 1e-9, 3, 4]
+
+
+@pytest.mark.parametrize("turns", [-2, 1])
+def test_a_key_frame_of_another_period_is_that_of_the_first(motion: Shapes, turns: int) -> None:
+    """Times of a cycle are taken modulo the period: an inserted key-frame too."""
+    own = motion.pick(0, 1, 2)
+    path = Path(own.bases, own.faces, times(0.0, 1.0, 2.0, 4.0), cyclic=True)
+    inside, outside = (tm.PathEditor(path, own.keyframes, steps=2) for _ in range(2))
+    moved = own.keyframes[1] + 0.1
+    assert inside.insert(2.5, moved) == outside.insert(2.5 + 4 * turns, moved) == 3
+    assert outside.path.times.tolist() == [0.0, 1.0, 2.0, 2.5, 4.0]
+    assert torch.equal(outside.path(outside.keyframes, 2.5 + 4 * turns), moved)
+    assert torch.equal(outside.shapes(), inside.shapes())
+
+
+@pytest.mark.parametrize("cyclic", [False, True])
+@pytest.mark.parametrize("t", [math.nan, -math.inf, 0.2 + 1e-16, 0.8, -0.4, 5.0])
+def test_an_insert_that_fails_changes_nothing(bars: Shapes, cyclic: bool, t: float) -> None:
+    own = bars.pick(0, 1, 2)
+    path = Path(own.bases, own.faces, times(0.2, 0.6, 0.8, 1.4)[: 3 + cyclic], cyclic=cyclic)
+    editor = tm.PathEditor(path, own.keyframes, steps=2)
+    before, at = editor.shapes(), editor.times()
+    if cyclic and t == 5.0:
+        with pytest.raises(ValueError, match="not finite"):
+            editor.insert(t, own.keyframes[0] * math.nan)
+    else:
+        with pytest.raises(ValueError, match=r"lies between|already"):
+            editor.insert(t, own.keyframes[0])
+    assert editor.path is path
+    assert torch.equal(editor.keyframes, own.keyframes)
+    assert torch.equal(editor.times(), at)
+    assert torch.equal(editor.shapes(), before)
+    moved = own.keyframes[0] + 0.1
+    assert editor.insert(0.7, moved) == 2
+    assert torch.equal(editor.path(editor.keyframes, 0.7), moved)
+
+
 def test_solve_tells_how_it_went(motion: Shapes, path: Path) -> None:
     t = times(0.0, 3.5, 1.2, 0.4)
     with torch.no_grad():
@@ -328,7 +418,24 @@ def test_solve_tells_how_it_went(motion: Shapes, path: Path) -> None:
     assert nothing.shapes.shape == (0, *motion.keyframes.shape[1:]) and nothing.solution.status.shape == (0,)
 
 
-def test_solve_tells_what_is_blended(bars: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_explain_tells_where_velocities_are_limited(bars: Shapes) -> None:
+    """A bar bends, rests for an interval, and goes back: at a key-frame, and within intervals."""
+    own = bars.pick(0, 1, 1, 0)
+    why = Path(own.keyframes, own.faces).explain(own.keyframes, times(0.4, 1.0, 1.5, 2.5)[:, None])
+    assert why.interval.tolist() == [[0], [1], [1], [2]]
+    torch.testing.assert_close(why.fraction, times(0.4, 0.0, 0.5, 0.5)[:, None])
+    assert torch.equal(why.limited > 0.99, torch.tensor([[[0, 1]], [[1, 1]], [[1, 1]], [[1, 0]]]).bool())
+    assert not why.even.any() and not why.solution.start_weights.any() and largest(why.displacement) < 1e-9
+    assert bool((why.turns[[0, 3], :, 1] > 0.5).all()) and largest(why.turns[1:3]) < 1e-6
+    even = torch.stack([bars.keyframes[0] @ quarter_turns(k).mT for k in (0, 0.6, 1.2, 1.8)])
+    steady = Path(even, bars.faces).explain(even, 1.5)
+    assert not steady.limited.any()
+    torch.testing.assert_close(steady.turns, times(0.6 * math.pi / 2, 0), rtol=0, atol=1e-6)
+    pairs = Path(own.keyframes, own.faces, smooth=False).explain(own.keyframes, 1.0)
+    assert pairs.even and not pairs.limited.any()
+
+
+def test_explain_tells_what_is_blended(bars: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
     path, t = Path(bars.keyframes, bars.faces), times(0.3, 0.7)
     spline, knots = path.splines[0], path.knots(bars.keyframes[None])
     assert knots is not None
@@ -336,9 +443,30 @@ def test_solve_tells_what_is_blended(bars: Shapes, monkeypatch: pytest.MonkeyPat
     straight = spline.alignment.to_caller(spline.straight(knots[0], 0, which, t), spline.pose(knots[0], 0, which, t))
     smooth = path(bars.keyframes, t)
     monkeypatch.setattr(path.distortions[0], "forward", lambda *_: torch.tensor([[2.5e30, 1], [1e30, 1e30]]).double())
-    weights = path.solve(bars.keyframes, t).solution.start_weights
-    torch.testing.assert_close(weights, times(0.5, 0)[:, None])
+    why = path.explain(bars.keyframes, t)
+    torch.testing.assert_close(why.solution.start_weights, times(0.5, 0)[:, None])
     torch.testing.assert_close(path(bars.keyframes, t), torch.stack([(smooth + straight)[0] / 2, smooth[1]]))
+
+
+def test_explain_tells_of_more_than_a_full_turn() -> None:
+    """A strip that rolls up, and goes on a little."""
+    points, faces = rectangle(6.0, 1.0, 0.25)
+    shapes = [cylinder(points, time, lambda s: rolled(s, 6.0, 3.0), math.radians(80)) for time in (0.0, 0.9, 1.0)]
+    x = torch.from_numpy(np.stack(shapes))
+    assert Path(x, torch.from_numpy(faces)).explain(x, times(0.5, 1.5)).even.tolist() == [True, False]
+
+
+def test_explain_tells_what_a_term_moved(motion: Shapes) -> None:
+    """Of two motions at two times each."""
+    objective = tm.Objective(terms=(Shrinking(300.0),), coarse_faces=200)
+    path = Path(motion.bases, motion.faces, objective=objective)
+    keyframes, t = torch.stack([motion.keyframes, 1.1 * motion.keyframes])[:, None], times(1.0, 2.5)
+    why = path.explain(keyframes, t)
+    plain = Path(motion.keyframes, motion.faces)(keyframes, t)
+    moved = (path(keyframes, t) - plain).norm(dim=-1).amax(-1)
+    torch.testing.assert_close(why.displacement, moved, rtol=1e-6, atol=1e-9)
+    assert largest(moved[:, 0]) < 1e-9 < 1e-4 * diagonal(motion.keyframes[0]) < float(moved[:, 1].min())
+    assert why.limited.shape == (2, 2, 2) and why.solution.n_steps.shape == (2, 2)
 
 
 def test_times_in_float32_reach_the_key_frames(motion: Shapes) -> None:
@@ -354,3 +482,39 @@ def test_times_in_float32_reach_the_key_frames(motion: Shapes) -> None:
         Path(motion.bases, motion.faces, times=at)(motion.keyframes, 3.3 + 1e-5)
     listed = Path(motion.bases[:3], motion.faces, [0.1, 0.3, 0.7])  # no numbers of float32
     assert torch.equal(listed(motion.keyframes[:3], times(0.1, 0.3, 0.7)), motion.keyframes[:3])
+
+
+@pytest.mark.parametrize("cyclic", [False, True])
+def test_what_an_inserted_key_frame_changes_is_computed_again(bars: Shapes, cyclic: bool) -> None:
+    """The intervals around it that shapes were known of already, too."""
+    own = bars.pick(0, 1, 2, 1, 0)
+    editor = tm.PathEditor(Path(own.bases, own.faces, cyclic=cyclic), own.keyframes, steps=3)
+    before = editor.shapes()
+    editor.insert(1.5, own.keyframes[0] + 0.1)
+    whole = editor.path(editor.keyframes, editor.times())
+    torch.testing.assert_close(editor.shapes(), whole, rtol=0, atol=1e-9)
+    assert largest(whole[:6] - before[:6]) > 1e-3, "the intervals before it depend on it"
+
+
+def test_an_inserted_key_frame_borrows_the_modes_around_it(motion: Shapes) -> None:
+    x, path = motion.keyframes, Path(motion.bases, motion.faces, smooth=False)
+    pinned = path(x, 1.3) + 0.05
+    found = path.insert(1.3)(torch.cat([x[:2], pinned[None], x[2:]]), times(1.15, 1.65))
+    borrowed = dataclasses.replace(motion.bases[1], reference=path(x, 1.3))
+    for shape, ends, other in zip(found, ((x[1], pinned), (pinned, x[2])), (1, 2), strict=True):
+        bases = [motion.bases[1], borrowed] if other == 1 else [borrowed, motion.bases[2]]
+        torch.testing.assert_close(shape, tm.InBetween(bases, motion.faces)(*ends, 0.5), rtol=0, atol=1e-9)
+
+
+def test_a_path_scheme_outlasts_an_insert(motion: Shapes) -> None:
+    """One in which every key-frame is a rest."""
+
+    def still(speeds: Tensor, durations: Tensor, cyclic: bool, squared: Squared) -> Tensor:
+        return torch.cat([torch.zeros_like(speeds), torch.zeros_like(speeds[:1])])
+
+    path = Path(motion.bases, motion.faces, smooth=still)
+    keyframes = torch.cat([motion.keyframes[:2], path(motion.keyframes, 1.5)[None], motion.keyframes[2:]])
+    near = path.insert(1.5)(keyframes, times(1.5, 1.5 + 1e-3, 2.0, 2.0 + 1e-3))
+    assert largest(near[1::2] - near[::2]) < 1e-4
+    away = Path(motion.bases, motion.faces).insert(1.5)(keyframes, times(1.5, 1.5 + 1e-3))
+    assert largest(away[1] - away[0]) > 3e-4, "without it, the motion goes on"

@@ -70,7 +70,7 @@ TABLES = {
 }
 """Classes whose members the first column of a table names, by page and heading; others are headed ``tm.NAME``."""
 VARIABLES: dict[str, type] = {
-    **{"space": tm.ShapeSpace, "layer": tm.InBetween, "passengers": tm.Passengers},
+    **{"space": tm.ShapeSpace, "layer": tm.InBetween, "editor": tm.PathEditor, "passengers": tm.Passengers},
     **{"augment": tm.AugmentationSequential, "components": tm.Components, "fitted": tm.Fitted, "solution": tm.Solution},
 }
 """Names by which the pages call objects of the package in running text."""

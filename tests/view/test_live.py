@@ -42,8 +42,8 @@ def test_controls_edit_the_motion(live: Any, bars: Shapes) -> None:
 
     live.time.value = 0.5
     live.insert()
-    assert len(live.keyframes) == 4 == len(live.shapes)
+    assert len(live.keyframes) == 4 == len(live.editor.keyframes)
     live.update()
-    torch.testing.assert_close(shown(live), live.shapes[1], rtol=0, atol=1e-5)
+    torch.testing.assert_close(shown(live), live.editor.keyframes[1], rtol=0, atol=1e-5)
     live.insert()
     assert len(live.keyframes) == 4, "there is a key-frame at this time already"

@@ -23,15 +23,18 @@ from torch_modal.inbetween.results import InBetweenResult, join_bodies, report, 
 from torch_modal.inbetween.settings import Objective, Preset, Solver, settings
 from torch_modal.keyframes.arrays import as_faces, broadcast_leading
 from torch_modal.keyframes.check import check_surface
-from torch_modal.layers.base import Bases, PreciseModule, basis_buffers
+from torch_modal.layers.base import Bases, BasisBuffers, PreciseModule, basis_buffers
 from torch_modal.layers.blend import Blend
 from torch_modal.layers.in_between import InBetween
 from torch_modal.motion.cubics import Scheme, evaluate_by_interval
-from torch_modal.motion.spline import Knots, Spline
-from torch_modal.times import check_times, locate_times
+from torch_modal.motion.spline import Explanation, Knots, Spline
+from torch_modal.times import check_times, locate_times, wrap_times
 
 # Even times between two key-frames at which a path looks for contacts.
 N_SEARCHED = 31
+
+# Times nearer to a key-frame than this part of the interval are the key-frame's.
+SAME_TIME = 1e-12
 
 
 class Path(PreciseModule):
@@ -144,6 +147,34 @@ class Path(PreciseModule):
         """The dtype of the computation."""
         return self.splines[0].alignment.scale.dtype  # type: ignore[no-any-return]
 
+    @outside_inference_mode
+    def insert(self, t: float) -> "Path":
+        """Motion with one more key-frame, which borrows the modes of the nearer of those around it.
+
+        Args:
+            t: When it is, between the others; modulo the period, if cyclic.
+
+        Returns:
+            A path of one more key-frame.
+
+        Raises:
+            ValueError: The time is outside, not finite, or equal to the time of a key-frame.
+        """
+        at = self.times.new_tensor([t])
+        segment, u = locate_times(at, self.times, self.cyclic)
+        i, fraction = int(segment), float(u)
+        if min(fraction, 1 - fraction) <= SAME_TIME:
+            raise ValueError(f"there is a key-frame at {t:g} already; replace it in the keyframes that are passed")
+        buffers = [BasisBuffers(basis.reference, basis.modes) for basis in self.bases]
+        nearest = buffers[self.pairs[i][round(fraction)]]
+        passed = self(torch.stack([basis.reference for basis in buffers]).to(self.dtype), t)
+        buffers.insert(i + 1, BasisBuffers(passed, nearest.modes))
+        at = wrap_times(at, self.times) if self.cyclic else at
+        times = torch.cat([self.times[: i + 1], at, self.times[i + 1 :]])
+        options: dict[str, Any] = {"objective": self.objective, "solver": self.solver, "contact": self.contact}
+        other = Path(buffers, self.faces, times, self.cyclic, self.scheme or self.smooth, **options)
+        return other.to(self.bases[0].reference)
+
     @disable_compile
     def forward(self, keyframes: Tensor, t: Tensor | float) -> Tensor:
         """The shapes at given times.
@@ -176,6 +207,25 @@ class Path(PreciseModule):
         ends = torch.stack([flat[which, k] for k in pairs.unbind(-1)], 1).to(keyframes.dtype)
         exact = with_exact_keyframes(result.shapes, ends, torch.stack([1 - u, u], -1))
         return result._replace(shapes=exact).unflatten(lead)
+
+    @torch.no_grad()
+    @full_precision
+    def explain(self, keyframes: Tensor, t: Tensor | float) -> Explanation:
+        """Causes of sudden changes in the motion, at given times. Arguments as for :meth:`forward`."""
+        flat, which, segment, u, lead = self._flatten(keyframes, t)
+        splines, n = self.splines, len(self.pairs)
+        knots = [spline.knots(flat[:, :, body]) for spline, body in zip(splines, self.vertices, strict=True)]
+        limited, turns = zip(*map(Spline.explain, splines, knots), strict=True)
+        share, turn = self.smooth * torch.cat(limited, -1).to(u).mean(-1), torch.stack(turns).amax(0)
+        even = [not self.smooth or any(s.rotations[i].clusters is not None for s in splines) for i in range(n)]
+        known, result = knots if self.smooth else None, self.solve(keyframes, t)
+        alone = join_batches(
+            *evaluate_by_interval(segment, n, lambda i, rows: self._spline_shapes(known, flat, i, which[rows], u[rows]))
+        )
+        moved = (result.shapes.reshape_as(alone.shapes) - alone.shapes).norm(dim=-1).amax(-1)
+        of_intervals = share[segment, :, which], torch.tensor(even, device=u.device)[segment], turn[segment, :, which]
+        fields = (x.reshape(lead + x.shape[1:]) for x in (segment, u, *of_intervals, moved))
+        return Explanation._make([*fields, result.solution])
 
     def knots(self, motions: Tensor) -> list[Knots] | None:
         """The knots of each body; None if the path is not smooth. *Shape:* ``(L, K, V, 3)``."""

@@ -7,6 +7,7 @@ from torch import Tensor, nn
 
 from torch_modal.autograd import full_precision
 from torch_modal.elastic.backend import TorchBackend
+from torch_modal.elastic.minimise import Solution
 from torch_modal.geometry.canonical import own_order
 from torch_modal.geometry.clusters import beyond_a_turn
 from torch_modal.geometry.connectivity import Connectivity
@@ -21,6 +22,10 @@ from torch_modal.motion.cubics import Cubics, Scheme, cubics, offset
 
 # Strains are relative to the mean size of a triangle, of which the smallest is this part of the mean.
 SMALLEST = 1e-9
+
+# Change of a velocity by the limit from which on an Explanation counts it, relative to the velocity and a hundredth,
+# below which a triangle is at rest.
+LIMITED = 1e-3
 
 
 class Knots(NamedTuple):
@@ -42,6 +47,30 @@ class Knots(NamedTuple):
     """Rotations of the caller's shapes, axis times angle. *Shape of each:* ``(N, L, 3)``."""
     moves: Cubics
     """Positions of the centroids. *Shape of each:* ``(N, L, 3)``."""
+
+
+class Explanation(NamedTuple):
+    """Causes of sudden changes in a motion, at given times."""
+
+    interval: Tensor
+    """The interval between key-frames, from 0 on; other cubics begin at each. *Shape:* ``(...)``, int64."""
+    fraction: Tensor
+    """Time within the interval; at 0 and 1 the shape is the key-frame itself. *Shape:* ``(...)``."""
+    limited: Tensor
+    """Part of the triangles with a limited velocity at the key-frames before and after, where their acceleration jumps.
+    *Shape:* ``(..., 2)``."""
+    even: Tensor
+    """True where velocities jump at both key-frames: triangles turn evenly in this interval, as pairs alone, or because
+    parts turn by more than a full turn. *Shape:* ``(...)``, bool."""
+    turns: Tensor
+    """Angles by which the whole shape turns within the interval, and the triangle that turns most relative to it, in
+    radians. Near half a turn, and near a full turn, small changes of the key-frames change the way round.
+    *Shape:* ``(..., 2)``."""
+    displacement: Tensor
+    """Largest distance by which contact or further terms moved a vertex off the spline, in the caller's units.
+    *Shape:* ``(...)``."""
+    solution: Solution
+    """From :meth:`Path.solve`: ``status``, ``n_steps``, ``start_weights`` and, with contact, ``n_crossing``."""
 
 
 class Spline(nn.Module):
@@ -174,6 +203,20 @@ class Spline(nn.Module):
         else:
             edges = rotations.edges_along(trajectory, which, u)
         return self.poisson.forward_or_near(self.poisson.right_hand_side(edges), straight)
+
+    def explain(self, knots: Knots) -> tuple[Tensor, Tensor]:
+        """Masks of the velocities that are limited at both ends of each interval, and its :attr:`Explanation.turns`.
+
+        *Shape:* ``(N, 2, L, F), (N, 2, L)``.
+        """
+        step, *ends = knots.triangles
+        free = torch.stack(cubics(step, self.times.diff(), self.cyclic, torch.zeros_like)[1:])  # without the limit
+        change, speed = (x.norm(dim=2) for x in (torch.stack(ends) - free, step + free))
+        limited = (change > LIMITED * (speed + 0.01)).transpose(0, 1) & (self.scheme is None)
+        if not self.cyclic:
+            limited[0, 0] = limited[-1, 1] = False
+        turns = torch.stack([knots.turns.step.norm(dim=-1), step[:, :3].norm(dim=1).amax(-1)], 1)
+        return limited, turns
 
     def pose(self, knots: Knots, i: int, which: Tensor, u: Tensor) -> Pose:
         """The poses at times of one interval. Arguments as for :meth:`forward`."""
