@@ -299,7 +299,7 @@ def test_what_a_path_refuses(options: Any, message: str, motion: Shapes) -> None
 def test_too_few_key_frames_and_pairs_alone(motion: Shapes) -> None:
     with pytest.raises(ValueError, match="two key-frames or more, got 1"):
         Path(motion.bases[:1], motion.faces)
-    with pytest.raises(ValueError, match="knows pairs only"):
+    with pytest.raises(ValueError, match="the middle of a pair only"):
         tm.subdivide(motion.keyframes, motion.faces, bases=motion.bases, smooth=True, preset="paper")
 
 
