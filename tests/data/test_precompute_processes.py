@@ -18,8 +18,7 @@ from safetensors.torch import load_file
 
 import torch_modal as tm
 from torch_modal.cli import main as cli
-from torch_modal.data.precompute_set import DONE, Options, run_set
-from torch_modal.data.precompute_tree import precompute_tree
+from torch_modal.data.precompute import DONE, Options, precompute_tree, run_set
 from torch_modal.data.stored import SET_FILE, StoredSet, find_sets
 from torch_modal.io.frames import save_frames
 

@@ -2,7 +2,6 @@
 
 import argparse
 import os
-import sys
 from pathlib import Path
 
 from torch_modal.cli.arguments import (
@@ -78,8 +77,7 @@ def add_precompute(sub: argparse.ArgumentParser) -> None:
     text = "sets at a time, each in a process with one thread (default: one for each processor)"
     add("--workers", type=number(int, 1), metavar="N", help=text)
     add("--scheduler", metavar="ADDRESS", help="run on the Dask cluster with this scheduler instead")
-    text = "seconds for a set, half of which the mesher may take (default: 600)"
-    add("--timeout", type=number(float, 0, above=True), metavar="S", default=600.0, help=text)
+    add("--timeout", type=number(float, 0, above=True), metavar="S", default=600.0, help="for a set (default: 600)")
     text = (
         "the meshes of a folder are a motion, in natural order of their names; its file times.txt, if there is "
         "one, says when each is, and when the first comes again if it is a cycle (default: even times)"
@@ -114,13 +112,11 @@ def precompute(args: argparse.Namespace) -> int:
     if args.scheduler and args.workers:
         args.fail("--scheduler shares the sets among the workers of its cluster; leave out --workers")
 
-    from torch_modal.data.precompute_set import DONE, Options
-    from torch_modal.data.precompute_tree import precompute_tree
+    from torch_modal.data.precompute import DONE, Options, precompute_tree
 
     cache_dir = args.cache_dir and os.path.abspath(os.path.expanduser(args.cache_dir))
     settings = pick_options(args, "method", "mesher", "timeout", "overwrite", "sequence")
     options = Options(n_modes=args.modes, cache_dir=cache_dir, **settings)
     where = pick_options(args, "workers", "scheduler")
-    bar = not args.quiet and sys.stderr.isatty()
-    records = precompute_tree(args.root, args.out, options, **where, say=reporter(args), bar=bar)
+    records = precompute_tree(args.root, args.out, options, **where, say=reporter(args))
     return 0 if all(record.status == DONE for record in records.values()) else INCOMPLETE

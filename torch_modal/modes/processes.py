@@ -36,7 +36,6 @@ def run_child(
     stop: threading.Event | None = None,
     job: bytes = b"",
     environment: dict[str, str] | None = None,
-    grace: float = 0.0,
 ) -> None:
     """Run a program in a folder until it ends.
 
@@ -50,7 +49,6 @@ def run_child(
         stop: Event that also ends the program.
         job: Content of its standard input.
         environment: Its environment variables; by default those of this process.
-        grace: Seconds between interrupting the program and killing it.
 
     Raises:
         ChildError: The program ended with an error, or after the timeout.
@@ -79,10 +77,6 @@ def run_child(
             with contextlib.suppress(subprocess.TimeoutExpired):
                 code = process.wait(min(POLL, left))
     finally:
-        if grace and process.poll() is None:
-            process.send_signal(signal.SIGINT if os.name == "posix" else signal.SIGTERM)
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                process.wait(grace)
         if process.poll() is None:
             with contextlib.suppress(ProcessLookupError, PermissionError):
                 os.killpg(process.pid, signal.SIGKILL) if hasattr(os, "killpg") else process.kill()
