@@ -176,12 +176,6 @@ class Recent:
         self._kept.move_to_end(key)
         return self._kept[key]  # type: ignore[no-any-return]
 
-    def __len__(self) -> int:
-        return len(self._kept)
-
-    def __contains__(self, key: Hashable) -> bool:
-        return key in self._kept
-
 
 @contextmanager
 def one_thread() -> Iterator[None]:
@@ -245,42 +239,6 @@ class _Outside(torch.autograd.Function):
     ) -> tuple[Tensor, int | None]:
         first = [x if dim is None else x.movedim(dim, 0) for x, dim in zip(seen, in_dims[2:], strict=True)]
         return _Outside.apply(work, nothing, *first), in_dims[1]
-
-
-def forbid_second_derivative(x: Tensor, message: str) -> Tensor:
-    """The tensor, through which there are first derivatives; others raise a ``RuntimeError`` of this message."""
-    out: Tensor = x if is_traced(x) else _Once.apply(x, message, 1)
-    return out
-
-
-class _Once(torch.autograd.Function):
-    """The order that is left: at 0, any derivative raises."""
-
-    generate_vmap_rule = True
-
-    @staticmethod
-    def forward(x: Tensor, message: str, order: int) -> Tensor:
-        return x.clone()
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-        ctx.given = inputs[1:]
-
-    @staticmethod
-    def jvp(ctx: Any, tangent: Tensor, *_: None) -> Tensor:
-        return _Once._next(ctx, tangent)
-
-    @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None, None]:
-        return _Once._next(ctx, grads[0]), None, None
-
-    @staticmethod
-    def _next(ctx: Any, derivative: Tensor) -> Tensor:
-        message, order = ctx.given
-        if not order:
-            raise RuntimeError(message)
-        result: Tensor = _Once.apply(derivative, message, order - 1)
-        return result
 
 
 def apply_function(function: Any, *arguments: Any) -> Any:

@@ -343,7 +343,7 @@ def test_only_the_last_sets_stay_open(root: Path, monkeypatch: pytest.MonkeyPatc
     data = dataset(root)
     for i in (0, PER_SET, 2 * PER_SET, 0):
         data[i]
-        assert len(data._opened) <= 2
+        assert len(data._opened._kept) <= 2
         assert spaces() <= before + 2
     assert len(pickle.dumps(data)) < 4000
 

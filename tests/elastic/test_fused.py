@@ -204,10 +204,10 @@ class TestModal:
         given = [a, *trees.leaves(own)]
 
         def by_kernels(a: Tensor, *leaves: Tensor) -> Tensor:
-            return by_kernel.gradient(a, trees.fill(own, leaves))
+            return by_kernel.value_and_gradient(a, trees.fill(own, leaves))[1]
 
         def by_torch(a: Tensor, *leaves: Tensor) -> Tensor:
-            return plain.gradient(a, by_kernel.by_torch(trees.fill(own, leaves)))
+            return plain.value_and_gradient(a, by_kernel.by_torch(trees.fill(own, leaves)))[1]
 
         assert_alike([by_kernels(*given)], [plain.derivatives(a, truth).gradient], 1e-10)
         found, wanted = (torch.func.vjp(each, *given)[1](direction) for each in (by_kernels, by_torch))

@@ -19,7 +19,7 @@ from torch_modal.elastic.energy import Energy, Reference, RestShapes
 from torch_modal.elastic.kernel_energy import KernelEnergy, _MergeRests
 from torch_modal.elastic.kernel_steps import _Relaxation
 from torch_modal.elastic.kernels.function import run_operation
-from torch_modal.elastic.modal import KernelModalEnergy, _Gradient
+from torch_modal.elastic.modal import KernelModalEnergy, _GradientAndValue
 from torch_modal.elastic.procrustes import mean_pose
 from torch_modal.elastic.rotations import WarpRotations
 from torch_modal.elastic.stretch import Stretch
@@ -160,7 +160,7 @@ def test_merged_rest_shapes(elastic: Elastic, relative: bool) -> None:
 def test_gradients_in_amplitudes(elastic: Elastic) -> None:
     modal = KernelModalEnergy(elastic.kernels, noise(4, *elastic.start.shape[1:]))
     given = [0.1 * noise(2, 4), elastic.shapes.mean(1), *elastic.reference().records]
-    assert_differences(lambda *x: run_operation(_Gradient(modal), *x)[0], given)
+    assert_differences(lambda *x: run_operation(_GradientAndValue(modal), *x)[0], given)
     placement, a, direction, h = modal.place(given[1], elastic.reference()), given[0], noise(2, 4, seed=5), 1e-4
     with torch.no_grad():
         derivatives = modal.derivatives(a, placement)

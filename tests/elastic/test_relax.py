@@ -9,11 +9,10 @@ from conftest import Shapes
 from torch import Tensor
 from torch.func import hessian, jacfwd
 
-from torch_modal.elastic.energy import Energy, Linearised, Reference, Rest
+from torch_modal.elastic.energy import Energy, EnergyAt, Reference, RestShapes
 from torch_modal.elastic.shell import ShellEnergy
 from torch_modal.elastic.steps import (
     RIDGE,
-    ConvexHessian,
     SumOfEnergies,
     TermsTowards,
     chunk_of,
@@ -47,17 +46,12 @@ class Case:
 
     def reference_of(self, samples: Iterable[int]) -> Reference:
         """Both rest shapes in one, for some of the samples."""
-        rows = list(samples)
-        pulls = [pull[rows] for pull in self.pulls]
-        rests = [self.shell.rest(rest.expand_as(self.x)[rows]) for rest in self.rests]
-        factors = [(pulls[0] + pulls[1])[:, None] * stiffness for stiffness in self.shell.stiffness]
-        both = Rest(
-            *(tuple(torch.stack(each, -2) for each in zip(*own, strict=True)) for own in zip(*rests, strict=True))
-        )
-        return self.core.merge_rests(both, torch.stack(pulls, -1) / (pulls[0] + pulls[1])[:, None], factors)
+        rows, shapes = list(samples), torch.stack([rest.expand_as(self.x) for rest in self.rests], 1)
+        rests = RestShapes(shapes[rows], torch.stack(self.pulls, -1)[rows], self.shell.stiffness)
+        return rests.reference(self.core)
 
-    def at(self, x: Tensor) -> list[Linearised]:
-        return self.core.linearise(self.core.extend(x.movedim(-1, 0).contiguous()), self.reference)
+    def at(self, x: Tensor) -> EnergyAt:
+        return EnergyAt(self.core, self.core.extend(x.movedim(-1, 0).contiguous()), self.reference)
 
     def energy(self, x: Tensor, sample: int) -> Tensor:
         parts = zip(self.rests, self.pulls, strict=True)
@@ -70,7 +64,7 @@ def case(request: pytest.FixtureRequest, small_bars: Shapes) -> Case:
 
 
 def test_gradient_is_that_of_the_energy_of_each_sample(case: Case) -> None:
-    got = case.core.fold(case.core.gradient(case.at(case.x)))
+    got = case.core.fold(case.at(case.x).gradient())
     for sample in range(BATCH):
         x = case.x[sample].clone().requires_grad_()
         (truth,) = torch.autograd.grad(case.energy(x, sample), x)
@@ -79,13 +73,12 @@ def test_gradient_is_that_of_the_energy_of_each_sample(case: Case) -> None:
 
 def test_convex_hessian_is_gauss_newton_and_the_stretched_edges(case: Case) -> None:
     core, at = case.core, case.at(case.x)
-    convex = ConvexHessian(core, at)
-    n = case.x[0].numel()
-    to_volume = core.fold(at[2].gradients)
+    n, edges, volume = case.x[0].numel(), at.terms[0], at.terms[2]
+    to_volume = core.fold(volume.gradients)
     for sample in range(BATCH):
         unit = torch.eye(n, dtype=torch.float64).reshape(n, *case.x[0].shape).movedim(-1, 0)
-        only = core.linearise(case.rows[:, [sample]].expand(-1, n, -1).contiguous(), case.reference_of([sample]))
-        got = core.fold(ConvexHessian(core, only)(core.extend(unit))).movedim(0, -1).flatten(1)
+        alone = EnergyAt(core, case.rows[:, [sample]].expand(-1, n, -1).contiguous(), case.reference_of([sample]))
+        got = core.fold(alone.product(core.extend(unit))).movedim(0, -1).flatten(1)
 
         def residuals(x: Tensor, sample: int = sample) -> Tensor:
             parts = zip(case.rests, case.pulls, strict=True)
@@ -94,10 +87,7 @@ def test_convex_hessian_is_gauss_newton_and_the_stretched_edges(case: Case) -> N
             )
 
         jacobian = jacfwd(residuals)(case.x[sample]).flatten(1)
-        stretched = (
-            core.parts[0].term.tension(at[0].edge_vectors, at[0].slope, at[0].curvature)[sample]
-            * norm(at[0].edge_vectors[0])[sample]
-        )
+        stretched = at.tensions[0][sample] * norm(edges.edge_vectors[0])[sample]
 
         def lengths(x: Tensor, stretched: Tensor = stretched) -> Tensor:
             return (stretched * case.shell.measure(x).length).sum()
@@ -106,11 +96,11 @@ def test_convex_hessian_is_gauss_newton_and_the_stretched_edges(case: Case) -> N
         assert float((got - truth).norm() / truth.norm()) < 1e-11
         assert float(torch.linalg.eigvalsh(got).amin()) > -1e-9 * float(torch.linalg.eigvalsh(got).amax())
 
-        blocks = inverse_of_symmetric(convex.diagonal())[:, :, sample, : n // 3].permute(2, 0, 1)
+        blocks = inverse_of_symmetric(at.diagonal())[:, :, sample, : n // 3].permute(2, 0, 1)
         own = truth.reshape(n // 3, 3, n // 3, 3)
         # The volume couples all vertices and is left out of the blocks.
         own_volume = to_volume[:, sample].T
-        at_volume = at[2].curvature[sample] * own_volume[:, :, None] * own_volume[:, None]
+        at_volume = volume.curvature[sample] * own_volume[:, :, None] * own_volume[:, None]
         diagonal = torch.stack([own[v, :, v] for v in range(n // 3)]) - at_volume
         ridge = RIDGE * torch.eye(3) * diagonal.diagonal(dim1=1, dim2=2).sum(1)[:, None, None]
         product = (blocks @ (diagonal + ridge))[core.used]
@@ -126,13 +116,13 @@ def test_steps_go_downhill_and_many_end_at_a_minimum(small_bars: Shapes) -> None
     values = [energies(relax(case.core, case.x, case.reference, n, 5)) for n in (0, 1, 2, 4)]
     assert all(bool((after < before).all()) for before, after in pairwise(values))
     end = relax(case.core, case.x, case.reference, 60, 100)
-    start_norm, end_norm = (case.core.fold(case.core.gradient(case.at(x))).norm() for x in (case.x, end))
+    start_norm, end_norm = (case.core.fold(case.at(x).gradient()).norm() for x in (case.x, end))
     assert float(end_norm / start_norm) < 1e-5
 
 
 def test_a_step_that_goes_uphill_ends_where_the_parabola_is_least(case: Case) -> None:
     core, at = case.core, case.at(case.x)
-    before, gradient = core.value_at(at, case.reference), core.fold(core.gradient(at))
+    before, gradient = at.value, core.fold(at.gradient())
     move = -gradient * torch.tensor([1.0, 1e-5])[:, None]
     slope, after = (gradient * move).sum((0, -1)), core.value(case.rows + core.extend(move), case.reference)
     length = step_length(before, slope, after, torch.ones_like(before))

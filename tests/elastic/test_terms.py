@@ -25,7 +25,7 @@ DOUBLE = torch.float64
 
 def by_torch_func(kind: type[Term]) -> type[Term]:
     """The same term without what it writes out."""
-    names = ("gradients", "hessians")
+    names = ("linearise", "hessians")
     return type(f"Plain{kind.__name__}", (kind,), {name: getattr(Term, name) for name in names})
 
 
@@ -56,7 +56,7 @@ def test_closed_forms_agree_with_torch_func(surface: tuple[Mesh, Tensor], genera
         found.append(
             [
                 *derivatives,
-                space.gradient(a, placement),
+                space.value_and_gradient(a, placement)[1],
                 descend(SumOfEnergies([TermsTowards(energy, reference)]), x[1:3], 2, 4),
             ]
         )
@@ -73,15 +73,14 @@ def test_angles_of_any_number_of_shapes_are_one_reference(generator: torch.Gener
     versine = 1 - (at - angles).cos()
     truth = (weights * (2 * versine + versine**2 / 3)).sum(0)
     torch.testing.assert_close(term.energies(at, record) + left, truth)
-    slope = lambda x: term.slopes(x, record)  # noqa: E731
-    rate = lambda x: term.energies(x, record).sum()  # noqa: E731
-    torch.testing.assert_close(slope(at), torch.func.grad(rate)(at))
-    bound, beyond = term.curvatures(at, record)
-    torch.testing.assert_close(bound + beyond, torch.func.grad(lambda x: slope(x).sum())(at))
+    energy = lambda x: term.energies(x, record).sum()  # noqa: E731
+    slope, bound, beyond = term.derivatives(at, record)
+    torch.testing.assert_close(slope, torch.func.grad(energy)(at))
+    torch.testing.assert_close(bound + beyond, torch.func.hessian(energy)(at).diagonal())
     assert bool((beyond <= 1e-12).all())
     alone, _ = term.merge_rests(torch.zeros(1, 3, dtype=DOUBLE), torch.ones(1, 3, dtype=DOUBLE))
     half_a_turn = math.pi + torch.tensor([-1e-9, 0, 1e-9], dtype=DOUBLE)
-    assert float(term.slopes(half_a_turn, alone).abs().max()) < 1e-8
+    assert float(term.derivatives(half_a_turn, alone)[0].abs().max()) < 1e-8
     small = torch.tensor([1e-5, 0.1, math.radians(60)], dtype=DOUBLE)
     assert float((term.energies(small, alone) / small**2 - 1).abs().max()) < 0.013
 

@@ -1,5 +1,6 @@
 """Weighted in-betweens of several key-frames: invariances, gradients, what goes in and comes out."""
 
+import math
 import warnings
 from pathlib import Path
 from typing import Literal
@@ -14,8 +15,10 @@ from torch import Tensor
 
 import torch_modal as tm
 from torch_modal.data.samples import load_sample
+from torch_modal.elastic.bend import Bend
+from torch_modal.elastic.energy import Energy, Rest
 from torch_modal.elastic.minimise import Status
-from torch_modal.elastic.term import PeriodicTerm, Term
+from torch_modal.elastic.term import Mesh, Term
 from torch_modal.geometry.rigid import best_fit
 from torch_modal.geometry.rotations import about, arc, conjugate, mean, product
 from torch_modal.geometry.triangle_frames import sides
@@ -172,25 +175,23 @@ class TestGradients:
         assert w.grad is not None and bool(w.grad.isfinite().all()) and bool(w.grad.any())
 
     @pytest.mark.parametrize("of", [0, 1])
-    def test_second_ones_are_an_error(self, layer: Blend, poses: Tensor, of: int) -> None:
+    def test_second_ones(self, layer: Blend, poses: Tensor, of: int) -> None:
+        """Of reverse mode, against differences and forward mode."""
         given = [poses, pulls(0.5, 0.2, 0.3)]
 
         def value(x: Tensor) -> Tensor:
             return layer(*[x if i == of else other for i, other in enumerate(given)]).square().sum()
 
-        leaf = given[of].clone().requires_grad_()
-        (slope,) = torch.autograd.grad(value(leaf), leaf, create_graph=True)
-        with pytest.raises(RuntimeError, match="Blend of more than two key-frames has first derivatives only"):
-            torch.autograd.grad(slope.square().sum(), leaf)
-        once = torch.func.grad(value)
-        torch.testing.assert_close(once(given[of]), slope.detach(), rtol=1e-6, atol=1e-6)
-        for twice in (
-            lambda: torch.func.grad(lambda x: once(x).square().sum())(given[of]),
-            lambda: torch.func.jvp(once, (given[of],), (given[of],)),
-            lambda: torch.func.grad(lambda x: torch.func.jvp(value, (x,), (given[of],))[1])(given[of]),
-        ):
-            with pytest.raises(RuntimeError, match="Blend of more than two key-frames has first derivatives only"):
-                twice()
+        leaf, generator = given[of].clone().requires_grad_(), torch.Generator().manual_seed(2)
+        direction = torch.randn(leaf.shape, generator=generator, dtype=DOUBLE)
+        direction = direction - direction.mean(0)  # weights add up to one
+        slope, step = torch.func.grad(value), 1e-4
+        wanted = (slope(given[of] + step * direction) - slope(given[of] - step * direction)) / (2 * step)
+        (once,) = torch.autograd.grad(value(leaf), leaf, create_graph=True)
+        (twice,) = torch.autograd.grad((once * direction).sum(), leaf)
+        assert float((twice - wanted).norm()) < 1e-4 * float(wanted.norm())
+        forward = torch.func.jvp(slope, (given[of],), (direction,))[1]
+        torch.testing.assert_close(forward, twice, rtol=1e-6, atol=1e-6 * float(twice.abs().max()))
 
 
 class TestResults:
@@ -330,8 +331,9 @@ class TestParts:
 
     def test_angles_come_round(self) -> None:
         angles = pulls(3.1, -3.1, 3.0)[:, None]
-        found = PeriodicTerm().on_one_branch(angles, torch.ones_like(angles))
-        assert float(found.amax() - found.amin()) < 0.2
+        energy = Energy(Mesh.of(torch.tensor([[0, 1, 2], [1, 0, 3]]), 4), [Bend()])
+        mixed = energy.mix_rests(Rest((angles,), (torch.ones_like(angles),)), torch.full((3, 4), 1 / 3).double())
+        assert abs(abs(float(mixed.measures[0])) - math.pi) < 0.1
 
 
 def turned_over(x: Tensor, faces: Tensor) -> float:

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torch_modal import trees
 from torch_modal.contact.acceleration import AccelerationLimit
 from torch_modal.contact.active import ContactEnergy, ContactSearch, refuse_transforms
 from torch_modal.contact.modal import modal_displacement
@@ -39,7 +40,7 @@ class ContactSolver(InBetweenSolver):
         if len(samples.weights) == 1 or n_crossing is None or not bool(n_crossing.any()):
             return whole
         some = torch.nonzero(n_crossing).flatten()
-        parts = [super(ContactSolver, self).forward(samples.rows(slice(i, i + 1))) for i in some.tolist()]
+        parts = [super(ContactSolver, self).forward(trees.rows(samples, slice(i, i + 1))) for i in some.tolist()]
         each = zip(whole.solution, *(one.solution for one in parts), strict=True)
         merged = (values[0].index_copy(0, some, torch.cat(values[1:])) for values in each)  # type: ignore[union-attr, arg-type]
         shapes = whole.shapes.index_copy(0, some, torch.cat([one.shapes for one in parts]))
@@ -104,7 +105,7 @@ def push_apart(
 
     def in_modes(some: Tensor, contact: ContactEnergy, accelerations: Tensor) -> Tensor:
         space = core.space
-        placement = space.place(x[some], rests.rows(some), u[some])
+        placement = space.place(x[some], trees.rows(rests, some), u[some])
         zeros = x.new_zeros(len(some), space.n_amplitudes)
         at = space.derivatives(zeros, placement, second_order=False)
         stiffness = at.gauss_newton - space.anchor * torch.eye(zeros.shape[1]).to(at.gauss_newton)
@@ -129,4 +130,4 @@ def contact_search(core: InBetweenSolver, ends: Tensor, n_shapes: int) -> Contac
 
 def _steps(core: InBetweenSolver, rests: RestShapes) -> Callable[[Tensor, Tensor, ExtraEnergies], Tensor]:
     """Newton steps of all vertices of some of the shapes, with further energies."""
-    return lambda x, some, extra: core.fine.relax(x, rests.rows(some), [(1, PRODUCTS)], extra)
+    return lambda x, some, extra: core.fine.relax(x, trees.rows(rests, some), [(1, PRODUCTS)], extra)

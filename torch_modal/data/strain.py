@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from torch_modal.elastic.bend import dihedral_gradient
+from torch_modal.elastic.bend import SquaredBend
 from torch_modal.geometry.canonical import size
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.vectors import cross, norm, pick
@@ -52,7 +52,7 @@ def _bending_strains(modes: Tensor, x: Tensor, mesh: Connectivity) -> tuple[Tens
     first, *others = (torch.cat([x[None], modes])[:, corner] for corner in torch.tensor(mesh.hinges).unbind(1))
     vectors = torch.stack([other - first for other in others]).movedim(-1, 1)
     rest, moves = vectors[:, :, 0], vectors[:, :, 1:]
-    angles = (dihedral_gradient(rest)[:, :, None] * moves).sum((0, 1))
+    angles = (SquaredBend().linearise(rest)[1][:, :, None] * moves).sum((0, 1))
     e, a, b = rest
     tiny = torch.finfo(x.dtype).tiny
     areas = 0.5 * (norm(cross(e, a)) + norm(cross(e, b)))

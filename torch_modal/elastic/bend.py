@@ -33,9 +33,23 @@ class SquaredBend(Term):
         """All hinges."""
         return mesh.hinges
 
-    def measure(self, edge_vectors: Tensor) -> Tensor:
-        """The angle."""
-        return dihedral_angle(edge_vectors)
+    def measure(self, edge_vectors: Tensor, hinges: tuple[Tensor, ...] | None = None) -> Tensor:
+        """Signed angle between the normals of the two triangles of a hinge, 0 where flat, in ``(-pi, pi]``.
+
+        With the edge ``e``, ``n1 = e x a`` and ``n2 = b x e``, the sine is ``(n1 x n2).e/|e| = -|e| n1.b`` and the
+        cosine ``n1.n2``, both up to the factor ``|n1||n2|``.
+
+        Args:
+            edge_vectors: ``e = x_j - x_i``, ``a = x_k - x_i`` and ``b = x_l - x_i`` of a row of
+                :attr:`~torch_modal.geometry.connectivity.Connectivity.hinges`, components second. *Shape:* ``(3, 3,
+                ...)``.
+            hinges: Their :func:`normals`, if known.
+        """
+        n1, n2, flat, length = normals(edge_vectors) if hinges is None else hinges
+        sine = -length * (n1 * edge_vectors[2]).sum(0)
+        cosine = (n1 * n2).sum(0)
+        # atan2(0, 0) has a NaN gradient; a hinge with a collapsed triangle is flat by convention.
+        return torch.atan2(torch.where(flat, 0, sine), torch.where(flat, 1, cosine))
 
     measures = measure
 
@@ -50,18 +64,48 @@ class SquaredBend(Term):
         """The short way round."""
         return wrap_angle(measures - rest)
 
-    def gradients(self, edge_vectors: Tensor) -> Tensor:
-        """In closed form: by ``torch.func``, an in-between in torch takes 1.2 to 1.4 times as long."""
-        return dihedral_gradient(edge_vectors)
+    def linearise(self, edge_vectors: Tensor) -> tuple[Tensor, Tensor]:
+        """Angles, and their gradients in closed form: ``-|e| n / |n|^2`` at either tip, the edge by balance.
 
-    def measures_and_gradients(self, edge_vectors: Tensor) -> tuple[Tensor, Tensor]:
-        """Angles and their gradients from the same normals."""
-        hinges = normals(edge_vectors)
-        return dihedral_angle(edge_vectors, hinges), dihedral_gradient(edge_vectors, hinges)
+        They are zero where a triangle is collapsed. By ``torch.func``, an in-between in torch takes 1.2 to 1.4 times as
+        long.
+        """
+        e, a, b = edge_vectors
+        n1, n2, flat, length = hinges = normals(edge_vectors)
+        to_a = n1 * (-length * inverse((n1 * n1).sum(0), flat))
+        to_b = n2 * (-length * inverse((n2 * n2).sum(0), flat))
+        to_e = -((a * e).sum(0) * to_a + (b * e).sum(0) * to_b) * inverse((e * e).sum(0), flat)
+        return self.measure(edge_vectors, hinges), torch.stack([to_e, to_a, to_b])
 
     def hessians(self, edge_vectors: Tensor) -> Tensor:
-        """In closed form: ``torch.func`` knows neither checkpoints, whose tensors have hooks, nor ``torch.export``."""
-        return dihedral_hessian(edge_vectors)
+        r"""Hessian of the angle in closed form, zero where a triangle is collapsed.
+
+        ``torch.func`` knows neither checkpoints, whose tensors have hooks, nor ``torch.export``.
+
+        Each triangle of the hinge has a part of its own, made of the edge ``e``, its unit normal ``n``, its altitude
+        ``h`` and ``w = n x e``: with :math:`S = (n w^T + w n^T)\, |e| / |n_1|^2` and :math:`U = e n^T / (|e| |n_1|)`, a
+        tip whose foot divides the edge at ``r`` has the blocks ``S`` with itself and ``U - r S`` with the edge, which
+        has :math:`(r^2 + h^2 / 2 |e|^2) S - r (U + U^T)` with itself. The two tips have none.
+        """
+        e, a, b = edge_vectors
+        n1, n2, flat, length = normals(edge_vectors)
+        per_length = inverse(length, flat)
+        edge_block = e.new_zeros(())
+        with_itself, with_edge = [], []
+        for normal, tip, w in ((n1, a, cross(n1, e)), (n2, b, cross(e, n2))):
+            area = (normal * normal).sum(0)
+            per_area = inverse(area, flat)
+            # n and w are not of length one here: their factors are in front.
+            half = (normal * (length * per_area * per_area))[:, None] * w
+            s = half + half.transpose(0, 1)
+            u = e[:, None] * (normal * (per_length * per_area))
+            r = (tip * e).sum(0) * per_length * per_length
+            edge_block = edge_block + (r * r + 0.5 * area * per_length**4) * s - r * (u + u.transpose(0, 1))
+            with_itself.append(s)
+            with_edge.append(u - r * s)
+        (a_a, b_b), (a_e, b_e), none = with_itself, with_edge, torch.zeros_like(edge_block)
+        rows = (edge_block, a_e.transpose(0, 1), b_e.transpose(0, 1)), (a_e, a_a, none), (b_e, none, b_b)
+        return torch.stack([torch.stack(row, 1) for row in rows])
 
 
 class Bend(PeriodicTerm, SquaredBend):
@@ -91,77 +135,6 @@ def normals(edge_vectors: Tensor) -> tuple[Tensor, ...]:
     e, a, b = edge_vectors
     n1, n2 = cross(e, a), cross(b, e)
     return n1, n2, is_collapsed(e, n1) | is_collapsed(e, n2), norm(e)
-
-
-def dihedral_angle(edge_vectors: Tensor, hinges: tuple[Tensor, ...] | None = None) -> Tensor:
-    """Signed angle between the normals of the two triangles of a hinge, 0 where flat, in ``(-pi, pi]``.
-
-    With the edge ``e``, ``n1 = e x a`` and ``n2 = b x e``, the sine is ``(n1 x n2).e/|e| = -|e| n1.b`` and the cosine
-    ``n1.n2``, both up to the factor ``|n1||n2|``.
-
-    Args:
-        edge_vectors: ``e = x_j - x_i``, ``a = x_k - x_i`` and ``b = x_l - x_i`` of a row of
-            :attr:`~torch_modal.geometry.connectivity.Connectivity.hinges`, components second. *Shape:* ``(3, 3, ...)``.
-        hinges: Their :func:`normals`, if known.
-    """
-    n1, n2, flat, length = normals(edge_vectors) if hinges is None else hinges
-    sine = -length * (n1 * edge_vectors[2]).sum(0)
-    cosine = (n1 * n2).sum(0)
-    # atan2(0, 0) has a NaN gradient; a hinge with a collapsed triangle is flat by convention.
-    return torch.atan2(torch.where(flat, 0, sine), torch.where(flat, 1, cosine))
-
-
-def dihedral_gradient(edge_vectors: Tensor, hinges: tuple[Tensor, ...] | None = None) -> Tensor:
-    """Gradient of :func:`dihedral_angle` in closed form: ``-|e| n / |n|^2`` at either tip, the edge by balance.
-
-    Args:
-        edge_vectors: As above. *Shape:* ``(3, 3, ...)``.
-        hinges: As above.
-
-    Returns:
-        Zero where a triangle is collapsed. *Shape:* ``(3, 3, ...)``.
-    """
-    e, a, b = edge_vectors
-    n1, n2, flat, length = normals(edge_vectors) if hinges is None else hinges
-    to_a = n1 * (-length * inverse((n1 * n1).sum(0), flat))
-    to_b = n2 * (-length * inverse((n2 * n2).sum(0), flat))
-    to_e = -((a * e).sum(0) * to_a + (b * e).sum(0) * to_b) * inverse((e * e).sum(0), flat)
-    return torch.stack([to_e, to_a, to_b])
-
-
-def dihedral_hessian(edge_vectors: Tensor) -> Tensor:
-    r"""Hessian of :func:`dihedral_angle` in closed form.
-
-    Each triangle of the hinge has a part of its own, made of the edge ``e``, its unit normal ``n``, its altitude ``h``
-    and ``w = n x e``: with :math:`S = (n w^T + w n^T)\, |e| / |n_1|^2` and :math:`U = e n^T / (|e| |n_1|)`, a tip
-    whose foot divides the edge at ``r`` has the blocks ``S`` with itself and ``U - r S`` with the edge, which has
-    :math:`(r^2 + h^2 / 2 |e|^2) S - r (U + U^T)` with itself. The two tips have none.
-
-    Args:
-        edge_vectors: As above. *Shape:* ``(3, 3, ...)``.
-
-    Returns:
-        Zero where a triangle is collapsed. *Shape:* ``(3, 3, 3, 3, ...)``.
-    """
-    e, a, b = edge_vectors
-    n1, n2, flat, length = normals(edge_vectors)
-    per_length = inverse(length, flat)
-    edge_block = e.new_zeros(())
-    with_itself, with_edge = [], []
-    for normal, tip, w in ((n1, a, cross(n1, e)), (n2, b, cross(e, n2))):
-        area = (normal * normal).sum(0)
-        per_area = inverse(area, flat)
-        # n and w are not of length one here: their factors are in front.
-        half = (normal * (length * per_area * per_area))[:, None] * w
-        s = half + half.transpose(0, 1)
-        u = e[:, None] * (normal * (per_length * per_area))
-        r = (tip * e).sum(0) * per_length * per_length
-        edge_block = edge_block + (r * r + 0.5 * area * per_length**4) * s - r * (u + u.transpose(0, 1))
-        with_itself.append(s)
-        with_edge.append(u - r * s)
-    (a_a, b_b), (a_e, b_e), none = with_itself, with_edge, torch.zeros_like(edge_block)
-    rows = (edge_block, a_e.transpose(0, 1), b_e.transpose(0, 1)), (a_e, a_a, none), (b_e, none, b_b)
-    return torch.stack([torch.stack(row, 1) for row in rows])
 
 
 def fullness(edge_vectors: Tensor, needle: float) -> Tensor:

@@ -10,13 +10,13 @@ from torch import Tensor, nn
 
 from torch_modal.autograd import is_eager
 from torch_modal.elastic import bend, stretch
-from torch_modal.elastic.bend import dihedral_angle, is_collapsed
-from torch_modal.elastic.energy import Energy, RestShapes
+from torch_modal.elastic.bend import Bend
+from torch_modal.elastic.energy import Energy, RestShapes, edge_vectors_of
 from torch_modal.elastic.kernels.launch import launch, make_once
 from torch_modal.elastic.shell import N_SHELL_TERMS
 from torch_modal.elastic.steps import TermsTowards
 from torch_modal.elastic.term import Mesh, periodic_square
-from torch_modal.geometry.vectors import cross, inverse, norm, pick
+from torch_modal.geometry.vectors import norm
 
 # Elements of each kind that are looked at, spread evenly: the sum is then known to a few percent.
 MOST_ELEMENTS = 1024
@@ -29,6 +29,8 @@ LARGEST_WEIGHT = 8.0
 
 # Strain of all edges below which differences are hardly visible.
 SLIGHT = 0.02
+
+BEND = Bend()
 
 
 class Distortion(nn.Module):
@@ -84,12 +86,13 @@ class Distortion(nn.Module):
         """Stretching and bending. *Shape of each:* ``(B, V, 3) -> (S, B)``."""
         # All shapes at once: for so few elements, the number of operations determines the time.
         rows = self._rows(*shapes, *rests.shapes.unbind(1))
-        hinges = _edge_vectors(rows, self.hinges)
-        n, lengths, angles = len(shapes), norm(_edge_vectors(rows, self.edges)[0]), dihedral_angle(hinges)
+        hinges = edge_vectors_of(rows, self.hinges)
+        n, lengths, angles = len(shapes), norm(edge_vectors_of(rows, self.edges)[0]), BEND.measure(hinges)
         alpha, beta = self.on_elements(rests.stiffness)
         off = (lengths[:n, None] - lengths[n:]).abs()
         stretching = (alpha * off * (off / lengths[n:]).clamp_max(LARGEST_STRAIN)).sum(-1)
-        bending = (beta * _weights(hinges[:, :, n:]) * periodic_square(angles[:n, None] - angles[n:])).sum(-1)
+        weights = BEND.weights(hinges[:, :, n:], angles[n:]).clamp_max(LARGEST_WEIGHT)
+        bending = (beta * weights * periodic_square(angles[:n, None] - angles[n:])).sum(-1)
         return (rests.weights.mT * (self.shares[0] * stretching + self.shares[1] * bending)).sum(1)
 
     def on_elements(self, stiffness: Sequence[Tensor]) -> list[Tensor]:
@@ -99,7 +102,7 @@ class Distortion(nn.Module):
 
     def slight(self, stiffness: Sequence[Tensor], like: Tensor) -> Tensor:
         """The distortion of a shape whose edges are all strained by :data:`SLIGHT`. *Shape:* ``(B,)``."""
-        lengths = norm(_edge_vectors(self._rows(like.detach()), self.edges)[0]).sum((0, -1))
+        lengths = norm(edge_vectors_of(self._rows(like.detach()), self.edges)[0]).sum((0, -1))
         return self.shares[0] * stiffness[0].detach().mean(-1) * lengths * SLIGHT**2
 
     def _rows(self, *shapes: Tensor) -> Tensor:
@@ -194,17 +197,3 @@ def kernels() -> SimpleNamespace:
                 wp.atomic_add(out, place(j * n_samples, s), vec2(real(0.0), contribution + left))
 
     return SimpleNamespace(module=module, distortion=distortion)
-
-
-def _edge_vectors(rows: Tensor, corners: Tensor) -> Tensor:
-    """Vectors from the first vertex of each element to the others. *Shape:* ``(3, ..., V) -> (n-1, 3, ..., M)``."""
-    first, *others = (pick(rows, corner) for corner in corners)
-    return torch.stack([other - first for other in others])
-
-
-def _weights(edge_vectors: Tensor) -> Tensor:
-    """The bounded weights of hinges; 0 where a triangle has collapsed. *Shape:* ``(3, 3, ..., H) -> (..., H)``."""
-    e, a, b = edge_vectors
-    n1, n2 = cross(e, a), cross(b, e)
-    weight = 2 * (e * e).sum(0) * inverse(norm(n1) + norm(n2), is_collapsed(e, n1) | is_collapsed(e, n2))
-    return weight.clamp_max(LARGEST_WEIGHT)

@@ -5,6 +5,7 @@ the mesh, and the anchors of the terms.
 """
 
 from collections.abc import Sequence
+from functools import cached_property, reduce
 from typing import Any, NamedTuple
 
 import torch
@@ -13,6 +14,9 @@ from torch import Tensor, nn
 from torch_modal.autograd import outside_inference_mode
 from torch_modal.elastic.term import Mesh, Term
 from torch_modal.geometry.vectors import pick
+
+# Rows and columns of the upper triangle of a symmetric block.
+_ROWS, _COLUMNS = [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]
 
 
 def energy_rounding(dtype: torch.dtype) -> float:
@@ -46,6 +50,8 @@ class Reference(NamedTuple):
 class Linearised(NamedTuple):
     """One term at given shapes."""
 
+    energy: Tensor
+    """But for what remains at the reference. *Shape:* ``(B,)``."""
     edge_vectors: Tensor
     """*Shape:* ``(n-1, 3, B, M)``."""
     measures: Tensor
@@ -68,6 +74,15 @@ def _outlasting_buffers(module: nn.Module) -> None:
                 setattr(child, name, outside_inference_mode(buffer.clone)())
 
 
+def edge_vectors_of(rows: Tensor, corners: Tensor) -> Tensor:
+    """Vectors from the first vertex of each element to the others.
+
+    *Shape:* ``(3, ..., V), (n, M) -> (n-1, 3, ..., M)``.
+    """
+    first, *others = (pick(rows, corner) for corner in corners)
+    return torch.stack([other - first for other in others])
+
+
 class AssembledTerm(nn.Module):
     """A term on a mesh.
 
@@ -86,8 +101,7 @@ class AssembledTerm(nn.Module):
 
     def edge_vectors(self, rows: Tensor) -> Tensor:
         """Vectors from the first vertex of each element to the others. *Shape:* ``(3, ..., V) -> (n-1, 3, ..., M)``."""
-        first, *others = (pick(rows, corner) for corner in self.corners)
-        return torch.stack([other - first for other in others])
+        return edge_vectors_of(rows, self.corners)
 
     def measures(self, edge_vectors: Tensor) -> Tensor:
         """The measures, or their sum for a total. *Shape:* ``(n-1, 3, ..., M) -> (..., M or 1)``."""
@@ -111,9 +125,25 @@ class AssembledTerm(nn.Module):
         rest_weights = weights[..., None] * self.term.weights(edge_vectors, measures).expand_as(measures)
         return self.term.merge_rests(self.term.at_rest(measures), rest_weights, stiffness)
 
-    def on_elements(self, weights: Tensor) -> Tensor:
-        """Weights of vertices on the elements: means of their corners. *Shape:* ``(..., V) -> (..., M or 1)``."""
-        return weights.mean(-1, keepdim=True) if self.term.total else weights[..., self.corners].mean(-2)
+    def linearise(self, extended: Tensor, record: Tensor) -> "Linearised":
+        """The term at given shapes. *Shape:* ``(3, B, V)``, extended."""
+        edge_vectors = self.edge_vectors(extended)
+        measures, gradients = self.term.linearise(edge_vectors)
+        if self.term.total:
+            measures = measures.sum(-1, keepdim=True)
+            gradients = self.scatter_vectors(torch.zeros_like(extended), gradients)
+        energy = self.term.energies(measures, record).sum(-1)
+        return Linearised(energy, edge_vectors, measures, gradients, *self.term.derivatives(measures, record))
+
+    def along(self, one: "Linearised", field: Tensor) -> tuple[Tensor, Tensor]:
+        """Edge vectors of a displacement, for a total itself, and the first change of the measures with it.
+
+        *Shape:* ``(3, B, V)``, extended; ``(n-1, 3, B, M), (B, M)``.
+        """
+        if self.term.total:
+            return field, (one.gradients * field).sum((0, -1))[:, None]
+        vectors = self.edge_vectors(field)
+        return vectors, (one.gradients * vectors).sum((0, 1))
 
     def on_corners(self, on_edge_vectors: Tensor) -> list[Tensor]:
         """From the edge vectors to each vertex of the elements. *Shape:* ``(n-1, 3, ..., M)``; ``(3, ..., M)`` each."""
@@ -216,25 +246,6 @@ class Energy(nn.Module):
             weights.append(summand.term.weights(edge_vectors, values))
         return Rest(tuple(measures), tuple(weights))
 
-    def rest_of(self, x: Tensor) -> Rest:
-        """The rest shape from vertices alone. *Shape:* ``(B, V, 3)``."""
-        return self.rest(self.extend(x.movedim(-1, 0).contiguous()))
-
-    def merge_rests(self, rest: Rest, weights: Tensor, stiffness: Sequence[float | Tensor]) -> Reference:
-        r"""K rest shapes as one: :math:`\sum_k s_k \sum w_k (q - q_k)^2`, by Eq. 8 for any number of them.
-
-        Args:
-            rest: Of the rest shapes. *Shape of each:* ``(..., K, M)``.
-            weights: ``s``. *Shape:* ``(..., K)``.
-            stiffness: Of each term: a number, or *shape* ``(..., M)`` or ``(..., 1)``.
-        """
-        records, constant = [], torch.zeros_like(weights[..., 0])
-        for summand, measures, own, factor in zip(self.parts, *rest, stiffness, strict=True):
-            record, left = summand.term.merge_rests(measures, weights[..., None] * own.expand_as(measures), factor)
-            records.append(record)
-            constant = constant + left.sum(-1)
-        return Reference(tuple(records), constant)
-
     def mix_rests(self, rest: Rest, weights: Tensor) -> Rest:
         """One rest shape whose measures are weighted sums of the measures of K shapes.
 
@@ -246,15 +257,26 @@ class Energy(nn.Module):
         """
         measures, stiffness = [], []
         for summand, values, rest_weights in zip(self.parts, rest.measures, rest.weights, strict=True):
-            element_weights, rest_weights = summand.on_elements(weights), rest_weights.expand_as(values)
-            measures.append((element_weights * summand.term.on_one_branch(values, rest_weights)).sum(-2))
+            corners = weights[:, None] if summand.term.total else weights[:, summand.corners]
+            element_weights, rest_weights = corners.flatten(1, -2).mean(1), rest_weights.expand_as(values)
+            first = values[..., :1, :]  # differences of angles from it go the short way round
+            measures.append((element_weights * (first + summand.term.difference(values, first))).sum(-2))
             stiffness.append((element_weights * rest_weights).sum(-2).clamp_min(0))
         return Rest(tuple(measures), tuple(stiffness))
 
     def reference_of(self, rest: Rest, stiffness: Sequence[float | Tensor]) -> Reference:
-        """One rest shape as the reference."""
-        alone = Rest(*(tuple(values.unsqueeze(-2) for values in each) for each in rest))
-        return self.merge_rests(alone, torch.ones_like(rest.measures[0][..., :1]), stiffness)
+        """One rest shape as the reference.
+
+        Args:
+            rest: Its measures and weights.
+            stiffness: Of each term: a number, or *shape* ``(..., M)`` or ``(..., 1)``.
+        """
+        terms = [summand.term for summand in self.parts]
+        merged = [
+            term.merge_rests(measures[..., None, :], weights.expand_as(measures)[..., None, :], factor)
+            for term, measures, weights, factor in zip(terms, *rest, stiffness, strict=True)
+        ]
+        return join_references(merged)
 
     # --------------------------------------------------------------------------------------------------------- values
     def value(self, extended: Tensor, reference: Reference) -> Tensor:
@@ -264,57 +286,82 @@ class Energy(nn.Module):
             total = total + summand.term.energies(summand.measures(summand.edge_vectors(extended)), record).sum(-1)
         return total
 
-    # ---------------------------------------------------------------------------------------------------- derivatives
-    def linearise(self, extended: Tensor, reference: Reference) -> list[Linearised]:
-        """All terms at given shapes. *Shape:* ``(3, B, V)``, extended."""
-        each = []
-        for summand, record in zip(self.parts, reference.records, strict=True):
-            edge_vectors = summand.edge_vectors(extended)
-            measures, gradients = summand.term.measures_and_gradients(edge_vectors)
-            if summand.term.total:
-                measures = measures.sum(-1, keepdim=True)
-                gradients = summand.scatter_vectors(torch.zeros_like(extended), gradients)
-            slope, curvatures = summand.term.slopes(measures, record), summand.term.curvatures(measures, record)
-            each.append(Linearised(edge_vectors, measures, gradients, slope, *curvatures))
-        return each
 
-    def value_at(self, at: Sequence[Linearised], reference: Reference) -> Tensor:
-        """The energy of linearised shapes. *Shape:* ``(B,)``."""
-        total: Any = reference.constant
-        for summand, one, record in zip(self.parts, at, reference.records, strict=True):
-            total = total + summand.term.energies(one.measures, record).sum(-1)
-        return total
+def join_references(merged: Sequence[tuple[Tensor, Tensor]]) -> Reference:
+    """The reference of several terms, from the record and the remaining energies of each."""
+    records, left = zip(*merged, strict=True)
+    return Reference(records, reduce(torch.add, (energies.sum(-1) for energies in left)))
 
-    def rates(self, at: Sequence[Linearised], field: Tensor) -> list[Tensor]:
-        """First change of the measures with a displacement. *Shape:* ``(3, B, V)``, extended; ``(B, M)`` of each."""
+
+class EnergyAt:
+    """An energy at given shapes: value, gradient, and products with a convex Hessian.
+
+    The Hessian is Gauss-Newton's and the second-order term of stretched edges: it is never negative.
+
+    Args:
+        energy: The energy.
+        extended: The shapes. *Shape:* ``(3, B, V)``, extended.
+        reference: What they are compared with.
+    """
+
+    def __init__(self, energy: Energy, extended: Tensor, reference: Reference) -> None:
+        self.energy = energy
+        pairs = zip(energy.parts, reference.records, strict=True)
+        #: Each term there.
+        self.terms: list[Linearised] = [summand.linearise(extended, record) for summand, record in pairs]
+        #: The energy. *Shape:* ``(B,)``.
+        self.value = reduce(torch.add, (one.energy for one in self.terms), reference.constant)
+
+    @cached_property
+    def tensions(self) -> list[Tensor | None]:
+        """Stiffness across each element of two vertices; along it, there is the curvature. *Shape:* ``(B, M)``."""
         return [
-            (one.gradients * field).sum((0, -1))[:, None]
-            if summand.term.total
-            else (one.gradients * summand.edge_vectors(field)).sum((0, 1))
-            for summand, one in zip(self.parts, at, strict=True)
+            summand.term.tension(one.edge_vectors, one.slope, one.curvature)
+            for summand, one in zip(self.energy.parts, self.terms, strict=True)
         ]
 
-    def scatter(self, at: Sequence[Linearised], on_elements: Sequence[Tensor]) -> Tensor:
-        """From the elements to the vertices.
+    def _scatter(self, factors: Sequence[Tensor], others: Sequence[Tensor | None]) -> Tensor:
+        """Gradients of the measures with factors, and other values of edge vectors, at the vertices.
 
-        Args:
-            at: Gives the gradients of totals.
-            on_elements: Of each term what its edge vectors receive, *shape* ``(n-1, 3, B, M)``; of a total, the factor
-                of its gradient, *shape* ``(B, 1)``.
-
-        Returns:
-            *Shape:* ``(3, B, V)``, extended.
+        *Shape of each:* ``(B, M), (n-1, 3, B, M) -> (3, B, V)``, extended.
         """
-        out = on_elements[0].new_zeros(*at[0].gradients.shape[-3:-1], self.n_extended)
-        for summand, one, received in zip(self.parts, at, on_elements, strict=True):
-            out = out + received * one.gradients if summand.term.total else summand.scatter_vectors(out, received)
+        out = factors[0].new_zeros(*self.terms[0].gradients.shape[-3:-1], self.energy.n_extended)
+        for summand, one, factor, other in zip(self.energy.parts, self.terms, factors, others, strict=True):
+            values = factor * one.gradients
+            if summand.term.total:
+                out = out + values
+            else:
+                out = summand.scatter_vectors(out, values if other is None else values + other)
         return out
 
-    def gradient(self, at: Sequence[Linearised]) -> Tensor:
+    def gradient(self) -> Tensor:
         """Gradient of the energy. *Shape:* ``(3, B, V)``, extended."""
-        pairs = zip(self.parts, at, strict=True)
-        slopes = [one.slope if summand.term.total else one.slope * one.gradients for summand, one in pairs]
-        return self.scatter(at, slopes)
+        return self._scatter([one.slope for one in self.terms], [None] * len(self.terms))
+
+    def product(self, field: Tensor) -> Tensor:
+        """The convex Hessian times displacements. *Shape:* ``(3, B, V)``, extended."""
+        factors, across = [], []
+        for summand, one, tension in zip(self.energy.parts, self.terms, self.tensions, strict=True):
+            vectors, rate = summand.along(one, field)
+            factors.append(one.curvature * rate)
+            across.append(None if tension is None else tension * (vectors - rate * one.gradients))
+        return self._scatter(factors, across)
+
+    def diagonal(self) -> Tensor:
+        """The convex Hessian's blocks of all vertices, the upper triangle of each. *Shape:* ``(6, B, V)``, extended."""
+        like = self.terms[0].gradients
+        summed = like.new_zeros(6, like.shape[-2], self.energy.n_extended)
+        for summand, one, tension in zip(self.energy.parts, self.terms, self.tensions, strict=True):
+            if summand.term.total:
+                continue  # of rank one: it couples all vertices, and adds little to each
+            along = one.curvature if tension is None else one.curvature - tension
+            for corner, end in zip(summand.corners, summand.on_corners(one.gradients), strict=True):
+                blocks = (along * end)[_ROWS] * end[_COLUMNS]
+                if tension is not None:
+                    eye = torch.eye(3, dtype=end.dtype, device=end.device)[_ROWS, _COLUMNS]
+                    blocks = blocks + eye[:, None, None] * tension
+                summed = summed.index_add(-1, corner, blocks)
+        return summed
 
 
 class RestShapes(NamedTuple):
@@ -328,11 +375,6 @@ class RestShapes(NamedTuple):
     """One of each term. *Shape of each:* ``(B, M)`` or ``(B, 1)``."""
     anchors: Tensor | None = None
     """Fixed points of the terms, where they have some. *Shape:* ``(B, P, 3)``."""
-
-    def rows(self, some: slice | Tensor) -> "RestShapes":
-        """Rest shapes of some of the samples."""
-        anchors = None if self.anchors is None else self.anchors[some]
-        return RestShapes(self.shapes[some], self.weights[some], [each[some] for each in self.stiffness], anchors)
 
     def reference(self, energy: Energy, start: Tensor | None = None, relative: bool = False) -> Reference:
         """Merge the rest shapes into one reference of an energy, of the terms that the stiffnesses belong to.
@@ -348,5 +390,4 @@ class RestShapes(NamedTuple):
             begin = energy.extend(start.movedim(-1, 0))
         pairs = zip(energy.parts, self.stiffness, strict=True)
         merged = [summand.merge_rests(rows, self.weights, own, begin, relative) for summand, own in pairs]
-        records, left = zip(*merged, strict=True)
-        return Reference(records, sum((own.sum(-1) for own in left), start=torch.zeros_like(self.weights[:, 0])))
+        return join_references(merged)

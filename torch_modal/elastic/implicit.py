@@ -74,7 +74,7 @@ def _adjoint(
     solve = inverse(energy, amplitudes, trees.fill(tree, tensors), status == Status.CONVERGED)
 
     def slope(*tensors: Tensor) -> Tensor:
-        return energy.gradient(amplitudes, trees.fill(tree, tensors))
+        return energy.value_and_gradient(amplitudes, trees.fill(tree, tensors))[1]
 
     def pull_back(to_amplitudes: Tensor) -> tuple[Tensor, ...]:
         adjoint = solve(to_amplitudes)

@@ -35,10 +35,10 @@ class AmplitudeEnergy(Protocol):
         """Derivatives. *Shape:* ``(B, n)``."""
 
     def value_and_gradient(self, a: Tensor, placement: Any) -> tuple[Tensor, Tensor]:
-        """Energy and gradient. *Shape:* ``(B, n) -> (B,), (B, n)``."""
+        """Energy and gradient, which can be differentiated in all that the placement holds.
 
-    def gradient(self, a: Tensor, placement: Any) -> Tensor:
-        """Gradient, to be differentiated in all that the placement holds. *Shape:* ``(B, n) -> (B, n)``."""
+        *Shape:* ``(B, n) -> (B,), (B, n)``.
+        """
 
 
 class Status(IntEnum):

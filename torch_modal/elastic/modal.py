@@ -6,6 +6,7 @@ which are the same for a whole batch.
 
 import itertools
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import reduce
 from typing import Any, NamedTuple
 
@@ -14,7 +15,7 @@ from torch import Tensor, nn
 
 from torch_modal import trees
 from torch_modal.autograd import is_eager
-from torch_modal.elastic.energy import Energy, Linearised, Reference, RestShapes
+from torch_modal.elastic.energy import Energy, EnergyAt, Linearised, Reference, RestShapes
 from torch_modal.elastic.kernel_energy import KernelEnergy
 from torch_modal.elastic.kernels.function import run_operation
 from torch_modal.elastic.kernels.launch import launch, of_elements
@@ -139,9 +140,9 @@ class ModalEnergy(nn.Module):
             second_order: True to compute the term beyond Gauss-Newton.
         """
         x = self.rows(a, placement)
-        at = self.energy.linearise(x, placement.reference)
+        at = EnergyAt(self.energy, x, placement.reference)
         gradients, inner, curved = [], [], []
-        for i, (summand, one) in enumerate(zip(self.energy.parts, at, strict=True)):
+        for i, (summand, one) in enumerate(zip(self.energy.parts, at.terms, strict=True)):
             columns = getattr(self, f"edge_vectors_{i}") if self.tabulated else self._edge_vectors(i)
             if summand.term.total:
                 row = self._along_columns(one.gradients)
@@ -153,23 +154,17 @@ class ModalEnergy(nn.Module):
             if second_order:
                 curved.append(_second_order(summand.term, one, columns))
         gauss_newton = reduce(torch.add, inner)
-        stiffness = sum(one.curvature.sum(-1) for one in at)
+        stiffness = sum(one.curvature.sum(-1) for one in at.terms)
         stiffest = gauss_newton.diagonal(dim1=-2, dim2=-1).amax(-1)
         rounding = torch.finfo(x.dtype).eps * x.abs().amax((0, -1))
         resolution = rounding * (stiffest * stiffness).sqrt()
         beyond = reduce(torch.add, curved) if second_order else None
-        value = self.energy.value_at(at, placement.reference)
-        return Derivatives(value, reduce(torch.add, gradients), gauss_newton, beyond, resolution)
+        return Derivatives(at.value, reduce(torch.add, gradients), gauss_newton, beyond, resolution)
 
     def value_and_gradient(self, a: Tensor, placement: Placement) -> tuple[Tensor, Tensor]:
         """Energy and gradient at ``a``. *Shape:* ``(B, n) -> (B,), (B, n)``."""
-        at = self.energy.linearise(self.rows(a, placement), placement.reference)
-        return self.energy.value_at(at, placement.reference), self._along_columns(self.energy.gradient(at))
-
-    def gradient(self, a: Tensor, placement: Placement) -> Tensor:
-        """Gradient at ``a``, to be differentiated in all that the placement holds. *Shape:* ``(B, n) -> (B, n)``."""
-        at = self.energy.linearise(self.rows(a, placement), placement.reference)
-        return self._along_columns(self.energy.gradient(at))
+        at = EnergyAt(self.energy, self.rows(a, placement), placement.reference)
+        return at.value, self._along_columns(at.gradient())
 
     def _along_columns(self, extended: Tensor) -> Tensor:
         """From gradients in the vertices to those in the amplitudes. *Shape:* ``(3, B, V) -> (B, n)``."""
@@ -244,30 +239,19 @@ class KernelModalEnergy(ModalEnergy):
         base, reference = trees.map_leaves(placement, lambda value: value.to(self.columns.dtype))
         return super().place(base, reference.transpose())
 
-    def _plain(self, placement: Placement) -> Placement | None:
-        """The placement for torch; None where it is for kernels."""
-        serves = not torch.is_grad_enabled() and is_eager(placement.base, *placement.reference.records)
-        return None if serves else self.by_torch(placement)
-
-    def _shapes(self, a: Tensor, base: Tensor) -> Tensor:
-        """*Shape:* ``(..., B, n) -> (D * B, V, 3)``."""
-        a, flat = a.double(), self.flat.double()
-        if a.dim() == 2:
-            return torch.addmm(base.flatten(1), a, flat).view_as(base)
-        return ((a @ flat).unflatten(-1, (-1, 3)) + base).flatten(0, -3)
+    def shapes(self, a: Tensor, base: Tensor) -> Tensor:
+        """Shapes of amplitudes, in float64. *Shape:* ``(B, n), (B, V, 3) -> (B, V, 3)``."""
+        return torch.addmm(base.flatten(1), a.double(), self.flat.double()).view_as(base)
 
     def value(self, a: Tensor, placement: Placement) -> Tensor:
-        """Overrides the base class."""
-        for_torch = self._plain(placement)
-        if for_torch is not None:
-            return super().value(a.to(for_torch.base), for_torch).to(placement.base)
-        energies = self.kernels.value(self._shapes(a, placement.base), placement.reference)
-        return energies.unflatten(0, a.shape[:-1]) + placement.reference.constant
+        """Overrides the base class; by torch: only Newton's method compares values alone."""
+        for_torch = self.by_torch(placement)
+        return super().value(a.to(for_torch.base), for_torch).to(placement.base)
 
     def derivatives(self, a: Tensor, placement: Placement, second_order: bool = True) -> Derivatives:
         """Overrides the base class."""
-        for_torch = self._plain(placement)
-        if for_torch is not None:
+        if torch.is_grad_enabled() or not is_eager(placement.base, *placement.reference.records):
+            for_torch = self.by_torch(placement)
             result = super().derivatives(a.to(for_torch.base), for_torch, second_order)
             return trees.map_leaves(result, lambda value: value.to(placement.base))
         terms = [self.kernels.parts[i] for i in self.kernels.terms]
@@ -283,7 +267,7 @@ class KernelModalEnergy(ModalEnergy):
 
     def _derivatives(self, a: Tensor, placement: Placement, second_order: bool) -> Derivatives:
         x, to, kernels, blocks = (
-            self._shapes(a, placement.base),
+            self.shapes(a, placement.base),
             placement.reference,
             self.kernels,
             self.blocks.double(),
@@ -326,43 +310,38 @@ class KernelModalEnergy(ModalEnergy):
         return Derivatives(value, gradient, inner, curved, rounding * (stiffest * stiffness).sqrt())
 
     def value_and_gradient(self, a: Tensor, placement: Placement) -> tuple[Tensor, Tensor]:
-        """Overrides the base class."""
-        for_torch = self._plain(placement)
-        if for_torch is not None:
-            value, gradient = super().value_and_gradient(a.to(for_torch.base), for_torch)
-            return value.to(placement.base), gradient.to(placement.base)
-        to = placement.reference
-        value, x = self.kernels.value_and_gradient(self._shapes(a, placement.base), to)
-        return value + to.constant, x.flatten(1) @ self.flat.double().mT
-
-    def gradient(self, a: Tensor, placement: Placement) -> Tensor:
-        """Overrides the base class."""
-        return run_operation(_Gradient(self), a, placement.base, *placement.reference.records)[0].to(placement.base)
+        """Overrides the base class; the value has no gradient."""
+        base, (records, constant) = placement
+        gradient, value = run_operation(_GradientAndValue(self), a, base, *records)
+        return value + constant, gradient
 
 
-class _Gradient:
-    """Gradient in the amplitudes, from these, the base, and the records of a reference."""
+@dataclass(frozen=True, eq=False)
+class _GradientAndValue:
+    """Gradient in the amplitudes and energy but for the constant, from amplitudes, base, and records of a reference."""
 
-    n_results = n_differentiable = 1
+    modal: KernelModalEnergy
+    n_results, n_differentiable = 2, 1
 
-    def __init__(self, modal: KernelModalEnergy) -> None:
-        self.modal = modal
+    def run(self, kept: list[Any] | None, a: Tensor, base: Tensor, *records: Tensor) -> tuple[Tensor, ...]:
+        modal = self.modal
+        value, gradient = modal.kernels.value_and_gradient(modal.shapes(a, base), _without_constant(records))
+        return gradient.flatten(1) @ modal.flat.double().mT, value
 
-    def run(self, kept: list[Any] | None, a: Tensor, *place: Tensor) -> tuple[Tensor, ...]:
-        with torch.no_grad():
-            return (self.modal.value_and_gradient(a, self._placement(*place))[1],)
-
-    def back(self, kept: list[Any], grads: Sequence[Tensor], a: Tensor, *place: Tensor) -> tuple[Tensor | None, ...]:
-        modal, (base, to) = self.modal, self._placement(*place)
-        x, moved = modal._shapes(a, base), modal._shapes(grads[0], torch.zeros_like(base))
-        to_base, to_records = torch.zeros_like(x), [torch.zeros_like(record) for record in to.records]
+    def back(
+        self, kept: list[Any], grads: Sequence[Tensor], a: Tensor, base: Tensor, *records: Tensor
+    ) -> tuple[Tensor | None, ...]:
+        modal, to = self.modal, _without_constant(records)
+        x, moved = modal.shapes(a, base), modal.shapes(grads[0], torch.zeros_like(base))
+        to_base, to_records = torch.zeros_like(x), [torch.zeros_like(record) for record in records]
         modal.kernels.back(x, modal.kernels.at(x, to, hessian=False), to, moved, to_base, to_records)
         return to_base.flatten(1) @ modal.flat.double().mT, to_base, *to_records
 
-    def by_torch(self, a: Tensor, *place: Tensor) -> tuple[Tensor, ...]:
-        placement = self.modal.by_torch(self._placement(*place))
-        return (ModalEnergy.gradient(self.modal, a.to(placement.base), placement).to(a),)
+    def by_torch(self, a: Tensor, base: Tensor, *records: Tensor) -> tuple[Tensor, ...]:
+        placement = self.modal.by_torch(Placement(base, _without_constant(records)))
+        value, gradient = ModalEnergy.value_and_gradient(self.modal, a.to(placement.base), placement)
+        return gradient.to(a), value.to(a)
 
-    @staticmethod
-    def _placement(base: Tensor, *records: Tensor) -> Placement:
-        return Placement(base, Reference(records, base.new_zeros(len(base))))
+
+def _without_constant(records: Sequence[Tensor]) -> Reference:
+    return Reference(tuple(records), records[0].new_zeros(len(records[0])))

@@ -34,9 +34,9 @@ def _of_term(term: Term, elements: IntArray, points: FloatArray) -> sp.csc_matri
     """``sum_m 2 k w_m ∇q_m ∇q_mᵀ`` of the measures of a term. *Shape:* ``(M, n), (N, 3) -> (3N, 3N)``."""
     corners = torch.from_numpy(points[elements]).permute(1, 2, 0)
     edge_vectors = corners[1:] - corners[:1]
-    gradients = term.gradients(edge_vectors)
+    measures, gradients = term.linearise(edge_vectors)
     rows = torch.cat([-gradients.sum(0, keepdim=True), gradients])
-    stiffness = 2 * term.stiffness * term.weights(edge_vectors, term.measures(edge_vectors))
+    stiffness = 2 * term.stiffness * term.weights(edge_vectors, measures)
     rows = (rows * stiffness.sqrt()).permute(2, 0, 1).flatten(1)
     norms = rows.norm(dim=1)
     if len(norms):

@@ -31,18 +31,6 @@ class Measures(NamedTuple):
     """Signed volume enclosed with the centroid. *Shape:* ``(...,)``."""
 
 
-def _stiffness(number: int, doc: str) -> Any:
-    """The stiffness of one of the terms, as an attribute of their energy."""
-
-    def get(energy: "ShellEnergy") -> Any:
-        return energy.terms[number].stiffness
-
-    def put(energy: "ShellEnergy", value: float | Tensor) -> None:
-        energy.terms[number].stiffness = value
-
-    return property(get, put, doc=doc)
-
-
 class ShellEnergy(nn.Module):
     r"""Discrete-shell energy between a shape and a rest shape (Eq. 5 of the paper).
 
@@ -138,7 +126,3 @@ class ShellEnergy(nn.Module):
     def stiffness(self) -> list[Any]:
         """The stiffness of each term."""
         return [term.stiffness for term in self.terms]
-
-    alpha = _stiffness(0, "Stretching stiffness; it may be replaced.")
-    beta = _stiffness(1, "Bending stiffness; it may be replaced.")
-    gamma = _stiffness(2, "Volume stiffness; it may be replaced.")

@@ -1,4 +1,4 @@
-"""The energy on the caller's mesh with every vertex free: a convex Hessian, never summand, and steps with it."""
+"""The energy on the caller's mesh with every vertex free, and steps of a truncated Newton method."""
 
 from collections.abc import Callable, Sequence
 from functools import reduce
@@ -7,16 +7,14 @@ from typing import Any, NamedTuple, Protocol
 import torch
 from torch import Tensor, nn
 
+from torch_modal import trees
 from torch_modal.autograd import is_eager
-from torch_modal.elastic.energy import Energy, Linearised, Reference, RestShapes, energy_rounding
+from torch_modal.elastic.energy import Energy, EnergyAt, Reference, RestShapes, energy_rounding
 from torch_modal.elastic.term import Mesh, Term
 from torch_modal.geometry.canonical import CANONICAL_SIZE
 
 # Added to the diagonal blocks, relative to their trace: a vertex in a flat fan has no stiffness along its normal.
 RIDGE = 1e-6
-
-# Rows and columns of the upper triangle of a symmetric block.
-_ROWS, _COLUMNS = [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]
 
 # The curvature along a shorter step is rounding of energies.
 SLIGHT = 1e-5 * CANONICAL_SIZE
@@ -52,54 +50,6 @@ class FreeEnergy(Protocol):
 
     def at(self, x: Tensor) -> Point:
         """*Shape:* ``(B, V, 3)``."""
-
-
-class ConvexHessian:
-    """Gauss-Newton's Hessian and the second-order term of stretched edges: never negative.
-
-    Args:
-        energy: The energy.
-        at: Where it is linearised.
-    """
-
-    def __init__(self, energy: Energy, at: Sequence[Linearised]) -> None:
-        self.energy, self.at = energy, at
-        #: Stiffness across each element of two vertices; along it, there is the curvature. *Shape:* ``(B, M)``.
-        self.tensions = [
-            summand.term.tension(one.edge_vectors, one.slope, one.curvature)
-            for summand, one in zip(energy.parts, at, strict=True)
-        ]
-
-    def __call__(self, field: Tensor) -> Tensor:
-        """The product with displacements. *Shape:* ``(3, B, V)``, extended."""
-        received = []
-        for summand, one, tension in zip(self.energy.parts, self.at, self.tensions, strict=True):
-            if summand.term.total:
-                received.append(one.curvature * (one.gradients * field).sum((0, -1))[:, None])
-                continue
-            edge_vectors = summand.edge_vectors(field)
-            rate = (one.gradients * edge_vectors).sum((0, 1))
-            if tension is None:
-                received.append(one.curvature * rate * one.gradients)
-            else:
-                received.append(tension * edge_vectors + (one.curvature - tension) * rate * one.gradients)
-        return self.energy.scatter(self.at, received)
-
-    def diagonal(self) -> Tensor:
-        """The blocks of all vertices, the upper triangle of each. *Shape:* ``(6, B, V)``, extended."""
-        like = self.at[0].gradients
-        summed = like.new_zeros(6, like.shape[-2], self.energy.n_extended)
-        for summand, one, tension in zip(self.energy.parts, self.at, self.tensions, strict=True):
-            if summand.term.total:
-                continue  # of rank one: it couples all vertices, and adds little to each
-            along = one.curvature if tension is None else one.curvature - tension
-            for corner, end in zip(summand.corners, summand.on_corners(one.gradients), strict=True):
-                blocks = (along * end)[_ROWS] * end[_COLUMNS]
-                if tension is not None:
-                    eye = torch.eye(3, dtype=end.dtype, device=end.device)[_ROWS, _COLUMNS]
-                    blocks = blocks + eye[:, None, None] * tension
-                summed = summed.index_add(-1, corner, blocks)
-        return summed
 
 
 def inverse_of_symmetric(blocks: Tensor) -> Tensor:
@@ -284,15 +234,13 @@ class TermsTowards(FreeEnergy):
     def at(self, x: Tensor) -> Point:
         """*Shape:* ``(B, V, 3)``."""
         energy, n = self.energy, x.shape[1]
-        at = energy.linearise(self._extend(x), self.reference)
-        hessian = ConvexHessian(energy, at)
+        at = EnergyAt(energy, self._extend(x), self.reference)
 
         def product(field: Tensor) -> Tensor:
-            return energy.fold(hessian(energy.extend(field.movedim(-1, 0)))).movedim(0, -1)
+            return energy.fold(at.product(energy.extend(field.movedim(-1, 0)))).movedim(0, -1)
 
-        gradient, diagonal = energy.fold(energy.gradient(at)), hessian.diagonal()[..., :n]
-        value = energy.value_at(at, self.reference)
-        return Point(value, gradient.movedim(0, -1), diagonal.movedim(0, -1), product)
+        gradient, diagonal = energy.fold(at.gradient()), at.diagonal()[..., :n]
+        return Point(at.value, gradient.movedim(0, -1), diagonal.movedim(0, -1), product)
 
 
 ExtraEnergies = Callable[[slice, Tensor], Sequence[FreeEnergy]]
@@ -322,8 +270,8 @@ class FineEnergy(nn.Module):
         size, parts = chunk_of(x.shape[1], x.device), []
         for i in range(0, len(x), size):
             some = slice(i, i + size)
-            start = x[some]
-            parts.append(self.relax_chunk(start, rests.rows(some), stages, () if extra is None else extra(some, start)))
+            start, others = x[some], () if extra is None else extra(some, x[some])
+            parts.append(self.relax_chunk(start, trees.rows(rests, some), stages, others))
         return torch.cat(parts)
 
     def relax_chunk(

@@ -33,10 +33,11 @@ class Stretch(Term):
         """One over the length."""
         return inverse(measures, measures <= MIN_RELATIVE_LENGTH * measures.mean(-1, keepdim=True))
 
-    def gradients(self, edge_vectors: Tensor) -> Tensor:
-        """Unit vectors, 0 where there is no length."""
+    def linearise(self, edge_vectors: Tensor) -> tuple[Tensor, Tensor]:
+        """Lengths and unit vectors, 0 where there is no length."""
         squared = (edge_vectors * edge_vectors).sum(1, keepdim=True)
-        return edge_vectors * inverse(squared.sqrt(), squared <= tiny(edge_vectors))
+        gradients = edge_vectors * inverse(squared.sqrt(), squared <= tiny(edge_vectors))
+        return self.measure(edge_vectors), gradients
 
     def hessians(self, edge_vectors: Tensor) -> Tensor:
         """The projector across the edge over the length, 0 where there is none."""

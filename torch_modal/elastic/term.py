@@ -44,9 +44,6 @@ class Mesh:
         self.n_vertices = self.centre = connectivity.n_vertices
         self.first_anchor = self.n_vertices + 1
 
-    def __reduce__(self) -> tuple[Any, ...]:
-        return Mesh, (self.connectivity,)
-
     @classmethod
     def of(cls, faces: Tensor, n_vertices: int) -> "Mesh":
         """The mesh of these faces."""
@@ -217,33 +214,26 @@ class Term(nn.Module):
         weight, value = record.unbind(-2)
         return weight * self.difference(measures, value) ** 2
 
-    def slopes(self, measures: Tensor, record: Tensor) -> Tensor:
-        """First derivative of :meth:`energies` in the measures. *Shape:* ``(..., M)``."""
+    def derivatives(self, measures: Tensor, record: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Derivatives of :meth:`energies` in the measures. *Shape of each:* ``(..., M)``.
+
+        Returns:
+            The first; an upper bound of the second that is never negative; and its correction, None where it is zero.
+        """
         weight, value = record.unbind(-2)
-        return 2 * weight * self.difference(measures, value)
-
-    def curvatures(self, measures: Tensor, record: Tensor) -> tuple[Tensor, Tensor | None]:
-        """A second derivative that is never negative, and the correction to the true one, None where it is zero."""
-        return 2 * record[..., 0, :].expand_as(measures), None
-
-    def on_one_branch(self, measures: Tensor, weights: Tensor) -> Tensor:
-        """The measures of K rest shapes, such that weighted sums make sense. *Shape:* ``(..., K, M)`` each."""
-        return measures
+        return 2 * weight * self.difference(measures, value), 2 * weight.expand_as(measures), None
 
     def kernel_functions(self, n: int) -> KernelFunctions | None:
         """Functions that kernels are made from, of ``n`` edge vectors; None for a term that torch computes."""
-        if self.kernel_measure is None or not self._has(
-            Term, "difference", "energies", "slopes", "curvatures", "tension"
-        ):
+        angle = isinstance(self, PeriodicTerm)
+        kind, written = (PeriodicTerm, ()) if angle else (Term, ("difference", "tension"))
+        overridden = (
+            getattr(type(self), each) is not getattr(kind, each) for each in ("energies", "derivatives", *written)
+        )
+        if self.kernel_measure is None or self.total or any(overridden):
             return None
-        return _of_measure(self._name(), n, square(), self.kernel_measure, self.kernel_gradient)
-
-    def _name(self) -> str:
-        return f"{type(self).__module__}.{type(self).__qualname__}"
-
-    def _has(self, kind: type["Term"], *methods: str) -> bool:
-        """True for a term that is no total and has the methods of a class."""
-        return not self.total and all(getattr(type(self), each) is getattr(kind, each) for each in methods)
+        name = f"{type(self).__module__}.{type(self).__qualname__}"
+        return _functions_of_measure(name, n, angle, self.kernel_measure, self.kernel_gradient)
 
     def softening(self, start: Tensor, rest: Tensor, weights: Tensor | None) -> Tensor | None:
         """Factors of the stiffness where minimisations start; None for one.
@@ -263,16 +253,12 @@ class Term(nn.Module):
         """The measure of each element. *Shape:* ``(n-1, 3, ..., M) -> (..., M)``."""
         return self._each(self.measure, edge_vectors)
 
-    def gradients(self, edge_vectors: Tensor) -> Tensor:
-        """Gradients of the measures in the edge vectors. *Shape:* ``(n-1, 3, ..., M) -> (n-1, 3, ..., M)``."""
-        return self._each(jacrev(self.measure), edge_vectors)
-
-    def measures_and_gradients(self, edge_vectors: Tensor) -> tuple[Tensor, Tensor]:
-        """The measures and their gradients; overridden, with these, where both share work.
+    def linearise(self, edge_vectors: Tensor) -> tuple[Tensor, Tensor]:
+        """The measures and their gradients in the edge vectors.
 
         *Shape:* ``(n-1, 3, ..., M) -> (..., M), (n-1, 3, ..., M)``.
         """
-        return self.measures(edge_vectors), self.gradients(edge_vectors)
+        return self.measures(edge_vectors), self._each(jacrev(self.measure), edge_vectors)
 
     def hessians(self, edge_vectors: Tensor) -> Tensor:
         """Hessians of the measures in the edge vectors. *Shape:* ``(n-1, 3, ..., M) -> (n-1, 3, n-1, 3, ..., M)``."""
@@ -332,30 +318,13 @@ class PeriodicTerm(Term):
         v, _, v2, s2 = _turns(measures, c, s)
         return 8 / 3 * once * v - 1 / 6 * (along * v2 - across * s2)
 
-    def slopes(self, measures: Tensor, record: Tensor) -> Tensor:
-        """First derivative of :meth:`energies` in the measures. *Shape:* ``(..., M)``."""
-        _, c, s, once, along, across = record.unbind(-2)
-        _, sine, v2, s2 = _turns(measures, c, s)
-        return 8 / 3 * once * sine - 1 / 3 * (along * s2 - across * (1 - v2))
-
-    def curvatures(self, measures: Tensor, record: Tensor) -> tuple[Tensor, Tensor]:
-        """Upper bound of the second derivative, and its correction: the true value is their sum."""
+    def derivatives(self, measures: Tensor, record: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Overrides those of the square."""
         weight, c, s, once, along, across = record.unbind(-2)
-        v, _, v2, s2 = _turns(measures, c, s)
-        true = 8 / 3 * once * (1 - v) - 2 / 3 * (along * (1 - v2) + across * s2)
-        return 2 * weight.expand_as(measures), true - 2 * weight
-
-    def kernel_functions(self, n: int) -> KernelFunctions | None:
-        """Overrides the base class; kernels represent angles by cosine and sine."""
-        if self.kernel_measure is None or not self._has(PeriodicTerm, "energies", "slopes", "curvatures"):
-            return None
-        return _of_angle(self._name(), n, self.kernel_measure, self.kernel_gradient)
-
-    def on_one_branch(self, measures: Tensor, weights: Tensor) -> Tensor:
-        """Bring angles within half a turn of their weighted mean. *Shape:* ``(..., K, M)`` each."""
-        with torch.no_grad():
-            mean = torch.atan2((weights * measures.sin()).sum(-2, True), (weights * measures.cos()).sum(-2, True))
-        return mean + wrap_angle(measures - mean)
+        v, sine, v2, s2 = _turns(measures, c, s)
+        slope = 8 / 3 * once * sine - 1 / 3 * (along * s2 - across * (1 - v2))
+        curvature = 8 / 3 * once * (1 - v) - 2 / 3 * (along * (1 - v2) + across * s2)
+        return slope, 2 * weight.expand_as(measures), curvature - 2 * weight
 
 
 def periodic_square(difference: Tensor) -> Tensor:
@@ -506,41 +475,28 @@ def periodic() -> Potential:
 
 @cache
 @no_type_check
-def _of_measure(name: str, n: int, potential: Potential, measure: Any, gradient: Any) -> KernelFunctions:
-    """Functions of a measure alone, or with its gradient."""
+def _functions_of_measure(name: str, n: int, angle: bool, measure: Any, gradient: Any) -> KernelFunctions:
+    """Functions of a measure alone, or with its gradient; kernels represent angles by cosine and sine."""
     import warp as wp
+
+    kind, edges = measure, wp.types.matrix(shape=(n, 3), dtype=wp.float64)
+    if angle:
+
+        @wp.func
+        def kind(e: edges):
+            q = measure(e)
+            return wp.vec2d(wp.cos(q), wp.sin(q))
 
     if gradient is None:
 
         @wp.func
-        def linearise(e: wp.types.matrix(shape=(n, 3), dtype=wp.float64)):
-            return measure(e), wp.grad(measure)(e)
+        def linearise(e: edges):
+            return kind(e), wp.grad(measure)(e)
 
     else:
 
         @wp.func
-        def linearise(e: wp.types.matrix(shape=(n, 3), dtype=wp.float64)):
-            return measure(e), gradient(e)
+        def linearise(e: edges):
+            return kind(e), gradient(e)
 
-    return KernelFunctions(name, n, potential, measure, linearise, gradient is not None)
-
-
-@cache
-@no_type_check
-def _of_angle(name: str, n: int, measure: Any, gradient: Any) -> KernelFunctions:
-    """Functions of an angle, by its cosine and sine."""
-    import warp as wp
-
-    whole = _of_measure(name, n, periodic(), measure, gradient).linearise
-
-    @wp.func
-    def phase(e: wp.types.matrix(shape=(n, 3), dtype=wp.float64)):
-        angle = measure(e)
-        return wp.vec2d(wp.cos(angle), wp.sin(angle))
-
-    @wp.func
-    def linearise(e: wp.types.matrix(shape=(n, 3), dtype=wp.float64)):
-        angle, gradient_of_angle = whole(e)
-        return wp.vec2d(wp.cos(angle), wp.sin(angle)), gradient_of_angle
-
-    return KernelFunctions(name, n, periodic(), phase, linearise, gradient is not None)
+    return KernelFunctions(name, n, periodic() if angle else square(), kind, linearise, gradient is not None)

@@ -42,10 +42,11 @@ class Volume(Term):
         surface = 0.5 * norm(cross(q - p, r - p)).sum(-1, keepdim=True)
         return torch.maximum(measures.abs(), MIN_RELATIVE_VOLUME * surface**1.5) ** -2
 
-    def gradients(self, edge_vectors: Tensor) -> Tensor:
-        """Sixths of cross products."""
+    def linearise(self, edge_vectors: Tensor) -> tuple[Tensor, Tensor]:
+        """Volumes, and sixths of cross products."""
         p, q, r = edge_vectors
-        return torch.stack([cross(q, r), cross(r, p), cross(p, q)]) / 6
+        gradients = torch.stack([cross(q, r), cross(r, p), cross(p, q)]) / 6
+        return (p * gradients[0]).sum(0), gradients
 
     def hessians(self, edge_vectors: Tensor) -> Tensor:
         """``p.(q x r)`` has the block ``-[r]`` between ``p`` and ``q``."""

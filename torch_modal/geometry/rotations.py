@@ -136,8 +136,8 @@ def about(half: Tensor) -> Tensor:
 def mean(rotations: Tensor, weights: Tensor) -> Tensor:
     """Weighted mean of K rotations, where the weighted sum of their relative logarithms vanishes.
 
-    Of two rotations it is the point on the geodesic between them. Of more it has first derivatives only. Quaternions
-    have the signs of :func:`signs_of_mean`; weights add up to one.
+    Of two rotations it is the point on the geodesic between them. Quaternions have the signs of
+    :func:`signs_of_mean`; weights add up to one. There are first and second derivatives.
 
     *Shape:* ``(4, ..., K, F), (..., K, 1) -> (4, ..., F)``.
     """
@@ -152,7 +152,10 @@ def mean(rotations: Tensor, weights: Tensor) -> Tensor:
         estimate = estimate / estimate.square().sum(0).sqrt().clamp_min(torch.finfo(estimate.dtype).tiny)
         for _ in range(MEAN_STEPS):
             estimate = _mean_step(estimate, rotations, weights)
-    return _mean_step(estimate.detach(), rotations, weights)  # forward mode goes through no_grad
+    estimate = estimate.detach()  # forward mode goes through no_grad
+    for _ in range(2):  # at the mean, each step has one more derivative
+        estimate = _mean_step(estimate, rotations, weights)
+    return estimate
 
 
 @torch.no_grad()

@@ -1,7 +1,5 @@
 """An energy of some free vertices, minimised to convergence by Newton's method with sparse factors."""
 
-from collections.abc import Sequence
-
 import numpy as np
 import torch
 from scipy import sparse
@@ -9,7 +7,7 @@ from torch import Tensor, nn
 
 from torch_modal import trees
 from torch_modal.autograd import as_normal_tensor, is_double_backward, outside_inference_mode, run_outside_transforms
-from torch_modal.elastic.energy import AssembledTerm, Energy, Linearised, Reference, energy_rounding
+from torch_modal.elastic.energy import AssembledTerm, Energy, EnergyAt, Linearised, Reference, energy_rounding
 from torch_modal.elastic.minimise import Solution, Status
 from torch_modal.geometry.canonical import CANONICAL_SIZE
 from torch_modal.geometry.sparse import Solve, factorize, solve_by
@@ -63,19 +61,23 @@ class FreeVertices(nn.Module):
         """All vertices. *Shape:* ``(B, 3 n), (B, V, 3) -> (B, V, 3)``."""
         return start.index_add(1, self.free, a.unflatten(-1, (-1, 3)))
 
-    def gradient(self, a: Tensor, placement: Placement) -> Tensor:
-        """Gradient at ``a``, to be differentiated in all that the placement holds. *Shape:* ``(B, 3 n)``."""
-        gradient = self.energy.fold(self.energy.gradient(self._linearise(a, placement)))
-        return gradient.movedim(0, -1)[:, self.free].flatten(1) + self._ridge(placement) * a
+    def value_and_gradient(self, a: Tensor, placement: Placement) -> tuple[Tensor, Tensor]:
+        """Energy and gradient, which can be differentiated in all that the placement holds.
+
+        *Shape:* ``(B, 3 n) -> (B,), (B, 3 n)``.
+        """
+        at, ridge = self._linearise(a, placement), self._ridge(placement)
+        gradient = self.energy.fold(at.gradient()).movedim(0, -1)[:, self.free].flatten(1)
+        return at.value + 0.5 * (ridge * a * a).sum(-1), gradient + ridge * a
 
     def value(self, a: Tensor, placement: Placement) -> Tensor:
         """Energy at ``a``. *Shape:* ``(B, 3 n) -> (B,)``."""
         rows = self.energy.extend(self.shapes(a, placement[0]).movedim(-1, 0))
         return self.energy.value(rows, placement[1]) + 0.5 * (self._ridge(placement) * a * a).sum(-1)
 
-    def _linearise(self, a: Tensor, placement: Placement) -> list[Linearised]:
+    def _linearise(self, a: Tensor, placement: Placement) -> EnergyAt:
         rows = self.shapes(a, placement[0]).movedim(-1, 0).contiguous()
-        return self.energy.linearise(self.energy.extend(rows), placement[1])
+        return EnergyAt(self.energy, self.energy.extend(rows), placement[1])
 
     @staticmethod
     def _ridge(placement: Placement) -> Tensor:
@@ -97,7 +99,7 @@ class FreeVertices(nn.Module):
         return Solution(torch.cat(amplitudes), torch.cat(energies), torch.cat(norms), *counts)
 
     def _descend(self, a: Tensor, placement: Placement, max_steps: int) -> tuple[Tensor, Tensor, Tensor, int, Status]:
-        value, gradient, status, n_steps = self.value(a, placement), self.gradient(a, placement), Status.OUT_OF_STEPS, 0
+        (value, gradient), status, n_steps = self.value_and_gradient(a, placement), Status.OUT_OF_STEPS, 0
         first = gradient.norm(dim=-1).clamp_min(torch.finfo(a.dtype).tiny)
         if not first.isfinite():
             return a, value, first, 0, Status.INVALID
@@ -113,7 +115,7 @@ class FreeVertices(nn.Module):
                 if not length > SHORTEST:
                     return a, value, gradient.norm(dim=-1) / first, n_steps, Status.STALLED
             a, value, n_steps = a + length * step, there, n_steps + 1
-            gradient = self.gradient(a, placement)
+            gradient = self.value_and_gradient(a, placement)[1]
         return a, value, gradient.norm(dim=-1) / first, n_steps, status
 
     # -------------------------------------------------------------------------------------------- the Hessian's inverse
@@ -148,7 +150,7 @@ class FreeVertices(nn.Module):
             solution = solve_by(lambda: solve_all, right)
             if is_double_backward(solution, a, *tensors):
                 # Its derivative is the derivative of the Hessian's product, solved once more.
-                product = torch.func.vjp(lambda a: self.gradient(a, placement), a)[1](solution)[0]
+                product = torch.func.vjp(lambda a: self.value_and_gradient(a, placement)[1], a)[1](solution)[0]
                 solution = solution + solve_by(lambda: solve_all, torch.where(converged[:, None], right - product, 0))
             return solution
 
@@ -169,7 +171,7 @@ class FreeVertices(nn.Module):
         def product(field: Tensor) -> Tensor:
             with torch.enable_grad():
                 leaf = a.detach().requires_grad_()
-                return torch.autograd.grad(self.gradient(leaf, placement), leaf, field)[0]
+                return torch.autograd.grad(self.value_and_gradient(leaf, placement)[1], leaf, field)[0]
 
         def solve(right: Tensor) -> Tensor:
             residual, solution = right, torch.zeros_like(right)
@@ -191,7 +193,7 @@ class FreeVertices(nn.Module):
 
         return solve
 
-    def _factors(self, at: Sequence[Linearised], placement: Placement, convex: bool) -> Solve:
+    def _factors(self, at: EnergyAt, placement: Placement, convex: bool) -> Solve:
         """The inverse of the Hessian of all but totals, or of its part that is never negative.
 
         Raises:
@@ -199,7 +201,7 @@ class FreeVertices(nn.Module):
         """
         n, entries, values = self.n_amplitudes, iter(self.entries), []
         rows, columns = (np.concatenate(each) for each in zip(*(entry[1:] for entry in self.entries), strict=True))
-        for summand, one in zip(self.energy.parts, at, strict=True):
+        for summand, one in zip(self.energy.parts, at.terms, strict=True):
             if not summand.term.total:
                 blocks = _hessians(summand, one, convex)[..., 0, :].cpu().numpy()
                 values.append(blocks.reshape(-1)[next(entries)[0]])

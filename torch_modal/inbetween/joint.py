@@ -123,11 +123,6 @@ class JointSpace(nn.Module):
         value = torch.add(reduce(torch.add, values), a.square().sum(-1), alpha=0.5 * self.anchor)
         return value, torch.add(reduce(torch.add, gradients), a, alpha=self.anchor)
 
-    def gradient(self, a: Tensor, placement: Sequence[Placement]) -> Tensor:
-        """Gradient at ``a``, to be differentiated. *Shape:* ``(B, n) -> (B, n)``."""
-        each = [part.gradient(a.to(at.base.dtype), at) for part, at in zip(self.parts, placement, strict=True)]
-        return reduce(torch.add, each) + self.anchor * a
-
 
 def coarse_values(values: Tensor, fine: AssembledTerm, coarse: AssembledTerm, clusters: Tensor, n: int) -> Tensor:
     """Values of fine elements on the coarse elements: means over clusters, then over corners.

@@ -102,11 +102,6 @@ class PairedSpace(nn.Module):
         similarity, slope = self._similarity(a, placement)
         return first[0] + second[0] + similarity, torch.cat([first[1], second[1]], -1) + slope
 
-    def gradient(self, a: Tensor, placement: PairedPlacement) -> Tensor:
-        """Gradient at ``a``, to be differentiated. *Shape:* ``(B, n) -> (B, n)``."""
-        ends = [space.gradient(a_k, place) for space, a_k, place in self._ends(a, placement)]
-        return torch.cat(ends, -1) + self._similarity(a, placement)[1]
-
     def _similarity(self, a: Tensor, placement: PairedPlacement) -> tuple[Tensor, Tensor]:
         """The energy of the similarity and its gradient. *Shape:* ``(..., B, n) -> (..., B), (..., B, n)``."""
         grown = a @ self.gap_gram

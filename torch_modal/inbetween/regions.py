@@ -185,7 +185,7 @@ class LocalInterpolation(nn.Module):
             The shapes, and the worse :class:`~torch_modal.elastic.minimise.Status` of both, *shape* ``(B,)``.
         """
         energy, shapes = self.problem.energy, rests.shapes[:, :, self.used].double()
-        rest = energy.rest_of(shapes)
+        rest = energy.rest(energy.extend(shapes.movedim(-1, 0).contiguous()))
         measures, stiffness = [], []
         for summand, q, some, value in zip(energy.parts, rest.measures, self.elements, rests.stiffness, strict=False):
             measures.append(q[:, 0] + 0.5 * summand.term.difference(q[:, 1], q[:, 0]))

@@ -56,11 +56,6 @@ class Samples(NamedTuple):
     stiffness: list[Tensor]
     """Stiffness of each term. *Shape of each:* ``(B, M)`` or ``(B, 1)``."""
 
-    def rows(self, some: slice) -> "Samples":
-        """Some of the samples."""
-        stiffness = [values[some] for values in self.stiffness]
-        return Samples(self.keyframes[some], self.weights[some], self.mu[some], stiffness)
-
 
 def trivial_solution(x: Tensor, usable: Tensor) -> Solution:
     """The solution where there is nothing to minimise. *Shape:* ``(B, V, 3), (B,)``."""

@@ -118,19 +118,16 @@ class InBetweenSolver(nn.Module):
             ends, status = self.local(ends, rests, solution.status != Status.INVALID)
             solution = solution._replace(status=torch.where(solution.converged, status, solution.status))
         x = self.relax((ends[0] + ends[1]) / 2, rests)
-        energies = [self.mean_energy(shape.detach(), rests) for shape in (x, straight)]
+        energies = [self.mean_energy(shape, rests) for shape in (x, straight)]
         valid = (solution.status != Status.INVALID)[:, None, None]
         first, second, x = (torch.where(valid, self.alignment.to_caller(y, pose), torch.nan) for y in (*ends, x))
         return InBetweenResult(x, solution, first, second, *energies)
 
+    @torch.no_grad()
     def mean_energy(self, x: Tensor, rests: RestShapes) -> Tensor:
         """Mean of Eq. 5 from two key-frames to shapes, on the fine mesh. *Shape:* ``(B, V, 3) -> (B,)``."""
         energy, anchors = self.fine.energy, None if rests.anchors is None else rests.anchors.movedim(-1, 0)
-        rows = energy.extend(x.movedim(-1, 0).contiguous(), anchors)
-        each = [
-            energy.reference_of(energy.rest_of(shape.detach()), rests.stiffness) for shape in rests.shapes.unbind(1)
-        ]
-        return (energy.value(rows, each[0]) + energy.value(rows, each[1])).detach() / 2
+        return energy.value(energy.extend(x.movedim(-1, 0).contiguous(), anchors), rests.reference(energy))
 
     def minimise_amplitudes(self, base: Tensor, rests: RestShapes, mu: Tensor, usable: Tensor) -> Solution:
         """Amplitudes of least energy in the modal space. *Shape:* of ``mu`` and ``usable`` ``(B,)``."""

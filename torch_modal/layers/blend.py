@@ -5,7 +5,6 @@ from torch import Tensor
 
 from torch_modal.autograd import (
     disable_compile,
-    forbid_second_derivative,
     is_traced,
     outside_inference_mode,
     run_outside_transforms,
@@ -21,8 +20,6 @@ MOST_BELOW_ZERO = 0.25
 ROUNDING = 1e-5
 """Sums of weights may differ from one by so much, or by the rounding of their dtype."""
 
-SECOND = "Blend of more than two key-frames has first derivatives only; of two, they may be differentiated again"
-
 
 class Blend(InBetweenLayer):
     r"""Shapes in between several key-frames, by weights: the minimiser of :math:`\sum_k w_k\, d(x_k, x)`.
@@ -32,8 +29,8 @@ class Blend(InBetweenLayer):
     of two bases have the shapes of :class:`InBetween` at the time of the second weight. A rigid motion between
     key-frames is taken out first; the result has the weighted mean of their poses.
 
-    Gradients reach the key-frames, the weights and the stiffnesses. Second derivatives of more than two key-frames are
-    an error. The modes are constants. Precision, warnings and statuses are as for :class:`InBetween`.
+    Gradients reach the key-frames, the weights and the stiffnesses, also second ones. The modes are constants.
+    Precision, warnings and statuses are as for :class:`InBetween`.
 
     Args:
         bases: The bases, one or more, in any order (:func:`torch_modal.extract_bases`). Instead, key-frames,
@@ -93,12 +90,8 @@ class Blend(InBetweenLayer):
         if torch.finfo(weights.dtype).bits < 32:  # of an autocast model: to more digits, they do not add up to one
             normalised = weights.to(self.dtype)
             normalised = normalised / normalised.sum(-1, keepdim=True)
-        x, several = keyframes, weights.shape[-1] > 2
-        if several:  # second derivatives pass what goes in, in reverse mode, or what comes out, in forward mode
-            x, normalised = forbid_second_derivative(x, SECOND), forbid_second_derivative(normalised, SECOND)
-        result = self.solve_samples(x, normalised, lead)
-        shapes = forbid_second_derivative(result.shapes, SECOND) if several else result.shapes
-        return result._replace(shapes=with_exact_keyframes(shapes, keyframes, weights))
+        result = self.solve_samples(keyframes, normalised, lead)
+        return result._replace(shapes=with_exact_keyframes(result.shapes, keyframes, weights))
 
     def _check(self, keyframes: Tensor, weights: Tensor) -> torch.Size:
         """The leading dimensions of the result, of arguments that are checked."""

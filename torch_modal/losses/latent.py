@@ -7,6 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from torch_modal.autograd import full_precision
+from torch_modal.elastic.energy import EnergyAt
 from torch_modal.keyframes.arrays import check_tensor
 from torch_modal.losses.shell import ShellLoss
 
@@ -113,10 +114,11 @@ class LatentElasticity(nn.Module):
         """Products of displacements in the Hessian about shapes. *Shape:* ``(B, k, k)``."""
         energy, scale = self.shell.energy, self.shell.scale(x)
         reference = self.shell.reference_of(scale * x)
-        at = energy.linearise(self.shell._rows(scale * x), reference)
-        each = [energy.rates(at, self.shell._rows(scale * field)) for field in along]
+        at = EnergyAt(energy, self.shell._rows(scale * x), reference)
+        fields = [self.shell._rows(scale * field) for field in along]
         gram = x.new_zeros(len(x), len(along), len(along))
-        for record, *rates in zip(reference.records, *each, strict=True):
+        for summand, one, record in zip(energy.parts, at.terms, reference.records, strict=True):
+            rates = [summand.along(one, field)[1] for field in fields]
             scaled = torch.stack(rates, 1) * record[:, :1].sqrt()  # (B, k, M)
             gram = gram + scaled @ scaled.mT
         return gram

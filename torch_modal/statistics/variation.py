@@ -83,7 +83,8 @@ class Variation:
         self.fine = choose(backend).fine_energy(mesh, [Stretch(ALPHA), Bend(BETA), Volume(GAMMA)])
         closed = all(encloses(x, mesh.connectivity) for x in self.shapes)
         #: Measures of the given shapes, at a size of 100.
-        self.rest = self.fine.energy.rest_of(self.scale * self.shapes)
+        energy = self.fine.energy
+        self.rest = energy.rest(energy.extend((self.scale * self.shapes).movedim(-1, 0).contiguous()))
         #: Stiffnesses of the three terms of Eq. 5. *Shape of each:* ``(1, 1)``.
         self.stiffness = [mean.new_full((1, 1), value) for value in (ALPHA, BETA, GAMMA if closed else 0.0)]
 
