@@ -77,79 +77,40 @@ def worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
 
     def replace(code: str) -> None:
         script = tmp_path / "worker.py"
-        script.write_text("import os, signal, sys, time\njob, result = sys.argv[1:]\n" + textwrap.dedent(code))
+        script.write_text(
+            "import os, signal, sys, time\nimport numpy as np\njob, result = sys.argv[1:]\n" + textwrap.dedent(code)
+        )
         monkeypatch.setattr(tetwild, "WORKER", script)
 
     return replace
 
 
 @pytest.mark.parametrize(
-    ("code", "says", "lasting"),
+    ("code", "says"),
     [
-        ("os.kill(os.getpid(), signal.SIGKILL)", "signal SIGKILL", False),
-        ("os.kill(os.getpid(), signal.SIGBUS)", "signal SIGBUS", False),
-        ("os.abort()", "signal SIGABRT", False),
-        ("os.kill(os.getpid(), signal.SIGXCPU)", "its processor_time of inf s is over", True),
-        ("os.kill(os.getpid(), signal.SIGSEGV)", "signal SIGSEGV", True),
-        ("print('RuntimeError: no envelope'); sys.exit(3)", "exit code 3 \\(RuntimeError: no envelope\\)", True),
-        ("sys.exit('ModuleNotFoundError: pytetwild')", "exit code 1 \\(ModuleNotFoundError: pytetwild\\)", False),
-        ("pass", "no readable result", False),
-        ("open(result, 'wb').write(b'PK\\x03\\x04')", "no readable result", False),
+        ("os.kill(os.getpid(), signal.SIGKILL)", r"signal SIGKILL \(perhaps memory ran out\)"),
+        ("os.kill(os.getpid(), signal.SIGXCPU)", r"signal SIGXCPU \(its processor_time is over\)"),
+        ("os.kill(os.getpid(), signal.SIGSEGV)", "signal SIGSEGV"),
+        ("print('RuntimeError: no envelope'); sys.exit(3)", r"exit code 3 \(RuntimeError: no envelope\)"),
+        ("pass", "No such file"),
+        ("open(result, 'wb').write(b'PK\\x03\\x04')", "File is not a zip file"),
+        ("np.savez(result, vertices=np.zeros((0, 3)), tets=np.zeros((0, 4), int))", "the result is empty"),
         (
-            "import numpy as np; np.savez(result, vertices=np.zeros((0, 3)), tets=np.zeros((0, 4), int))",
-            "the result is empty",
-            True,
+            "np.savez(result, vertices=np.eye(4)[:, :3] * 1e-3, tets=np.arange(4)[None])",
+            "of its vertices are far from the result",
         ),
         (
-            "import numpy as np; np.savez(result, vertices=np.eye(4)[:, :3] * 1e-3, tets=np.arange(4)[None])",
-            "of its vertices are further than",
-            True,
-        ),
-        (
-            "import numpy as np; v = np.load(job)['vertices']; v[0] *= 50; i = np.arange(len(v));"
+            "v = np.load(job)['vertices']; v[0] *= 50; i = np.arange(len(v));"
             "np.savez(result, vertices=v, tets=np.stack([0 * i, i, np.roll(i, 5), np.roll(i, 40)], 1))",
             "reaches far beyond",
-            True,
         ),
     ],
 )
-def test_failure_says_which_mesh_and_why(worker, capsule: Mesh, code: str, says: str, lasting: bool) -> None:
-    """And whether the surface is the cause."""
+def test_failure_says_which_mesh_and_why(worker, capsule: Mesh, code: str, says: str) -> None:
     worker(code)
     with pytest.raises(TetrahedralizationError, match=says) as caught:
         TetWild().fill(as_it_is(*capsule), threading.Event())
     assert f"a mesh of {len(capsule[0])} vertices and {len(capsule[1])} faces" in str(caught.value)
-    assert caught.value.lasting == lasting
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="needs a limit of the address space")
-def test_too_little_memory_is_not_the_surfaces_fault(worker, capsule: Mesh) -> None:
-    """The real mesher where threads and memory cannot be had."""
-    real = str(tetwild.WORKER)
-    worker(
-        f"""
-        import resource, runpy
-        resource.setrlimit(resource.RLIMIT_AS, (180 * 2**20, 180 * 2**20))
-        sys.path.insert(0, "")
-        sys.argv[0] = {real!r}
-        runpy.run_path({real!r}, run_name="__main__")
-        """
-    )
-    with pytest.raises(TetrahedralizationError, match=r"SIGABRT|exit code 1") as caught:
-        COARSE.fill(as_it_is(*capsule), threading.Event())
-    assert not caught.value.lasting
-
-
-def test_the_exit_code_of_the_real_worker(capsule: Mesh, tmp_path: Path) -> None:
-    """It tells the mesher's refusal, here of a wrong edge length, from a job that cannot be read."""
-    numbers = {"edge_length_fac": 2.0, "epsilon": 1e-3, "stop_energy": 10.0, "max_surface_faces": 10**6}
-    numbers |= {"timeout": 60, "processor_time": np.inf}
-    np.savez(tmp_path / "job.npz", vertices=capsule[0], faces=capsule[1], **numbers)
-    for job, code, says in (("job.npz", tetwild.MESHER_RAISED, "ValueError: Edge"), ("none.npz", 1, "No such file")):
-        command = [sys.executable, str(tetwild.WORKER), str(tmp_path / job), str(tmp_path / "result.npz")]
-        run = subprocess.run(command, capture_output=True, text=True, timeout=120, cwd=tmp_path)
-        assert run.returncode == code
-        assert says in run.stderr.splitlines()[-1]
 
 
 def _is_running(pid: int) -> bool:
@@ -169,9 +130,9 @@ def test_timeout_kills_the_worker_and_its_children(worker, capsule: Mesh, tmp_pa
         time.sleep(60)
     """)
     start = time.monotonic()
-    with pytest.raises(TetrahedralizationError, match="no result after the timeout of 1 s") as caught:
+    with pytest.raises(TetrahedralizationError, match="no result after the timeout of 1 s"):
         TetWild(timeout=1.0).fill(as_it_is(*capsule), threading.Event())
-    assert time.monotonic() - start < 10 and not caught.value.lasting
+    assert time.monotonic() - start < 10
     time.sleep(0.1)
     assert not any(_is_running(int(pid)) for pid in (tmp_path / "pids").read_text().split())
 
@@ -242,22 +203,23 @@ def test_auto_bounds_the_time_of_the_mesher(monkeypatch: pytest.MonkeyPatch, cap
     """The lattice follows; with these edges fTetWild would take minutes."""
     resource = pytest.importorskip("resource", reason="Windows has no limit of the processor time")
     monkeypatch.setattr(tetwild, "PATIENCE", 1.0)
+    monkeypatch.setattr(tetwild, "EDGE_RANGE", (2e-3, 2e-3))
     keyframes, faces, *_ = load_sample("hand")
     surface = CanonicalSurface.of(keyframes[1].numpy(), faces.numpy())
     before = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
     with caplog.at_level("INFO"):
-        filled = Auto(TetWild(edge_length_fac=2e-3, timeout=60.0)).fill(surface, threading.Event())
+        filled = Auto().fill(surface, threading.Event())
     assert resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime - before < 4
-    assert "its processor_time of 1 s is over" in caplog.text
+    assert "its processor_time is over" in caplog.text
     np.testing.assert_array_equal(filled.tets, Lattice().fill(surface, threading.Event()).tets)
 
 
 def test_edges_follow_the_thinnest_part(monkeypatch: pytest.MonkeyPatch) -> None:
     given: list[float] = []
 
-    def stopped(points: np.ndarray, faces: np.ndarray, settings: TetWild, stop: threading.Event) -> Tetrahedra:
+    def stopped(surface: CanonicalSurface, settings: TetWild, stop: threading.Event) -> Tetrahedra:
         given.append(settings.edge_length_fac)  # type: ignore[arg-type]
-        raise TetrahedralizationError("stopped")
+        raise ValueError("stopped")
 
     monkeypatch.setattr(tetwild, "_run_worker", stopped)
     ball = trimesh.creation.icosphere(subdivisions=3)

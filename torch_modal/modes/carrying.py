@@ -24,9 +24,6 @@ MAX_FIT = 0.1
 """Largest root mean square and maximum distances from the key-frame, in bounding-box diagonals."""
 MAX_INVERTED = 0.04
 """Largest fraction of inverted tetrahedra. Up to 2.5 % change neither modes nor mid-shapes."""
-FLAT = 1e-3
-"""Determinant over the cubed norm, below which a matrix counts as singular; a rotation has 0.19."""
-MOST_POLAR_STEPS = 20
 
 
 class Carrier:
@@ -111,26 +108,7 @@ def vertex_rotations(before: FloatArray, after: FloatArray, faces: IntArray) -> 
 
 
 def nearest_rotations(matrices: NDArray[Any]) -> FloatArray:
-    """The rotations nearest to matrices. *Shape:* ``(·, 3, 3) -> (·, 3, 3)``.
-
-    The orthogonal factor of the polar decomposition by Newton's iteration ``X <- (s X + X^-T / s) / 2``, scaled by
-    ``s = det(X)^(-1/3)`` (Higham 1986), in a quarter of the time of a singular value decomposition. The latter serves
-    mirrored and singular matrices.
-    """
-    sound = np.linalg.det(matrices) > FLAT * np.linalg.norm(matrices, axis=(1, 2)) ** 3
-    result = np.empty((len(matrices), 3, 3))
-    if not sound.all():
-        u, _, vt = np.linalg.svd(matrices[~sound])
-        flip = np.ones((len(u), 3))
-        flip[:, 2] = np.sign(np.linalg.det(u @ vt))
-        result[~sound] = (u * flip[:, None]) @ vt
-    x = np.ascontiguousarray(np.moveaxis(matrices[sound], 0, -1), dtype=np.float64)
-    for _ in range(MOST_POLAR_STEPS):
-        cofactors = np.stack([np.cross(x[i - 2], x[i - 1], axis=0) for i in range(3)])  # det(X) X^-T
-        determinant = (x[0] * cofactors[0]).sum(axis=0)
-        scale = np.cbrt(determinant)
-        previous, x = x, 0.5 * (x / scale + cofactors * (scale / determinant))
-        if np.abs(x - previous).max(initial=0.0) < 1e-14:
-            break
-    result[sound] = np.moveaxis(x, -1, 0)
-    return result
+    """The rotations nearest to matrices. *Shape:* ``(·, 3, 3) -> (·, 3, 3)``."""
+    u, _, vt = np.linalg.svd(matrices)
+    u[:, :, 2] *= np.sign(np.linalg.det(u @ vt))[:, None]
+    return u @ vt

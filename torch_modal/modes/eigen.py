@@ -9,7 +9,7 @@ import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import LinearOperator, eigsh
 
-from torch_modal.arrays import FloatArray, IntArray
+from torch_modal.arrays import BoolArray, FloatArray, IntArray
 from torch_modal.geometry.sparse import factorize
 
 N_RIGID = 6
@@ -92,10 +92,7 @@ def lowest_modes(body: ElasticBody, n_modes: int) -> ElasticModes:
     n_pieces, piece = connected_components(_vertex_graph(k), directed=False)
     rigid = np.zeros((k.shape[0], N_RIGID * n_pieces))
     for index in range(n_pieces):
-        vertices = np.flatnonzero(piece == index)
-        rows = _unknowns(vertices)
-        columns = slice(N_RIGID * index, N_RIGID * (index + 1))
-        rigid[rows, columns] = rigid_motions(positions[vertices], inertia[rows][:, rows])
+        rigid[:, N_RIGID * index : N_RIGID * (index + 1)] = rigid_motions(positions, inertia, piece == index)
     n_modes = min(n_modes, k.shape[0] - rigid.shape[1])
     momentum = inertia @ rigid
     if k.shape[0] < DENSE_BELOW or 2 * n_modes > k.shape[0]:
@@ -112,7 +109,7 @@ def lowest_modes(body: ElasticBody, n_modes: int) -> ElasticModes:
     eigenvalues, rotation = np.linalg.eigh((restricted + restricted.T) / 2)
     modes, forces = span @ rotation, forces @ rotation
     # Of the rigid motions of components, the first six mixes are rigid motions of the whole.
-    mixes = scipy.linalg.qr(momentum.T @ rigid_motions(positions, inertia))[0]
+    mixes = scipy.linalg.qr(momentum.T @ rigid_motions(positions, inertia, piece >= 0))[0]
     energies = mixes.T @ (rigid.T @ (k @ rigid)) @ mixes
 
     n_zero = int((eigenvalues < ZERO * shift).sum())
@@ -146,17 +143,17 @@ def lowest_modes(body: ElasticBody, n_modes: int) -> ElasticModes:
     return ElasticModes(eigenvalues, modes * _signs(modes), rigid_eigenvalues, rigid.shape[1] + n_zero, n_pieces)
 
 
-def rigid_motions(positions: FloatArray, inertia: sp.csr_matrix) -> FloatArray:
-    """M-orthonormal translations and infinitesimal rotations of points that are not all on one line.
+def rigid_motions(positions: FloatArray, inertia: sp.csr_matrix, moves: BoolArray) -> FloatArray:
+    """M-orthonormal translations and infinitesimal rotations of some points, which are not all on one line.
 
-    *Shape:* ``(N, 3), (3N, 3N) -> (3N, 6)``, with the mass matrix of coordinates.
+    *Shape:* ``(N, 3), (3N, 3N), (N,) -> (3N, 6)``, with the mass matrix of coordinates.
     """
-    centered = positions - positions.mean(axis=0)
+    centered = positions[moves] - positions[moves].mean(axis=0)
     # Scaled to order 1 like the translations, for a well-conditioned factorisation.
     centered = centered / np.sqrt((centered**2).sum(axis=1).mean())
     motions = np.zeros((len(positions), 3, N_RIGID))
-    motions[:, :, :3] = np.eye(3)
-    motions[:, :, 3:] = np.cross(centered[:, None], np.eye(3))  # row c has coordinate c of the three rotations
+    motions[moves, :, :3] = np.eye(3)
+    motions[moves, :, 3:] = np.cross(centered[:, None], np.eye(3))  # row c has coordinate c of the three rotations
     return _orthonormal(motions.reshape(-1, N_RIGID), inertia)
 
 
@@ -175,10 +172,12 @@ def _lanczos(
     # The transpose of the symmetric matrix has sorted indices, in a fraction of the time of sorting.
     factors = factorize(shifted[order][:, order].tocsr().T, "NATURAL")
 
+    momentum = momentum.T.tocsr()
+
     def elastic_solve(forces: FloatArray) -> FloatArray:
         solved = np.empty(n)
         solved[order] = factors.solve(forces.reshape(-1)[order])
-        return solved - rigid @ (momentum.T @ solved)
+        return solved - rigid @ (momentum @ solved)
 
     # A fixed start makes modes reproducible. Full accuracy: a looser tolerance misses copies of equal eigenvalues.
     start = elastic_solve(np.random.default_rng(0).standard_normal(n))

@@ -224,9 +224,7 @@ class _Extraction:
         first, second = (self.shells, self.solids) if reason else (self.solids, self.shells)
         try:
             return first()
-        except (TetrahedralizationError, ModalAnalysisError) as error:
-            if isinstance(error, TetrahedralizationError) and not error.lasting:
-                raise  # another attempt may succeed, and the same call should give the same modes
+        except ModalAnalysisError as error:
             self.stop.clear()
             logger.info("modes of %s: %s", "a solid" if reason else "the surface itself, not of a solid", error)
             self.bar.expect(len(self.surfaces))
@@ -337,9 +335,7 @@ class _Extraction:
         except (MeshError, TetrahedralizationError, ModalAnalysisError) as error:
             if self.n_keyframes == 1:
                 raise
-            named = type(error)(f"key-frame {index}: {error}")
-            named.__dict__.update(error.__dict__)  # whether a failure lasts
-            raise named from error
+            raise type(error)(f"key-frame {index}: {error}") from error
 
 
 def _deforming_motions(motions: FloatArray, points: FloatArray, faces: IntArray) -> FloatArray:

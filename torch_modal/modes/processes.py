@@ -13,14 +13,12 @@ from pathlib import Path
 from torch_modal.threads import StoppedError
 
 POLL = 0.5
+HINTS = {"signal SIGKILL": "perhaps memory ran out", "signal SIGXCPU": "its processor_time is over"}
+"""Causes of signals that leave no message."""
 
 
 class ChildError(RuntimeError):
-    """A child process was killed after its timeout, or ended with an error; ``code`` is None or the exit status."""
-
-    def __init__(self, reason: str, code: int | None = None) -> None:
-        super().__init__(reason)
-        self.code = code
+    """A child process was killed after its timeout, or ended with an error."""
 
 
 def package_command(function: str) -> list[str]:
@@ -54,8 +52,6 @@ def run_child(
         ChildError: The program ended with an error, or after the timeout.
         StoppedError: ``stop`` was set.
     """
-    if not command[0]:
-        raise ChildError("sys.executable is empty, so that no child process can be started; use a normal interpreter")
     stop, end, code = stop or threading.Event(), time.monotonic() + timeout, None
     with (folder / "log.txt").open("wb") as log:  # a full pipe would block it
         process = subprocess.Popen(
@@ -89,15 +85,7 @@ def run_child(
     if code:
         lines = (folder / "log.txt").read_text(errors="replace").split("\n")
         last = next((line.strip() for line in reversed(lines) if line.strip()), "")  # of a traceback, the error
-        hint = "perhaps memory ran out" if code == -getattr(signal, "SIGKILL", 0) else last
-        raise ChildError(f"its process ended with {_describe_exit(code)}" + (f" ({hint})" if hint else ""), code)
-
-
-def _describe_exit(code: int) -> str:
-    """``exit code 1`` or ``signal SIGSEGV``."""
-    if code >= 0:
-        return f"exit code {code}"
-    try:
-        return f"signal {signal.Signals(-code).name}"
-    except ValueError:
-        return f"signal {-code}"
+        names = {-number: f"signal {number.name}" for number in signal.Signals}
+        status = names.get(code, f"exit code {code}")
+        hint = HINTS.get(status, last)
+        raise ChildError(f"its process ended with {status}" + (f" ({hint})" if hint else ""))

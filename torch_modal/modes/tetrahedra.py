@@ -39,16 +39,7 @@ class Tetrahedra(NamedTuple):
 
 
 class TetrahedralizationError(RuntimeError):
-    """The mesher failed; the message names the mesh, the reason and a remedy.
-
-    Args:
-        message: The message.
-        lasting: The surface is the cause, so that the same call fails again.
-    """
-
-    def __init__(self, message: str, lasting: bool = False) -> None:
-        super().__init__(message)
-        self.lasting = lasting
+    """The mesher failed; the message names the mesh, the reason and a remedy."""
 
 
 class Mesher(Protocol):

@@ -1,6 +1,5 @@
 """fTetWild in a child process: conforming tetrahedra inside a surface."""
 
-import signal
 import sys
 import tempfile
 import threading
@@ -13,8 +12,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.geometry.connectivity import double_areas
+from torch_modal.geometry.decimation import decimate
 from torch_modal.modes.lattice import Lattice
 from torch_modal.modes.processes import ChildError, run_child
 from torch_modal.modes.surface import CanonicalSurface, clearances, self_proximity
@@ -22,8 +21,6 @@ from torch_modal.modes.tetrahedra import Tetrahedra, TetrahedralizationError, or
 from torch_modal.progress import logger
 
 WORKER = Path(__file__).resolve().with_name("_tetwild_worker.py")
-BOX_DIAGONAL = 100.0
-"""Bounding-box diagonal of the surfaces that fTetWild gets."""
 EDGES_PER_THICKNESS = 0.65
 EDGE_RANGE = (0.012, 0.04)
 """Range of default edge lengths: one tetrahedron across a limb is far too stiff, bulky bodies need no finer ones."""
@@ -31,15 +28,8 @@ THIN_PART = 0.05
 """Part of the area with the least thickness, which gives the default edge length."""
 TOUCHING = 0.03
 """Self-proximity above which a lattice fuses so much that modes are too stiff: closed fists have 0.037 and more."""
-
 PATIENCE = 10.0
 """Processor time that ``"auto"`` gives fTetWild, in seconds: fists take 1 to 3, bodies of many parts minutes."""
-MESHER_RAISED = 3
-"""Exit code of the worker if the mesher itself raised an exception."""
-_TIME_IS_OVER = -getattr(signal, "SIGXCPU", 0)
-_OWN_FAILURES = {MESHER_RAISED, _TIME_IS_OVER, *(-getattr(signal, name, 0) for name in ("SIGSEGV", "SIGFPE"))}
-"""Exit codes that the surface causes. Others may not recur: SIGKILL comes from outside, and C++ raises SIGABRT when
-memory or threads run out."""
 
 
 @dataclass(frozen=True)
@@ -97,92 +87,70 @@ class TetWild:
                 ones that do not fill the surface.
             StoppedError: ``stop`` was set, and the child process killed.
         """
-        low, high = surface.points.min(axis=0), surface.points.max(axis=0)
-        center, scale = (low + high) / 2, BOX_DIAGONAL / np.linalg.norm(high - low)
-        points = (surface.points - center) * scale
+        points, faces = surface.points, surface.faces
+        diagonal = float(np.linalg.norm(np.ptp(points, axis=0)))
         edge_length_fac = self.edge_length_fac
         if edge_length_fac is None:
             thickness = surface.thickness
             if self_proximity(surface) <= TOUCHING:  # otherwise, the overlap of two parts is measured
                 thin = clearances(surface)[0]
                 order = np.argsort(thin)
-                areas = double_areas(surface.points, surface.faces)[order].cumsum()
+                areas = double_areas(points, faces)[order].cumsum()
                 thickness = min(thickness, thin[order][np.searchsorted(areas, THIN_PART * areas[-1])])
-            edges = EDGES_PER_THICKNESS * thickness / np.linalg.norm(high - low)
-            edge_length_fac = float(np.clip(edges, *EDGE_RANGE))
-        settings = replace(self, edge_length_fac=edge_length_fac)
+            edge_length_fac = float(np.clip(EDGES_PER_THICKNESS * thickness / diagonal, *EDGE_RANGE))
         try:
-            tetrahedra = without_debris(orient(_run_worker(points, surface.faces, settings, stop)))
-            _check_fills(tetrahedra, points, edge_length_fac, self.epsilon)
-        except TetrahedralizationError as error:
-            mesh = f"a mesh of {len(points)} vertices and {len(surface.faces)} faces"
-            raise TetrahedralizationError(f"cannot fill {mesh} with tetrahedra: {error}", error.lasting) from error
-        return Tetrahedra(tetrahedra.vertices / scale + center, tetrahedra.tets)
+            tetrahedra = without_debris(
+                orient(_run_worker(surface, replace(self, edge_length_fac=edge_length_fac), stop))
+            )
+            # Vertices on the new surface are about one edge length apart, so no point of the old one is further away.
+            _check_fills(tetrahedra, surface, diagonal * (0.05 + 2 * edge_length_fac))
+        except (ChildError, OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
+            raise TetrahedralizationError(
+                f"cannot fill a mesh of {len(points)} vertices and {len(faces)} faces with tetrahedra: {error}. Check "
+                "that the surface is closed, its winding consistent, without self-intersections, and no part thinner "
+                f"than {100 * self.epsilon:g} % of the diagonal; or give a longer timeout or processor_time, a smaller "
+                "epsilon, another edge_length_fac, or a larger max_surface_faces if small parts were lost"
+            ) from error
+        return tetrahedra
 
 
 @dataclass(frozen=True)
 class Auto:
-    """The mesher ``"auto"``: a lattice, but fTetWild where parts of the surface touch, unless it fails or takes long.
-
-    Attributes:
-        tetwild: Settings of fTetWild, which gets 10 seconds of processor time at most.
-    """
-
-    tetwild: TetWild = TetWild()
+    """The mesher ``"auto"``: a lattice, but fTetWild where parts of the surface touch, unless it fails or is slow."""
 
     def key(self) -> dict[str, Any]:
         """The keys of both meshers."""
-        return {**Lattice().key(), **{f"touching_{name}": value for name, value in self.tetwild.key().items()}}
+        return {**Lattice().key(), **{f"touching_{name}": value for name, value in TetWild().key().items()}}
 
     def fill(self, surface: CanonicalSurface, stop: threading.Event) -> Tetrahedra:
         """Fill a surface with tetrahedra."""
         if self_proximity(surface) > TOUCHING:
             try:
-                return replace(self.tetwild, processor_time=PATIENCE).fill(surface, stop)
+                return TetWild(processor_time=PATIENCE).fill(surface, stop)
             except TetrahedralizationError as error:
                 logger.info("a lattice, in which parts that touch are joined: %s", error)
         return Lattice().fill(surface, stop)
 
 
-def _run_worker(points: FloatArray, faces: IntArray, settings: TetWild, stop: threading.Event) -> Tetrahedra:
-    """Run the worker process on a surface with a bounding-box diagonal of 100 and read its result."""
+def _run_worker(surface: CanonicalSurface, settings: TetWild, stop: threading.Event) -> Tetrahedra:
+    """Run the worker process on a surface, decimated, and read its result."""
+    points, faces = surface.points, surface.faces
+    if len(faces) > settings.max_surface_faces:
+        points, faces, _ = decimate(points, faces, settings.max_surface_faces)
     with tempfile.TemporaryDirectory(prefix="torch_modal-", ignore_cleanup_errors=True) as folder:
         job, result = (Path(folder) / name for name in ("job.npz", "result.npz"))
         np.savez(job, vertices=points, faces=faces, **asdict(settings))
         # In the folder, as fTetWild leaves a __tracked_surface.stl where it runs.
-        command = [sys.executable, str(WORKER), str(job), str(result)]
-        try:
-            run_child(command, Path(folder), settings.timeout, stop)
-        except ChildError as error:
-            reason, advice = str(error), "a surface without self-intersections and degenerate faces, or other settings"
-            if error.code is None:
-                advice = "a longer timeout, a larger edge_length_fac, or a surface without self-intersections"
-            elif error.code == _TIME_IS_OVER:
-                reason = f"its processor_time of {settings.processor_time:g} s is over"
-            raise TetrahedralizationError(f"{reason}. Try {advice}", lasting=error.code in _OWN_FAILURES) from error
-        try:
-            with result.open("rb") as file, np.load(file) as arrays:  # np.load leaves damaged files open
-                return Tetrahedra(arrays["vertices"], arrays["tets"])
-        except (OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
-            raise TetrahedralizationError(f"the worker process left no readable result ({error}). Try again") from error
+        run_child([sys.executable, str(WORKER), str(job), str(result)], Path(folder), settings.timeout, stop)
+        with result.open("rb") as file, np.load(file) as arrays:  # np.load leaves damaged files open
+            return Tetrahedra(arrays["vertices"], arrays["tets"])
 
 
-def _check_fills(tetrahedra: Tetrahedra, points: FloatArray, edge_length_fac: float, epsilon: float) -> None:
-    """Reject a mesh that is empty, not finite, or does not cover the surface (bounding-box diagonal 100)."""
-    # Vertices on the new surface are about one edge length apart, so no point of the old one is further away.
-    reach = BOX_DIAGONAL * (0.05 + 2 * edge_length_fac)
-    low, high = points.min(axis=0) - reach, points.max(axis=0) + reach
+def _check_fills(tetrahedra: Tetrahedra, surface: CanonicalSurface, reach: float) -> None:
+    """Reject a mesh that is empty, not finite, or does not cover the surface."""
     if len(tetrahedra.tets) == 0:
-        flaw = "the result is empty"
-    elif not ((tetrahedra.vertices >= low) & (tetrahedra.vertices <= high)).all():
-        flaw = "the result reaches far beyond the surface"
-    elif n_far := int((cKDTree(tetrahedra.vertices).query(points)[0] > reach).sum()):
-        flaw = f"{n_far} of its vertices are further than {reach:g} % of the diagonal from the result"
-    else:
-        return
-    raise TetrahedralizationError(
-        f"{flaw}. Check that the surface is closed, its winding consistent, and no part thinner than "
-        f"{100 * epsilon:g} % of the diagonal; or give a smaller epsilon, or raise max_surface_faces if small parts "
-        "were lost in the decimation",
-        lasting=True,
-    )
+        raise ValueError("the result is empty")
+    if not np.abs(tetrahedra.vertices).max() <= np.abs(surface.points).max() + reach:
+        raise ValueError("the result reaches far beyond the surface")
+    if n_far := int((cKDTree(tetrahedra.vertices).query(surface.points)[0] > reach).sum()):
+        raise ValueError(f"{n_far} of its vertices are far from the result")
