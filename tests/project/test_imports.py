@@ -140,9 +140,9 @@ def test_one_door_leads_to_the_kernels() -> None:
 
 
 def test_one_lock_guards_the_decimation() -> None:
-    """fast-simplification is not thread-safe; the worker is a process of its own."""
+    """fast-simplification is not thread-safe."""
     users = [name for name in MODULES if "fast_simplification" in imported(name)]
-    assert users == ["geometry.decimation", "modes._tetwild_worker"]
+    assert users == ["geometry.decimation"]
 
 
 def printed(code: str) -> list[str]:

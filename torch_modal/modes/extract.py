@@ -14,8 +14,9 @@ import torch
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.errors import MeshError, MeshWarning
 from torch_modal.geometry.bodies import bodies
-from torch_modal.geometry.connectivity import Connectivity, connected_pieces
+from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.inspect import OPEN, open_part
+from torch_modal.geometry.rigid import infinitesimal_motions
 from torch_modal.io.cache import Arrays, Cache
 from torch_modal.keyframes.check import check_keyframes
 from torch_modal.modes.basis import ModalBasis
@@ -51,7 +52,7 @@ def extract_modes(vertices: Any, faces: Any, n_modes: int = 30, **options: Any) 
         vertices: Positions, tensor or array, any units. *Shape:* ``(V, 3)``.
         faces: Vertex indices. *Shape:* ``(F, 3)``.
         n_modes: Number of elastic modes, k.
-        options: Those of :func:`extract_bases`; no bar is shown unless ``progress`` is given.
+        options: Further arguments of :func:`extract_bases`; no bar is shown unless ``progress`` is given.
 
     Returns:
         The basis: float64, on the CPU, without gradient.
@@ -126,10 +127,9 @@ def bases_of_checked(
     progress: Progress = None,
 ) -> list[ModalBasis]:
     """`extract_bases` for the output of :func:`~torch_modal.keyframes.check.check_keyframes`."""
-    if method not in METHODS:
-        raise ValueError(f"the method is {method!r}; give one of {METHODS}")
-    if form not in HESSIAN_FORMS:
-        raise ValueError(f"the Hessian form is {form!r}; give one of {HESSIAN_FORMS}")
+    for what, choice, choices in (("method", method, METHODS), ("Hessian form", form, HESSIAN_FORMS)):
+        if choice not in choices:
+            raise ValueError(f"the {what} is {choice!r}; give one of {choices}")
     if isinstance(mesher, str):
         if mesher not in MESHERS:
             raise ValueError(f"the mesher is {mesher!r}; give a Mesher or one of {tuple(MESHERS)}")
@@ -137,14 +137,14 @@ def bases_of_checked(
     if isinstance(n_modes, bool) or not isinstance(n_modes, (int, np.integer)) or n_modes < 1:
         raise ValueError(f"n_modes is {n_modes!r}; give a whole number of at least 1")
     shapes, triangles = keyframes.detach().cpu().double().numpy(), faces.cpu().numpy()
-    n_used = len(np.unique(triangles))
-    possible = 3 * n_used - N_RIGID
+    mesh = Connectivity(triangles, shapes.shape[1])
+    possible = 3 * len(mesh.used) - N_RIGID
     if n_modes > possible:
         raise ValueError(
-            f"{n_modes} modes requested, but a surface of {n_used} vertices has at most {possible} ways to "
+            f"{n_modes} modes requested, but a surface of {len(mesh.used)} vertices has at most {possible} ways to "
             f"deform; give 1 to {possible}"
         )
-    several = bodies(shapes, Connectivity(triangles, shapes.shape[1]))
+    several = bodies(shapes, mesh)
     if len(several) > 1:
         with contextlib.suppress(MeshError, ModalAnalysisError):  # the whole may have modes, nevertheless
             return _bases_of_bodies(several, torch.from_numpy(shapes), n_modes, method, form, mesher, cache, progress)
@@ -154,21 +154,21 @@ def bases_of_checked(
             with extraction.stage(index, "checks"):
                 extraction.surfaces.append(CanonicalSurface.of(shape, triangles))
         results = extraction.by(method)
-    if loose := [one for one in results if one["n_zero"][0] > N_RIGID]:
+    if n_pieces := [int(result["n_pieces"][0]) for result in results if result["n_zero"][0] > N_RIGID]:
         warnings.warn(
-            f"the shape has {max(int(one['n_pieces'][0]) for one in loose)} loose pieces, or parts hung on an edge or "
-            "a vertex: modes deform each of them, and how they move against each other is left to the interpolation of "
-            "the key-frames; join them if they belong together",
+            f"the shape has {max(n_pieces)} loose pieces, or parts hung on an edge or a vertex: modes deform each, and "
+            "how they move against each other is left to the interpolation of the key-frames; join them if they "
+            "belong together",
             MeshWarning,
             stacklevel=3,
         )
     bases = []
-    for shape, surface, one in zip(shapes, extraction.surfaces, results, strict=True):
+    for shape, surface, result in zip(shapes, extraction.surfaces, results, strict=True):
         # lambda ~ 1 / length², and phi ~ length^(-3/2) since phi' M phi = 1 with a mass ~ length³.
         modes = np.zeros((n_modes, *shape.shape))
-        modes[:, surface.used] = one["modes"] @ surface.axes * surface.scale**1.5
-        eigenvalues, rigid_eigenvalues = (one[name] * surface.scale**2 for name in ("eigenvalues", "rigid_eigenvalues"))
-        bases.append(ModalBasis(*map(torch.from_numpy, (shape.copy(), eigenvalues, modes, rigid_eigenvalues))))
+        modes[:, surface.used] = result["modes"] @ surface.axes * surface.scale**1.5
+        values = [result[name] * surface.scale**2 for name in ("eigenvalues", "rigid_eigenvalues")]
+        bases.append(ModalBasis(*map(torch.from_numpy, (shape.copy(), values[0], modes, values[1]))))
     return bases
 
 
@@ -219,9 +219,9 @@ class _Extraction:
         if method != "auto":
             return self.solids() if method == "solid" else self.shells()
         reason = why_shell(self.surfaces)
+        first, second = (self.shells, self.solids) if reason else (self.solids, self.shells)
         if reason:
             logger.info("modes of the surface itself, not of a solid: %s", reason)
-        first, second = (self.shells, self.solids) if reason else (self.solids, self.shells)
         try:
             return first()
         except ModalAnalysisError as error:
@@ -235,36 +235,32 @@ class _Extraction:
 
     def shells(self) -> list[Arrays]:
         """Modes of all surfaces themselves."""
-        return self._all(
-            lambda index: self._modes_of(index, lambda: sheet_body(self.surfaces[index], self.n_modes)),
-            {},
-            {"form": "shell"},
-            n_coarse_faces(self.n_modes) // 2,
-        )
+
+        def compute(index: int) -> Arrays:
+            return self._modes_of(index, lambda: sheet_body(self.surfaces[index], self.n_modes))
+
+        return self._all(compute, {}, {"form": "shell"}, n_coarse_faces(self.n_modes) // 2)
 
     def solids(self) -> list[Arrays]:
         """Modes of all solids inside.
 
         The key-frame of least self-proximity is meshed, as tetrahedra join parts in contact, and its tetrahedra are
-        carried to the others. Those that they cannot follow are meshed, too.
+        carried to the others. Key-frames that they cannot follow are meshed, too.
         """
         for index, surface in enumerate(self.surfaces):
             with self.stage(index, "checks"):
                 surface.require_solid()
         first = min(range(len(self.surfaces)), key=lambda index: self_proximity(self.surfaces[index]))
-        solid, lock = self._mesh(first), threading.Lock()
+        solid = self._mesh(first)
         make_carrier = functools.cache(lambda: Carrier(solid))
 
         def compute(index: int) -> Arrays:
             if index == first:
                 return self._modes_of(index, lambda: solid.body(self.form))
-            carried = None
+            # A singular system, or modes of tetrahedra that are too distorted.
             with self.stage(index, "carrying tetrahedra"), contextlib.suppress(RuntimeError, np.linalg.LinAlgError):
-                with lock:  # all key-frames share one factorisation
-                    carrier = make_carrier()
-                carried = carrier.carry(self.surfaces[index])
-            if carried is not None:
-                with contextlib.suppress(ModalAnalysisError):  # too distorted
+                carried = make_carrier().carry(self.surfaces[index])
+                if carried is not None:
                     return self._modes_of(index, lambda: carried.body(self.form))
             mesh = self._mesh(index)
             return self._modes_of(index, lambda: mesh.body(self.form))
@@ -345,12 +341,10 @@ def _deforming_motions(motions: FloatArray, points: FloatArray, faces: IntArray)
     """
     if len(motions) == 0:
         return motions
-    piece = connected_pieces(np.concatenate([faces[:, :2], faces[:, 1:]]), len(points))
-    left = motions.copy()
+    left, piece = motions.copy(), Connectivity(faces, len(points)).vertex_pieces
     for members in (np.flatnonzero(piece == index) for index in range(piece.max() + 1)):
-        arms = points[members] - points[members].mean(axis=0)
-        spins = np.cross(np.eye(3)[:, None], arms[None])
-        rigid = np.concatenate([np.broadcast_to(np.eye(3)[:, None], spins.shape), spins]).reshape(2 * 3, -1)
+        arms = torch.from_numpy(points[members] - points[members].mean(axis=0))
+        rigid = infinitesimal_motions(arms).flatten(1).numpy()
         flat = motions[:, members].reshape(len(motions), -1)
         left[:, members] = (flat - flat @ np.linalg.pinv(rigid) @ rigid).reshape(len(motions), -1, 3)
     size = np.linalg.norm(motions)

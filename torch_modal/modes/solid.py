@@ -111,11 +111,5 @@ def _around(points: FloatArray, vertices: FloatArray, piece: IntArray) -> IntArr
     reach = REACH * max(np.linalg.norm(vertices[nearest] - center), np.linalg.norm(np.ptp(points, axis=0)))
     distance = np.linalg.norm(vertices - vertices[nearest], axis=1)
     distance[piece != piece[nearest]] = np.inf
-    near = np.argsort(distance, kind="stable")
-    near = near[: max(int((distance <= reach).sum()), min(N_NEIGHBOURS, int(np.isfinite(distance).sum())))]
-    # Farthest-point sampling.
-    chosen, to_found = [0], distance[near]
-    while len(chosen) < N_NEIGHBOURS:
-        chosen.append(int(to_found.argmax()))
-        to_found = np.minimum(to_found, np.linalg.norm(vertices[near] - vertices[near[chosen[-1]]], axis=1))
-    return near[chosen]
+    n_near = max(int((distance <= reach).sum()), min(N_NEIGHBOURS, int(np.isfinite(distance).sum())))
+    return np.argsort(distance, kind="stable")[np.linspace(0, n_near - 1, N_NEIGHBOURS).astype(np.int64)]
