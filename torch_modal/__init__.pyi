@@ -50,8 +50,8 @@ from .io.formats import Animation as Animation
 from .io.frames import save_frames as save_frames
 from .io.frames import save_mesh as save_mesh
 from .io.read import open_asset as open_asset
-from .keyframes.arrays import weld_seams as weld_seams
 from .keyframes.check import check_keyframes as check_keyframes
+from .keyframes.seams import weld_seams as weld_seams
 from .layers.blend import Blend as Blend
 from .layers.in_between import InBetween as InBetween
 from .layers.mid_shape import MidShape as MidShape

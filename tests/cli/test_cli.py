@@ -228,7 +228,7 @@ def test_warnings_are_lines_and_each_is_shown_once(
     assert cli.main(["subdivide", *map(str, files), "--out", str(tmp_path / "a.glb"), *FAST]) == 0
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 1
-    assert lines[0].startswith("torch-modal: warning: the surface is open: 3 edges")
+    assert lines[0].startswith("torch-modal: warning: 3 edges belong to one face only: the surface is open")
 
 
 def test_wrong_usage(meshes: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

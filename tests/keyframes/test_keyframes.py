@@ -340,18 +340,17 @@ BEYOND += [(TWO[:1] - 0.5) * 2 * 1.5e308]  # whose extent overflows
             (TWO, CUBE_FACES.astype(t), r"faces have dtype torch\.\w+; .* convert with \.long")
             for t in ("f8", "?", "c16")
         ),
-        (TWO, np.array([[0, 1, 2**64 - 1]], dtype=np.uint64), "must fit into int64"),
-        ([CUBE, CUBE.astype(np.float32)], CUBE_FACES, "key-frame 1 has dtype torch.float32, .* 0 has torch.float64"),
+        (TWO, np.array([[0, 1, 2**64 - 1]], dtype=np.uint64), "faces use vertices that do not exist"),
+        ([CUBE, CUBE.astype(np.float32)], CUBE_FACES, "key-frame 1 has .*torch.float32, .* 0 has .*torch.float64"),
         # shapes
-        ([CUBE, CUBE[:7]], CUBE_FACES, r"key-frame 1 has shape \(7, 3\), key-frame 0 has \(8, 3\)"),
+        ([CUBE, CUBE[:7]], CUBE_FACES, r"key-frame 1 has shape \(7, 3\), .* key-frame 0 has shape \(8, 3\), "),
         ([], CUBE_FACES, "keyframes is empty"),
-        (CUBE, CUBE_FACES, r"shape \(8, 3\), which is one shape; pass keyframes\[None\]"),
+        (CUBE, CUBE_FACES, r"shape \(8, 3\); .* pass keyframes\[None\]"),
         *((bad, CUBE_FACES, r"keyframes have shape .*; \(K, V, 3\) is needed") for bad in BAD_SHAPES),
         *((TWO, bad, r"faces have shape .*; \(F, 3\) is needed") for bad in (CUBE_FACES[:, :2], CUBE_FACES[None])),
-        (TWO, np.zeros((6, 4), dtype=int), r"\(6, 4\), which is quads .* along one diagonal"),
-        (np.zeros((2, 0, 3)), CUBE_FACES, "there are no vertices"),
-        (TWO, [], "there are no faces"),
-        (TWO, np.zeros((0, 3), dtype=int), "there are no faces"),
+        (TWO, np.zeros((6, 4), dtype=int), r"\(6, 4\); .* along one diagonal"),
+        (np.zeros((2, 0, 3)), CUBE_FACES, "12 faces use vertices .* with 0 vertices"),
+        *((TWO, none, "triangles, at least one") for none in ([], np.zeros((0, 3), dtype=int))),
         # values
         *(
             (
@@ -368,13 +367,17 @@ BEYOND += [(TWO[:1] - 0.5) * 2 * 1.5e308]  # whose extent overflows
         (TWO, CUBE_FACES + 1, "indices count from 0, not from 1"),
         (TWO, [[0, 0, 1], [1, 2, 2]], "all faces use a vertex twice"),
         # sizes
-        (POINT, CUBE_FACES, "key-frame 1 has zero size"),
-        (0 * TWO, CUBE_FACES, "key-frame 0 has zero size"),
-        ((TWO + 4e6).astype(np.float32), CUBE_FACES, "key-frame 0 has zero size: .* torch.float32 cannot resolve"),
-        (TWO + 4e12, CUBE_FACES, "key-frame 0 has zero size: .* torch.float64 cannot resolve"),
+        (POINT, CUBE_FACES, "key-frame 1 .* cannot compute with"),
+        (0 * TWO, CUBE_FACES, "key-frame 0 has a bounding-box diagonal of 0 "),
+        ((TWO + 4e6).astype(np.float32), CUBE_FACES, "key-frame 0 .* torch.float32 cannot compute with"),
+        (TWO + 4e12, CUBE_FACES, "key-frame 0 .* torch.float64 cannot compute with"),
         # a vertex of no face gives no size
-        (np.concatenate([POINT, TWO[:, :1] + 1], axis=1), CUBE_FACES, "key-frame 1 has zero size"),
-        *((x, CUBE_FACES, "cannot compute with; choose another unit") for x in BEYOND),
+        (
+            np.concatenate([POINT, TWO[:, :1] + 1], axis=1),
+            CUBE_FACES,
+            "key-frame 1 .* cannot compute with",
+        ),
+        *((x, CUBE_FACES, "cannot compute with: choose another unit") for x in BEYOND),
         (
             np.stack([10 * CUBE, CUBE, 101 * CUBE]),
             CUBE_FACES,
@@ -447,8 +450,8 @@ SEAM = np.concatenate([CUBE, CUBE[[1, 7, 3]]])[None], changed(CUBE_FACES, (-1, [
             [r"1 edges join three or more faces.*not bending.*the first is edge \[0, 1\]", ""],
             None,
         ),
-        (TWO, CUBE_FACES[:-1], ["open: 3 edges belong to one face only"], None),
-        (*SEAM, ["open: 6 edges .* 6 of its vertices lie exactly .*weld_seams joins them"], None),
+        (TWO, CUBE_FACES[:-1], ["3 edges belong to one face only: the surface is open"], None),
+        (*SEAM, ["6 edges .* open; .* 6 of its vertices lie exactly .*weld_seams joins them"], None),
         (
             np.concatenate([TWO, np.full((2, 2, 3), 1e300)], axis=1),
             CUBE_FACES,
@@ -472,7 +475,7 @@ SEAM = np.concatenate([CUBE, CUBE[[1, 7, 3]]])[None], changed(CUBE_FACES, (-1, [
         (
             np.concatenate([TWO, TWO[:1] + 4096]).astype(np.float32),
             CUBE_FACES,
-            ["^1 key-frames lie so far .* torch.float32 rounds .* key-frame 2 .* float64"],
+            ["^1 key-frames lie so far .* torch.float32 rounds .* float64, .* key-frame 2 "],
             None,
         ),
         # a mirror image of an open surface is not seen
@@ -481,7 +484,7 @@ SEAM = np.concatenate([CUBE, CUBE[[1, 7, 3]]])[None], changed(CUBE_FACES, (-1, [
         (
             np.concatenate([TWO, TWO]),
             np.concatenate([CUBE_FACES[:-3], [[2, 2, 1], [3, 3, 1]], CUBE_FACES[:2]]),
-            ["^2 ", "^2 ", "^the "],
+            ["^2 ", "^2 ", "open"],
             CUBE_FACES[:-3],
         ),
         # both silent
@@ -596,7 +599,7 @@ def test_flat_surface_is_refused_only_where_a_solid_is_needed():
         ("mh-hand", 5, 1597, None),
         ("mh-hand-path", 9, 1597, None),
         ("mh-woman", 3, 13380, None),
-        ("ict-face", 4, 6706, "the surface is open: 296 edges"),
+        ("ict-face", 4, 6706, "296 edges belong to one face only: the surface is open"),
     ],
 )
 def test_real_data(data_dir, name, n_files, n_vertices, warning):

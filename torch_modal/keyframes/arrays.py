@@ -1,6 +1,6 @@
-"""Positions and faces from tensors, NumPy arrays and sequences; vertices welded along seams."""
+"""Positions and faces from tensors, NumPy arrays and sequences; checks of tensors."""
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -9,7 +9,6 @@ from torch import Tensor
 from torch_modal.arrays import IntArray
 from torch_modal.autograd import broadcast_shapes
 from torch_modal.errors import MeshError
-from torch_modal.geometry.connectivity import merge_seams
 
 UNITS = 8.0
 """Points that extend over more or less than known ones by this factor are in other units."""
@@ -21,14 +20,10 @@ def as_positions(keyframes: Any) -> Tensor:
         if not keyframes:
             raise MeshError("keyframes is empty; it needs the shape (K, V, 3)")
         shapes = [_as_tensor("keyframes", shape) for shape in keyframes]
-        for i, shape in enumerate(shapes):
-            for what, mine, its in (
-                ("shape", tuple(shapes[0].shape), tuple(shape.shape)),
-                ("dtype", shapes[0].dtype, shape.dtype),
-                ("device", shapes[0].device, shape.device),
-            ):
-                if mine != its:
-                    raise MeshError(f"key-frame {i} has {what} {its}, key-frame 0 has {mine}; they must be equal")
+        for i, x in enumerate(shapes):
+            kind, first = (f"shape {tuple(shape.shape)}, {shape.dtype}, on {shape.device}" for shape in (x, shapes[0]))
+            if kind != first:
+                raise MeshError(f"key-frame {i} has {kind}, key-frame 0 has {first}; they must be equal")
         positions = torch.stack(shapes)
     else:
         positions = _as_tensor("keyframes", keyframes)
@@ -48,10 +43,7 @@ def as_faces(faces: Any) -> IntArray:
         raise MeshError(
             f"faces have dtype {tensor.dtype}; they are vertex indices and must be integers: convert with .long()"
         )
-    array = tensor.detach().cpu().numpy()
-    if array.dtype == np.uint64 and array.size and array.max() > np.iinfo(np.int64).max:
-        raise MeshError(f"faces hold the index {array.max()}; vertex indices must fit into int64")
-    return array.astype(np.int64)
+    return tensor.detach().cpu().numpy().astype(np.int64)
 
 
 def _as_tensor(name: str, value: Any) -> Tensor:
@@ -125,67 +117,6 @@ def broadcast_leading(hint: str = "", **leading: torch.Size) -> torch.Size:
     except RuntimeError:
         got = ", ".join(f"{name} {tuple(shape)}" for name, shape in leading.items())
         raise ValueError(f"leading dimensions do not broadcast: {got}{hint and '; '}{hint}") from None
-
-
-class WeldedKeyframes(NamedTuple):
-    """Key-frames without duplicate vertices along seams."""
-
-    keyframes: Tensor
-    """*Shape:* ``(K, W, 3)``."""
-    faces: Tensor
-    """Indices of the W vertices, int64. *Shape:* ``(F, 3)``."""
-    vertex_of: Tensor
-    """Welded vertex of each of the V vertices. *Shape:* ``(V,)``."""
-
-    @property
-    def n_merged(self) -> int:
-        """Number of removed vertices."""
-        return len(self.vertex_of) - self.keyframes.shape[1]
-
-    def scatter(self, shapes: Tensor) -> Tensor:
-        """Positions of all V vertices; duplicates coincide exactly.
-
-        *Shape:* ``(..., W, 3) -> (..., V, 3)``.
-        """
-        return shapes.index_select(-2, self.vertex_of.to(shapes.device))
-
-
-def weld_seams(keyframes: Any, faces: Any) -> WeldedKeyframes:
-    """Join the vertices that exporters split along seams of texture coordinates and normals.
-
-    Otherwise the surface would tear there. Boundary vertices that coincide in all key-frames become one, with the
-    position of the first. Faces that become degenerate are removed.
-
-    Args:
-        keyframes: Vertex positions, as for :func:`torch_modal.check_keyframes`. *Shape:* ``(K, V, 3)``.
-        faces: Vertex indices. *Shape:* ``(F, 3)``.
-
-    Returns:
-        The welded key-frames; unchanged if nothing was split.
-
-    Raises:
-        MeshError: The arguments are not numeric arrays.
-    """
-    positions = as_positions(keyframes)
-    indices = as_faces(faces)
-    n = positions.shape[1] if positions.dim() == 3 else 0
-    fits = positions.dim() == 3 and indices.ndim == 2 and indices.shape[1:] == (3,) and len(indices)
-    # `check_keyframes` reports errors of the mesh.
-    if fits and indices.min() >= 0 and indices.max() < n and bool(torch.isfinite(positions).all()):
-        vertex_of = merge_seams(positions.detach().cpu().double().numpy(), indices)
-    else:
-        vertex_of = np.arange(n)
-    welded = vertex_of.max(initial=-1) + 1
-    if welded == n:
-        return WeldedKeyframes(positions, torch.from_numpy(indices), torch.arange(n))
-    first = torch.from_numpy(np.unique(vertex_of, return_index=True)[1]).to(positions.device)
-    joined = vertex_of[indices]
-    whole = (joined != np.roll(joined, 1, axis=1)).all(axis=1)
-    return WeldedKeyframes(
-        positions.index_select(1, first),
-        torch.from_numpy(joined[whole]).to(positions.device),
-        torch.from_numpy(vertex_of).to(positions.device),
-    )
 
 
 def require_units(name: str, points: Tensor, of: str, known: Tensor, unit: float = 1.0) -> None:

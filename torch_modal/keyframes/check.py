@@ -71,16 +71,14 @@ def check_surface(
 ) -> tuple[torch.Tensor, Connectivity]:
     """`check_keyframes` that returns the connectivity instead of the faces, and appends flaws to a list, if given."""
     positions, shapes, indices = check_arrays(keyframes, faces, min_keyframes)
-    notes: list[str] = [] if flaws is None else flaws
-    mesh, orientable = _repair(indices, shapes.shape[1], notes.append)
-    scaled = _check_sizes(shapes, mesh, positions.dtype, notes.append)
+    mesh, orientable, repairs = _repair(indices, shapes.shape[1])
+    scaled, far = _check_sizes(shapes, mesh, positions.dtype)
     if orientable and not (mesh.counts % 2).any():
         _refuse_mirrored(scaled, mesh.faces)
     if flaws is not None:
-        same = np.flatnonzero((shapes[1:] == shapes[:-1]).all(axis=(1, 2))) + 1
-        if len(same):
-            flaws.append(f"{len(same)} key-frames are equal to the one before; the first is key-frame {same[0]}")
-        _note_flaws(scaled, mesh, _RESOLUTION[positions.dtype], notes.append)
+        same = np.argwhere((shapes[1:] == shapes[:-1]).all(axis=(1, 2))) + 1
+        equal = _count(same, "key-frames are equal to the one before", lambda k: f"key-frame {k}")
+        flaws.extend(filter(None, [*repairs, far, equal, *_flaws(scaled, mesh, _RESOLUTION[positions.dtype])]))
     return positions, mesh
 
 
@@ -92,105 +90,91 @@ def check_arrays(keyframes: Any, faces: Any, min_keyframes: int = 1) -> tuple[to
     """
     positions, indices = as_positions(keyframes), as_faces(faces)
     shape = tuple(positions.shape)
-    if len(shape) == 2 and shape[1] == 3:
-        raise MeshError(f"keyframes have shape {shape}, which is one shape; pass keyframes[None] for (K, V, 3)")
     if len(shape) != 3 or shape[2] != 3:
-        raise MeshError(f"keyframes have shape {shape}; (K, V, 3) is needed: key-frames, vertices, coordinates")
+        raise MeshError(
+            f"keyframes have shape {shape}; (K, V, 3) is needed: key-frames, vertices, coordinates; of a single shape, "
+            "pass keyframes[None]"
+        )
     if shape[0] < max(min_keyframes, 1):
         raise MeshError(f"{shape[0]} key-frame(s) arrived, at least {max(min_keyframes, 1)} are needed")
-    if shape[1] == 0:
-        raise MeshError(f"keyframes have shape {shape}: there are no vertices")
-    if indices.ndim == 2 and indices.shape[1] == 4:
+    if indices.ndim != 2 or indices.shape[1] != 3 or not len(indices):
         raise MeshError(
-            f"faces have shape {indices.shape}, which is quads (or tetrahedra); triangles (F, 3) are needed: "
-            "cut each quad along one diagonal, the same for all key-frames"
+            f"faces have shape {indices.shape}; (F, 3) is needed: triangles, at least one, the same for all "
+            "key-frames; cut quads along one diagonal, the same in all"
         )
-    if indices.size == 0:
-        raise MeshError(f"faces have shape {indices.shape}: there are no faces; key-frames are surfaces of triangles")
-    if indices.ndim != 2 or indices.shape[1] != 3:
-        raise MeshError(f"faces have shape {indices.shape}; (F, 3) is needed, one for all key-frames")
     shapes = positions.detach().cpu().double().resolve_neg().numpy()
-    finite = np.isfinite(shapes)
-    if not finite.all():
-        bad = ~finite.all(axis=2)
-        k, v = np.argwhere(bad)[0]
-        raise MeshError(
-            f"{bad.sum()} vertices have NaN or infinite positions; the first is vertex {v} of key-frame {k}: "
-            f"{shapes[k, v].tolist()}"
-        )
-    if indices.min() < 0 or indices.max() >= shape[1]:
-        wrong = ((indices < 0) | (indices >= shape[1])).any(axis=1)
-        face = int(np.flatnonzero(wrong)[0])
-        hint = "; indices count from 0, not from 1" if indices.min() == 1 and indices.max() == shape[1] else ""
-        raise MeshError(
-            f"{wrong.sum()} faces use vertices that do not exist; the first is face {face}, vertices "
-            f"{indices[face].tolist()}, with {shape[1]} vertices{hint}"
-        )
+    missing = ((indices < 0) | (indices >= shape[1])).any(axis=1)
+    from_one = "; indices count from 0, not from 1" if indices.min() == 1 and indices.max() == shape[1] else ""
+    for message in (
+        _count(
+            np.argwhere(~np.isfinite(shapes).all(axis=2)),
+            "vertices have NaN or infinite positions",
+            lambda k, v: f"vertex {v} of key-frame {k}: {shapes[k, v].tolist()}",
+        ),
+        _count(
+            np.argwhere(missing),
+            "faces use vertices that do not exist",
+            lambda f: f"face {f}, vertices {indices[f].tolist()}, with {shape[1]} vertices{from_one}",
+        ),
+    ):
+        if message:
+            raise MeshError(message)
     return positions, shapes, indices
 
 
-def _repair(faces: IntArray, n_vertices: int, note: Callable[[str], None]) -> tuple[Connectivity, bool]:
-    """Drop degenerate and repeated faces, orient the others; return the mesh and its orientability."""
-    kept = np.arange(len(faces))
+def _count(places: IntArray, what: str, name: Callable[..., str]) -> str:
+    """Message on the number of places with a flaw and on the first; empty if there are none. *Shape:* ``(n, i)``."""
+    return f"{len(places)} {what}; the first is {name(*places[0])}" if len(places) else ""
+
+
+def _repair(faces: IntArray, n_vertices: int) -> tuple[Connectivity, bool, list[str]]:
+    """Drop degenerate and repeated faces, orient the others; return the mesh, its orientability, and messages."""
+    kept, messages = np.arange(len(faces)), []
+
+    def name(i: int) -> str:
+        return f"face {kept[i]}, {faces[kept[i]].tolist()}"
+
     for flaw, what in (
         (inspect.degenerate_faces, "use a vertex twice"),
         (inspect.repeated_faces, "have the same vertices as an earlier face"),
     ):
         bad = flaw(faces[kept])
-        if bad.any():
-            first = kept[bad][0]
-            note(f"{bad.sum()} faces {what} and were dropped; the first is face {first}, {faces[first].tolist()}")
-            kept = kept[~bad]
-        if len(kept) == 0:
-            raise MeshError("all faces use a vertex twice, so none is a triangle")
+        messages.append(_count(np.argwhere(bad), f"faces {what} and were dropped", name))
+        kept = kept[~bad]
+    if len(kept) == 0:
+        raise MeshError("all faces use a vertex twice, so none is a triangle")
     mesh = Connectivity(faces[kept], n_vertices)
     wound, flipped, non_orientable = inspect.consistent_winding(mesh)
-    if len(flipped):
-        first = kept[flipped[0]]
-        note(
-            f"{len(flipped)} faces wind against their neighbours and were turned over; the first is "
-            f"face {first}, {faces[first].tolist()}"
-        )
-    if len(non_orientable):
-        first = kept[non_orientable[0]]
-        note(
-            f"{len(non_orientable)} faces belong to a surface that has no consistent winding (like a "
-            "Moebius strip) and were left as they are, so some dihedral angles have the wrong sign and the "
-            f"volume means nothing; the first is face {first}, {faces[first].tolist()}"
-        )
-    if len(flipped):
-        mesh = Connectivity(wound, n_vertices)
-    return mesh, not len(non_orientable)
+    messages += [
+        _count(flipped[:, None], "faces wind against their neighbours and were turned over", name),
+        _count(
+            non_orientable[:, None],
+            "faces belong to a surface that has no consistent winding (like a Moebius strip) and were left as they "
+            "are, so some dihedral angles have the wrong sign and the volume means nothing",
+            name,
+        ),
+    ]
+    return Connectivity(wound, n_vertices) if len(flipped) else mesh, not len(non_orientable), messages
 
 
-def _check_sizes(shapes: FloatArray, mesh: Connectivity, dtype: torch.dtype, note: Callable[[str], None]) -> FloatArray:
-    """Reject unusable sizes; return centred shapes with a diagonal of 1."""
+def _check_sizes(shapes: FloatArray, mesh: Connectivity, dtype: torch.dtype) -> tuple[FloatArray, str]:
+    """Reject unusable sizes; return centred shapes with a diagonal of 1, and a message on shapes that are far away."""
     surface = shapes[:, mesh.used]
     with np.errstate(over="ignore", invalid="ignore"):
         diagonals = inspect.diagonals(surface)
+    largest = np.abs(surface).max(axis=(1, 2))
     low, high = _DIAGONAL_RANGE[dtype]
-    far = []
     for k, diagonal in enumerate(diagonals):
-        largest = np.abs(surface[k]).max()
-        if torch.finfo(dtype).eps * largest > _COARSE_ROUNDING * diagonal:
-            far.append((k, largest, diagonal))
-        if diagonal <= _RESOLUTION[dtype] * largest:
+        if not max(low, _RESOLUTION[dtype] * largest[k]) < diagonal < high:
             raise MeshError(
-                f"key-frame {k} has zero size: its bounding-box diagonal is {diagonal:.3g} at coordinates up "
-                f"to {largest:.3g}, which {dtype} cannot resolve; move it to the origin or check its export"
+                f"key-frame {k} has a bounding-box diagonal of {diagonal:.3g} at coordinates up to {largest[k]:.3g}, "
+                f"which {dtype} cannot compute with: choose another unit, move it to the origin, or check its export"
             )
-        if not low < diagonal < high:
-            raise MeshError(
-                f"key-frame {k} has a bounding-box diagonal of {diagonal:.3g}, which {dtype} cannot compute "
-                "with; choose another unit"
-            )
-    if far:
-        k, largest, diagonal = far[0]
-        note(
-            f"{len(far)} key-frames lie so far from the origin that {dtype} rounds their shape visibly; the "
-            f"first is key-frame {k} with coordinates up to {largest:.3g} and a diagonal of {diagonal:.3g}: "
-            "use float64, or move it to the origin"
-        )
+    far = _count(
+        np.argwhere(torch.finfo(dtype).eps * largest > _COARSE_ROUNDING * diagonals),
+        f"key-frames lie so far from the origin that {dtype} rounds their shape visibly: use float64, or move them",
+        lambda k: f"key-frame {k} with coordinates up to {largest[k]:.3g} and a diagonal of {diagonals[k]:.3g}",
+    )
     small, large = int(diagonals.argmin()), int(diagonals.argmax())
     if diagonals[large] > _LARGEST_SIZE_RATIO * diagonals[small]:
         raise MeshError(
@@ -199,7 +183,7 @@ def _check_sizes(shapes: FloatArray, mesh: Connectivity, dtype: torch.dtype, not
             "probably in different units, so scale one of them"
         )
     with np.errstate(over="ignore"):  # unreferenced vertices, which are not used below
-        return (shapes - surface.mean(axis=1, keepdims=True)) / diagonals[:, None, None]
+        return (shapes - surface.mean(axis=1, keepdims=True)) / diagonals[:, None, None], far
 
 
 def _refuse_mirrored(scaled: FloatArray, faces: IntArray) -> None:
@@ -218,43 +202,38 @@ def _refuse_mirrored(scaled: FloatArray, faces: IntArray) -> None:
             )
 
 
-def _note_flaws(scaled: FloatArray, mesh: Connectivity, resolution: float, note: Callable[[str], None]) -> None:
-    """Report flaws that the solver tolerates."""
-    faces, edges, counts = mesh.faces, mesh.edges, mesh.counts
+def _flaws(scaled: FloatArray, mesh: Connectivity, resolution: float) -> list[str]:
+    """Messages on flaws that the solver tolerates, empty for those that the shapes do not have."""
+    edges, boundary = mesh.edges, mesh.boundary_edges
     along = scaled[:, edges[:, 0]] - scaled[:, edges[:, 1]]
-    vanishing = np.einsum("kei,kei->ke", along, along) <= resolution**2
-    if vanishing.any():
-        k, e = np.argwhere(vanishing)[0]
-        note(
-            f"{vanishing.sum()} edges have no length, their two vertices coincide; the first is edge "
-            f"{edges[e].tolist()} in key-frame {k}"
-        )
-    flat = np.stack([inspect.flat_faces(shape, faces, resolution) for shape in scaled])
-    if flat.any():
-        k, f = np.argwhere(flat)[0]
-        note(
-            f"{flat.sum()} faces have no area in some key-frame, so their dihedral angles are noise; the "
-            f"first is face {faces[f].tolist()} in key-frame {k}"
-        )
-    overfull = edges[counts > 2]
-    if len(overfull):
-        note(
-            f"{len(overfull)} edges join three or more faces (non-manifold): they resist stretching but not "
-            f"bending; the first is edge {overfull[0].tolist()}"
-        )
-    loose = np.setdiff1d(np.arange(mesh.n_vertices), mesh.used)
-    if len(loose):
-        note(
-            f"{len(loose)} vertices belong to no face: they follow the interpolation of the key-frames; the "
-            f"first is vertex {loose[0]}"
-        )
-    boundary = mesh.boundary_edges
-    if len(boundary):
-        # Rendering formats create coincident vertices at texture seams.
-        copies = np.unique(scaled[0][np.unique(boundary)], axis=0, return_counts=True)[1]
-        split = int(copies[copies > 1].sum())
-        seam = f"; {split} of its vertices lie exactly on each other, perhaps a seam: torch_modal.weld_seams joins them"
-        note(
-            f"the surface is open: {len(boundary)} edges belong to one face only, the first is edge "
-            f"{boundary[0].tolist()}{seam if split else ''}"
-        )
+    # Rendering formats create coincident vertices at texture seams.
+    copies = np.unique(scaled[0][np.unique(boundary)], axis=0, return_counts=True)[1]
+    split = int(copies[copies > 1].sum())
+    seam = f"; {split} of its vertices lie exactly on each other, perhaps a seam: torch_modal.weld_seams joins them"
+    return [
+        _count(
+            np.argwhere(np.einsum("kei,kei->ke", along, along) <= resolution**2),
+            "edges have no length, their two vertices coincide",
+            lambda k, e: f"edge {edges[e].tolist()} in key-frame {k}",
+        ),
+        _count(
+            np.argwhere([inspect.flat_faces(shape, mesh.faces, resolution) for shape in scaled]),
+            "faces have no area in some key-frame, so their dihedral angles are noise",
+            lambda k, f: f"face {mesh.faces[f].tolist()} in key-frame {k}",
+        ),
+        _count(
+            np.argwhere(mesh.counts > 2),
+            "edges join three or more faces (non-manifold): they resist stretching but not bending",
+            lambda e: f"edge {edges[e].tolist()}",
+        ),
+        _count(
+            np.setdiff1d(np.arange(mesh.n_vertices), mesh.used)[:, None],
+            "vertices belong to no face: they follow the interpolation of the key-frames",
+            lambda v: f"vertex {v}",
+        ),
+        _count(
+            np.argwhere(mesh.counts == 1),
+            "edges belong to one face only: the surface is open",
+            lambda e: f"edge {edges[e].tolist()}{seam if split else ''}",
+        ),
+    ]

@@ -12,8 +12,8 @@ from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.errors import MeshError
 from torch_modal.geometry.rigid import best_fit
 from torch_modal.io.cache import Cache
-from torch_modal.keyframes.arrays import weld_seams
 from torch_modal.keyframes.check import check_keyframes
+from torch_modal.keyframes.seams import weld_seams
 from torch_modal.progress import Progress, ProgressReport
 from torch_modal.registration.fit import COARSE_STAGES, FINE_STAGES, TemplateFit, sliding_freedom
 from torch_modal.registration.landmarks import landmark_table
