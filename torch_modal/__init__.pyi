@@ -47,9 +47,9 @@ from .inbetween.settings import Objective as Objective
 from .inbetween.settings import Solver as Solver
 from .io.asset import Asset as Asset
 from .io.formats import Animation as Animation
-from .io.frames import save_frames as save_frames
-from .io.frames import save_mesh as save_mesh
 from .io.read import open_asset as open_asset
+from .io.write import save_frames as save_frames
+from .io.write import save_mesh as save_mesh
 from .keyframes.check import check_keyframes as check_keyframes
 from .keyframes.seams import weld_seams as weld_seams
 from .layers.blend import Blend as Blend

@@ -15,10 +15,8 @@ import torch
 from conftest import listen_to_ctrl_c
 
 import torch_modal as tm
-from torch_modal.cli import demo
 from torch_modal.cli import main as cli
-from torch_modal.data.samples import load_sample
-from torch_modal.io.frames import save_frames
+from torch_modal.io.write import save_frames
 from torch_modal.modes import lattice as lattice_module
 from torch_modal.modes.extract import MESHERS
 from torch_modal.modes.tetrahedra import TetrahedralizationError
@@ -127,8 +125,8 @@ def test_options_arrive(
 
     monkeypatch.setattr(tm, "subdivide", subdivide)
     argv = ["subdivide", *meshes, "--out", str(tmp_path / "a.glb"), "--modes", "6", "--levels", "0"]
-    assert cli.main([*argv, "--preset", "paper", "--mu", "0.5", "--regions", "4", "--quiet"]) == 0
-    assert (seen["preset"], seen["mu"], seen["regions"]) == ("paper", 0.5, 4)
+    assert cli.main([*argv, "--preset", "paper", "--no-smooth", "--proxy", "0", "--quiet"]) == 0
+    assert (seen["preset"], seen["smooth"], seen["proxy"]) == ("paper", False, 0)
     assert seen["bases"].keywords["n_modes"] == 6  # type: ignore[attr-defined]
     assert capsys.readouterr() == ("", "")
 
@@ -147,7 +145,7 @@ def test_nothing_is_overwritten_and_no_work_is_done_for_it(
         (picture, ["--out", str(tmp_path / "other.glb"), "--picture", str(picture)]),
     ):
         existing.write_text("mine")
-        assert "exists; --overwrite replaces it" in fails(capsys, *base, *argv)
+        assert "exists; pass overwrite=True (--overwrite)" in fails(capsys, *base, *argv)
         assert existing.read_text() == "mine"
         existing.unlink()
     bases = tmp_path / "key-000.safetensors"
@@ -239,11 +237,10 @@ def test_wrong_usage(meshes: list[str], tmp_path: Path, capsys: pytest.CaptureFi
     for name in ("a.obj", "a.xyz", "a.GLTF", "a.mp5"):  # not a folder of that name
         assert ".glb, .mp4" in misused(capsys, "subdivide", *meshes, "--out", name)
     for option in ("--ping-pong", "--ease"):
-        assert "begin and end" in misused(capsys, "subdivide", *meshes, *out, "--cyclic", option)
+        assert "begin and end" in fails(capsys, "subdivide", *meshes, *out, "--cyclic", option)
     assert "must end in .png or .pdf" in misused(capsys, "subdivide", *meshes, *out, "--picture", "a.jpg")
     assert "one file, but there are 2" in misused(capsys, "modes", *meshes, "--out", "a.safetensors")
     assert "the same file name" in misused(capsys, "modes", meshes[0], meshes[0], "--out", "a")
-    assert "is a folder here" in misused(capsys, "demo", "--out", "a.glb")
     for option, value in (
         ("--levels", "-1"),
         ("--levels", "1.5"),
@@ -309,50 +306,30 @@ def test_help_has_an_example_that_the_parser_accepts(command: str, capsys: pytes
     assert "None" not in text
 
 
-def test_modes_writes_bases_and_prints_a_table(
-    meshes: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_modes_writes_bases(meshes: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["modes", *meshes, "--out", str(tmp_path / "bases"), "--modes", "6"]) == 0
     bases = [tm.ModalBasis.load(tmp_path / "bases" / f"key-00{i}.safetensors") for i in range(2)]
     keyframes = tm.load_keyframes(meshes).keyframes
     for basis, shape in zip(bases, keyframes, strict=True):
         assert torch.equal(basis.reference, shape)
         assert basis.n_modes == 6
-    lines = capsys.readouterr().out.splitlines()
-    assert lines[1].split()[0] == "key-000.obj"
-    np.testing.assert_allclose([float(x) for x in lines[1].split()[1:]], bases[0].eigenvalues, rtol=6e-3)
-    ratios = (bases[0].eigenvalues / bases[0].eigenvalues[0]).sqrt()
-    np.testing.assert_allclose([float(x) for x in lines[2].split()[3:]], ratios, atol=6e-4)
+    assert capsys.readouterr().out.endswith("key-000.safetensors to key-001.safetensors\n")
     assert cli.main(["modes", meshes[0], "--out", str(tmp_path / "one.safetensors"), "--modes", "6", "--quiet"]) == 0
     assert tm.ModalBasis.load(tmp_path / "one.safetensors").n_modes == 6
 
 
 def test_demo_on_the_hand(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """What README promises, with room for a mesher that is not deterministic."""
     out = tmp_path / "demo"
     assert cli.main(["demo", "--sample", "hand", "--levels", "2", "--out", str(out)]) == 0
     assert sorted(file.name for file in out.iterdir()) == ["hand.glb", "hand.png"]
     assert not gltf_validator.issues(out / "hand.glb")
-    lines = capsys.readouterr().out.splitlines()
-    assert lines[-1] == f"written to {out}: hand.glb, hand.png"
-    linear, ours = (next(line.split() for line in lines if line.startswith(f"hand, {m}")) for m in ("linear", "torch"))
-    assert float(linear[2]) == pytest.approx(10.2, abs=0.1) and float(linear[-1]) == pytest.approx(0.866, abs=2e-3)
-    assert float(ours[2]) < 2.5 and abs(float(ours[-1]) - 1) < 0.03
-
-
-def test_demo_compares_with_the_truth_at_its_times() -> None:
-    """The truth itself has no error where a frame falls on its time, and times between frames are left out."""
-    sample = load_sample("hand")
-    sequence = torch.stack([sample.keyframes[0], *sample.truth, sample.keyframes[1]])
-    assert demo.errors(sample, sequence, levels=2).tolist() == 3 * [[0.0, 1.0]]
-    torch.testing.assert_close(demo.errors(sample, 2 * sequence, levels=2), torch.tensor(3 * [[1.0, 8.0]]))
-    assert demo.errors(sample, sequence[::2], levels=1).tolist() == [[0.0, 1.0]]
+    assert capsys.readouterr().out.splitlines()[-1] == f"written to {out}: hand.glb, hand.png"
 
 
 def test_times_of_keyframes_are_respected(meshes: list[str], tmp_path: Path) -> None:
     """In the frames, and in the animation."""
     three = [*meshes, meshes[0]]
-    argv = ["subdivide", *three, "--modes", "6", "--preset", "fast", "--frames", "9", "--times", "0,1,4", "--quiet"]
+    argv = ["subdivide", *three, "--modes", "6", "--preset", "fast", "--frames", "9", "--quiet", "--times", *"014"]
     assert cli.main([*argv, "--out", str(tmp_path / "a.npz"), "--duration", "2"]) == 0
     stored = np.load(tmp_path / "a.npz")
     assert stored["keyframes"].tolist() == [0, 2, 8]
@@ -362,5 +339,3 @@ def test_times_of_keyframes_are_respected(meshes: list[str], tmp_path: Path) -> 
         assert cli.main([*pair, *option, "--out", str(tmp_path / f"{number}.npz")]) == 0
     smooth, straight = (np.load(tmp_path / f"{number}.npz")["frames"] for number in range(2))
     assert np.abs(smooth - straight).max() > 1e-6
-    with pytest.raises(SystemExit):
-        cli.main([*argv[:-3], "--times", "0,x", "--out", str(tmp_path / "b.npz")])

@@ -1,6 +1,5 @@
 """``torch-modal complete``: which files arrive, what is written and said, and what is refused."""
 
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -68,7 +67,7 @@ def test_template_and_scans(files: Path, arrived: dict[str, Any], capsys: pytest
     assert cli.main([*argv, "--noise", "0.01", "--view", "0", "0", "-2", "--estimate-times"]) == 0
     template, faces = tm.load_keyframes(["template.obj"])
     assert torch.equal(arrived["rests"], template[0]) and torch.equal(arrived["faces"], faces)
-    assert arrived["times"] is None and arrived["progress"] is False  # no terminal
+    assert arrived["times"] is None and arrived["progress"] is None
     assert arrived["estimate_times"] is True and arrived["contact"] is False
     observations = arrived["observations"]
     assert [one.time for one in observations] == [0.5 * i for i in range(10)]
@@ -111,17 +110,8 @@ def test_exact_keyframes_and_markers(files: Path, capsys: pytest.CaptureFixture[
 
 
 def test_markers_and_keyframes_arrive(files: Path, arrived: dict[str, Any]) -> None:
-    argv = [
-        "complete",
-        "template.obj",
-        "markers.csv",
-        SCANS[1],
-        "--keyframes",
-        "later.obj",
-        "--keyframe-times",
-        "0",
-        "2",
-    ]
+    argv = ["complete", "template.obj", "markers.csv", SCANS[1], "--keyframes", "later.obj"]
+    argv += ["--keyframe-times", "0", "2"]
     assert cli.main([*argv, "--times", "1.75", "--out", "motion.npz", "--quiet"]) == 0
     assert arrived["rests"].shape[0] == 2 and arrived["times"] == [0.0, 2.0]
     first, second, cloud = arrived["observations"]
@@ -174,26 +164,6 @@ def test_picture_has_the_points_above_the_shapes(
     assert orange(upper) > 0.02 > 2 * orange(lower[:, : -image.shape[1] // 10])  # without the inferred half of the last
 
 
-def test_bar_on_a_terminal(files: Path, arrived: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
-    for quiet in ([], ["--quiet"]):
-        assert cli.main(["complete", "template.obj", *SCANS[:2], "--out", "a.npz", "--overwrite", *quiet]) == 0
-        assert arrived["progress"] is (not quiet)
-
-
-def test_an_order_of_names_that_is_none_of_numbers_is_warned_of(
-    files: Path, arrived: dict[str, Any], capsys: pytest.CaptureFixture[str]
-) -> None:
-    """As shells have it: s-10 stands before s-9."""
-    Path("s-10.ply").write_bytes(Path(SCANS[1]).read_bytes())
-    Path("s-9.ply").write_bytes(Path(SCANS[0]).read_bytes())
-    argv = ["complete", "template.obj", "s-10.ply", "s-9.ply", "--out", "a.npz", "--overwrite"]
-    assert cli.main(argv) == 0
-    assert "warning: s-10.ply, s-9.ply, ... were seen at 0, 1" in capsys.readouterr().err
-    assert cli.main([*argv, "--times", "10", "9"]) == 0
-    assert capsys.readouterr().err == ""
-
-
 def test_what_cannot_work_is_refused_before_the_work(
     files: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -215,7 +185,7 @@ def test_what_cannot_work_is_refused_before_the_work(
     own = ["--keyframes", "a.glb", "--keyframe-times", "0", "1", "--overwrite"]
     assert "is one of the meshes that are read" in fails(capsys, *base, *out, *own)
     Path("a.glb").write_text("mine")
-    assert "a.glb exists; --overwrite" in fails(capsys, *base, *out)
+    assert "a.glb exists; pass overwrite=True" in fails(capsys, *base, *out)
     assert Path("a.glb").read_text() == "mine"
     Path("bad.csv").write_text("time,vertex,x,y,z\n0,4000,0,0,0\n")
     assert "bad.csv, line 2: vertex 4000 " in fails(capsys, "complete", "template.obj", "bad.csv", "--out", "b.glb")

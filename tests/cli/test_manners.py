@@ -1,7 +1,6 @@
 """What long work says, and how errors of writing name files."""
 
 import errno
-import logging
 import os
 import signal
 import sys
@@ -13,7 +12,7 @@ import pytest
 
 import torch_modal as tm
 from torch_modal.cli import main as cli
-from torch_modal.io.files import atomic_write, write_file
+from torch_modal.io.files import atomic_write, write_files
 from torch_modal.io.formats import ANIMATION_FORMATS, Animation, OutputFormat
 from torch_modal.progress import ProgressReport
 
@@ -36,14 +35,6 @@ def test_a_bar_is_shown_on_terminals(
     assert ("second" in said and "1/2" in said) if shown else said == ""
 
 
-def test_verbose_says_what_is_written(
-    tmp_path: Path, capsule: tuple[np.ndarray, np.ndarray], caplog: pytest.LogCaptureFixture
-) -> None:
-    with caplog.at_level(logging.DEBUG, "torch_modal"):
-        (path,) = tm.save_frames(capsule[0][None], capsule[1], tmp_path, "obj")
-    assert [record.message for record in caplog.records] == [f"wrote {path}, {path.stat().st_size / 1000:.1f} kB"]
-
-
 # ------------------------------------------------------------------------------------------------------ errors of files
 def test_write_errors_name_the_users_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     wanted = tmp_path / "missing" / "a.glb"
@@ -56,7 +47,7 @@ def test_write_errors_name_the_users_path(tmp_path: Path, monkeypatch: pytest.Mo
 
     monkeypatch.setattr(Path, "write_bytes", full)
     with pytest.raises(OSError, match=r"No space left on device: '[^']*/b\.glb'") as caught_again:
-        write_file(tmp_path / "b.glb", b"x")
+        write_files([(tmp_path / "b.glb", b"x")])
     assert caught_again.value.errno == errno.ENOSPC and list(tmp_path.iterdir()) == []
     with pytest.raises(PermissionError) as other, atomic_write(tmp_path / "c.glb"):
         raise PermissionError(errno.EACCES, "of another file", "/elsewhere")

@@ -16,7 +16,7 @@ from torch_modal.cli import main as cli
 from torch_modal.data import precompute
 from torch_modal.data.precompute import Options, Record, read_record
 from torch_modal.data.stored import LABELS_FILE, SET_FILE, StoredSet, find_sets, write_set
-from torch_modal.io.frames import save_frames
+from torch_modal.io.write import save_frames
 
 # In place of the process that computes a set: the set's name says what becomes of it. The package itself starts it,
 # keeps its time and reads its result.

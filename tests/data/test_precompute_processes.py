@@ -20,7 +20,7 @@ import torch_modal as tm
 from torch_modal.cli import main as cli
 from torch_modal.data.precompute import DONE, Options, precompute_tree, run_set
 from torch_modal.data.stored import SET_FILE, StoredSet, find_sets
-from torch_modal.io.frames import save_frames
+from torch_modal.io.write import save_frames
 
 OPTIONS = Options(n_modes=4, mesher="lattice")  # the lattice always gives the same tetrahedra
 ARGUMENTS = ["--modes", "4", "--mesher", "lattice"]

@@ -62,7 +62,7 @@ def test_key_depends_on_names_content_and_options(tmp_path: Path) -> None:
     (tmp_path / "s" / "notes.txt").write_text("says nothing about the shape")
     (tmp_path / "s" / "times.txt").write_text("nor does this, unless it is a sequence")
     os.utime(tmp_path / "s" / "1.obj", (0, 0))
-    assert key(timeout=5.0, overwrite=True, cache_dir="x") == first
+    assert key(timeout=5.0, overwrite=True) == first
     in_time = key(sequence=True)
     (tmp_path / "s" / "times.txt").write_text("0 2")
     seen = {first, in_time, key(sequence=True), key(n_modes=40), key(method="shell"), key(mesher="tetwild")}

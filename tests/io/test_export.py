@@ -4,8 +4,6 @@ import json
 import os
 import re
 import struct
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -13,15 +11,14 @@ import pygltflib
 import pytest
 import torch
 import trimesh
+from gltf_validator import accessor
 from textured import textured_obj
 
-from torch_modal.io import glb
-from torch_modal.io.frames import save_frames
 from torch_modal.io.read import open_asset
+from torch_modal.io.write import save_frames
 from torch_modal.view.animation import save_animation
 
 FACES = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])
-DTYPES = {pygltflib.FLOAT: "<f4", pygltflib.UNSIGNED_SHORT: "<u2", pygltflib.UNSIGNED_INT: "<u4"}
 
 
 def tetrahedra(n=5):
@@ -29,20 +26,6 @@ def tetrahedra(n=5):
     rng = np.random.default_rng(3)
     first = np.array([[10.1, -3.3, 0.7]] * 4) + np.eye(4, 3, -1)
     return first + np.cumsum(rng.normal(scale=0.2, size=(n, 4, 3)), axis=0)
-
-
-def accessor(gltf, number):
-    """The numbers of an accessor, decoded by hand."""
-    a = gltf.accessors[number]
-    view = gltf.bufferViews[a.bufferView]
-    raw = gltf.binary_blob()[view.byteOffset : view.byteOffset + view.byteLength]
-    array = np.frombuffer(raw, DTYPES[a.componentType])
-    array = array.reshape(a.count, 3) if a.type == "VEC3" else array
-    assert len(array) == a.count
-    if a.min:  # pygltflib reads a missing one as an empty list
-        np.testing.assert_array_equal(a.min, array.reshape(a.count, -1).min(axis=0))
-        np.testing.assert_array_equal(a.max, array.reshape(a.count, -1).max(axis=0))
-    return array
 
 
 def played(gltf, time):
@@ -54,9 +37,9 @@ def played(gltf, time):
     now = [np.interp(time, times, column) for column in weights.T]
     result = []
     for name in ("POSITION", "NORMAL"):
-        base = accessor(gltf, getattr(primitive.attributes, name)).astype(np.float64)
+        base = accessor(gltf, getattr(primitive.attributes, name))
         moved = [accessor(gltf, target[name]) for target in primitive.targets]
-        result.append(base + np.tensordot(now, np.array(moved, dtype=np.float64), 1))
+        result.append(base + np.tensordot(now, np.array(moved), 1))
     return result
 
 
@@ -188,7 +171,6 @@ def test_wrong_input_is_refused_before_anything_is_written(tmp_path, frames, fac
         ({"out": "a.gltf"}, r"\.glb"),
         ({"keyframe_indices": [0, 5]}, r"0 to 4.*\[0, 5\]"),
         ({"keyframe_indices": [-1]}, r"0 to 4"),
-        ({"max_targets": 0}, "max_targets"),
     ],
 )
 def test_wrong_animation_options(tmp_path, options, message):
@@ -198,13 +180,8 @@ def test_wrong_animation_options(tmp_path, options, message):
 
 
 def test_wrong_frame_options(tmp_path):
-    with pytest.raises(ValueError, match="ply, obj, off"):
-        save_frames(tetrahedra(), FACES, tmp_path, fmt="stl")
-    for stem in ("", "a/b", "../a"):
-        with pytest.raises(ValueError, match="stem"):
-            save_frames(tetrahedra(), FACES, tmp_path, stem=stem)
     (tmp_path / "file").write_text("")
-    with pytest.raises(NotADirectoryError, match="is a file"):
+    with pytest.raises(FileExistsError, match="file"):
         save_frames(tetrahedra(), FACES, tmp_path / "file")
     (tmp_path / "a.glb").mkdir()
     with pytest.raises(IsADirectoryError, match="is a folder"):
@@ -264,35 +241,25 @@ def test_cyclic_returns_to_frame_zero(tmp_path):
     assert gltf.accessors[gltf.animations[0].samplers[0].input].count == 6
 
 
-def test_long_sequences_are_thinned(tmp_path):
-    frames = tetrahedra(1) + np.linspace(0, 2, 201)[:, None, None]  # a straight move: thinning loses nothing
-    with pytest.warns(UserWarning, match="9 of the 201 frames"):
-        path = save_animation(frames, FACES, tmp_path / "a.glb", fps=10, keyframe_indices=[77], max_targets=8)
+def test_many_targets_are_warned_of(tmp_path):
+    frames = tetrahedra(1) + np.linspace(0, 2, 101)[:, None, None]
+    with pytest.warns(UserWarning, match=r"a\.glb has 100 morph targets"):
+        path = save_animation(frames, FACES, tmp_path / "a.glb", fps=10)
     gltf = pygltflib.GLTF2().load(path)
-    kept = gltf.animations[0].extras["frames"]
-    assert kept[0] == 0 and kept[-1] == 200 and 77 in kept and len(kept) == 9
-    assert np.diff(kept).max() <= 26  # 200 / 8 = 25, a little more because of 77
-    assert len(gltf.meshes[0].primitives[0].targets) == 8
-    np.testing.assert_allclose(played(gltf, 12.34)[0], tetrahedra(1)[0] + 1.234, atol=1e-5)
-    with pytest.warns(UserWarning, match="9 of the 201"):  # more key-frames than targets: still at most 8
-        save_animation(frames, FACES, tmp_path / "b.glb", keyframe_indices=range(50), max_targets=8)
+    assert len(gltf.meshes[0].primitives[0].targets) == 100
+    np.testing.assert_allclose(played(gltf, 1.234)[0], frames[12] + 0.34 * (frames[13] - frames[12]), atol=1e-5)
 
 
-def test_large_files_do_without_moving_normals(tmp_path, monkeypatch):
-    monkeypatch.setattr(glb, "LARGEST_FILE_WITH_NORMALS", 5 * 4 * 3 * 4 - 1)
-    with pytest.warns(UserWarning, match="normals"):
-        gltf = pygltflib.GLTF2().load(save_animation(tetrahedra(), FACES, tmp_path / "a.glb"))
-    assert all(target.get("NORMAL") is None for target in gltf.meshes[0].primitives[0].targets)
-
-
-@pytest.mark.parametrize(("n_vertices", "component"), [(65535, "<u2"), (65536, "<u4")])
+@pytest.mark.parametrize(
+    ("n_vertices", "component"), [(65535, pygltflib.UNSIGNED_SHORT), (65536, pygltflib.UNSIGNED_INT)]
+)
 def test_index_type(tmp_path, n_vertices, component):
     """65535 is uint16's restart mark, so 65535 vertices (last index 65534) are the most it can name."""
     frames = np.random.default_rng(0).normal(size=(1, n_vertices, 3))
     faces = np.array([[0, 1, n_vertices - 1]])
     gltf = pygltflib.GLTF2().load(save_animation(frames, faces, tmp_path / "a.glb"))
     number = gltf.meshes[0].primitives[0].indices
-    assert DTYPES[gltf.accessors[number].componentType] == component
+    assert gltf.accessors[number].componentType == component
     assert accessor(gltf, number).tolist() == [0, 1, n_vertices - 1]
 
 
@@ -307,11 +274,3 @@ def test_normals_have_unit_length_everywhere(tmp_path):
         np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-6)
         np.testing.assert_array_equal(normals[4:], [[0, 0, 1]] * 3)
         assert np.abs(normals[:4] - [0, 0, 1]).max() > 0.5  # the others are not the stand-in
-
-
-def test_the_import_is_light():
-    names = "torch_modal.io.frames, torch_modal.view.animation, torch_modal.view.picture"
-    code = f"import sys, {names}; print(*sys.modules)"
-    root = str(Path(glb.__file__).parents[1])
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=root)
-    assert not {"pyvista", "vtkmodules", "matplotlib", "pygltflib"} & set(done.stdout.split())

@@ -69,8 +69,3 @@ def test_samples_at_a_fixed_rate_repeat_no_end() -> None:
     np.testing.assert_array_equal(Timing(3, **timing, ping_pong=True).samples(), [*there, 1.5, 1, 0.5])
     np.testing.assert_allclose(Timing(3, **timing, cyclic=True).samples(), [0, 0.75, 1.5, 2.25])
     np.testing.assert_array_equal(Timing(1, **timing, ping_pong=True).samples(), [0])
-
-
-def test_numbers_of_frames_have_as_many_digits_as_the_last(tmp_path: Path) -> None:
-    for n, last in ((1000, "frame-999.off"), (1001, "frame-1000.off")):
-        assert tm.save_frames(np.repeat(FRAMES[:1], n, 0), FACES, tmp_path / str(n), "off")[-1].name == last

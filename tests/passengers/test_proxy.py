@@ -12,7 +12,7 @@ from torch import Tensor
 import torch_modal as tm
 from torch_modal.cli import main as cli
 from torch_modal.geometry.connectivity import Connectivity
-from torch_modal.io.frames import save_frames
+from torch_modal.io.write import save_frames
 from torch_modal.passengers.proxy import Proxy, proxy_size
 
 

@@ -9,9 +9,9 @@ from conftest import Shapes
 from scipy.spatial.transform import Rotation
 
 from torch_modal.cli import main as cli
-from torch_modal.io.frames import save_frames
 from torch_modal.io.ply import PlyFile
 from torch_modal.io.points import PointFile, evaluate_harmonics, rotate_harmonics
+from torch_modal.io.write import save_frames
 
 NAMES = ["x", "y", "z", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3)), *(f"f_rest_{i}" for i in range(45))]
 NAMES += ["opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]

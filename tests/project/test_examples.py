@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from torch_modal.data.samples import load_sample
-from torch_modal.io.frames import save_mesh
+from torch_modal.io.write import save_mesh
 from torch_modal.registration.landmarks import read_landmarks
 from torch_modal.registration.load import load_keyframes
 

@@ -16,7 +16,7 @@ from torch_modal.cli import main as cli
 from torch_modal.data.stored import StoredSet
 from torch_modal.geometry.canonical import size
 from torch_modal.geometry.connectivity import Connectivity
-from torch_modal.io.frames import save_frames
+from torch_modal.io.write import save_frames
 from torch_modal.modes.sheet import THICKNESS
 
 pytestmark = pytest.mark.filterwarnings("ignore::torch_modal.keyframes.check.MeshWarning")

@@ -12,7 +12,7 @@ from torch_modal import extras
 from torch_modal.cli import main as cli
 from torch_modal.data.samples import load_sample
 from torch_modal.extras import require
-from torch_modal.io.frames import save_mesh
+from torch_modal.io.write import save_mesh
 from torch_modal.registration import register as register_module
 from torch_modal.registration.landmarks import landmark_table, read_landmarks
 from torch_modal.registration.maps import SpectralShape
@@ -396,10 +396,15 @@ def test_doubtful_key_frames_are_refused(files: list[Path], tmp_path: Path) -> N
 
 
 def test_register_command_writes_the_registered_mesh(
-    files: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str], found: tm.Registration
+    files: list[Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    found: tm.Registration,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch.setenv("TORCH_MODAL_CACHE", str(tmp_path / "cache"))
     out = tmp_path / "wrapped.obj"
-    command = ["register", *map(str, files[:2]), "--out", str(out), "--cache-dir", str(tmp_path / "cache")]
+    command = ["register", *map(str, files[:2]), "--out", str(out)]
     assert cli.main(command) == 0
     assert "confidence" in capsys.readouterr().out
     np.testing.assert_allclose(tm.load_keyframes([out]).keyframes[0], found.positions, atol=1e-12)
@@ -409,8 +414,6 @@ def test_register_command_writes_the_registered_mesh(
     assert cli.main(command) == 1 and "exists" in capsys.readouterr().err
     with pytest.raises(SystemExit):
         cli.main(["register", *map(str, files[:2])])
-    with pytest.raises(SystemExit):
-        cli.main(["subdivide", *map(str, files[:2]), "--across", "--out", str(tmp_path / "x.glb")])
 
 
 @pytest.mark.slow

@@ -2,7 +2,6 @@
 
 import importlib.util
 import struct
-from pathlib import Path
 
 import numpy as np
 import pygltflib
@@ -12,7 +11,7 @@ from textured import bend, textured_obj, triangles_of_tube
 
 import torch_modal as tm
 from torch_modal.errors import MeshWarning, MissingPackageError
-from torch_modal.io.formats import Timing
+from torch_modal.io.formats import ANIMATION_FORMATS, Timing
 from torch_modal.view import animation
 
 X, FACES = triangles_of_tube()
@@ -165,10 +164,10 @@ def small_pictures(monkeypatch):
 def test_missing_packages_are_named_before_the_work(tmp_path, monkeypatch, suffix, extra):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(MissingPackageError, match=rf"pip install 'torch_modal\[{extra}\]'"):
-        animation.require_packages(Path(f"a.{suffix}"))
+        ANIMATION_FORMATS[f".{suffix}"].check_installed("a")
     with pytest.raises(MissingPackageError):
         tm.save_animation(FRAMES, FACES, tmp_path / f"a.{suffix}")
-    animation.require_packages(Path("a.glb"))
+    ANIMATION_FORMATS[".glb"].check_installed("a.glb")
 
 
 @pytest.mark.parametrize("suffix", ["mdd", "pc2", "npz", "usda", "gif"])

@@ -160,13 +160,6 @@ def test_animation_is_read_back(tmp_path: Path, ball: tuple[np.ndarray, np.ndarr
     np.testing.assert_allclose(frames, growing, atol=1e-6)
     np.testing.assert_array_equal(faces, ball[1])
     assert options == {"keyframe_indices": [0, 4], "fps": 12.0, "cyclic": True}
-    with pytest.warns(UserWarning, match="holds 4 of the 7"):
-        tm.save_animation(growing, ball[1], path, fps=12, keyframe_indices=[0, 3, 6], max_targets=3, overwrite=True)
-    thin, _, options = read_shapes([path])
-    kept = np.rint(12 * np.array(options["times"])).astype(int)
-    np.testing.assert_allclose(thin, growing[kept], atol=1e-6)
-    assert kept[options["keyframe_indices"]].tolist() == [0, 3, 6]
-    assert options["fps"] == pytest.approx(3 / 0.5)
     tm.save_animation(growing[:1], ball[1], path, overwrite=True)
     assert read_shapes([path])[0].shape == (1, *growing[0].shape)
 
@@ -238,8 +231,7 @@ def test_view_command_writes_a_page(
     [
         (["--compare", "short"], "3 shapes"),
         (["--compare", "cube.ply"], "vertices"),
-        (["--linear", "--keyframes", "1", "6"], r"first frame \(0\)"),
-        (["--linear", "--keyframes", "0", "5"], r"the last \(6\)"),
+        (["--linear", "--keyframes", "0", "7"], "from 0 to 6"),
         (["--keyframes", "7"], "from 0 to 6"),
         (["--compare", "missing.ply"], "no such file"),
     ],

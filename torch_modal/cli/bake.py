@@ -2,41 +2,28 @@
 
 import argparse
 from pathlib import Path
-from typing import Any
 
-from torch_modal.cli.arguments import (
-    add_common,
-    add_forms,
-    add_registration,
-    check_forms,
-    check_output,
-    file_name,
-    number,
-    pick_options,
-    register_options,
-    reporter,
-)
+from torch_modal.cli import arguments
+from torch_modal.cli.arguments import number, pick_options
 from torch_modal.io.formats import ANIMATION_FORMATS
 
 
 def add_arguments(sub: argparse.ArgumentParser) -> None:
     """Add the arguments of ``bake``."""
-    add, positive = sub.add_argument, number(float, 0, above=True)
-    text = (
-        "meshes in their order, a folder or a quoted pattern of them, an animated GLB, or an NPZ with frames and faces"
-    )
+    add = sub.add_argument
+    text = "meshes in their order, a folder or a quoted pattern of them, an animated GLB, or an NPZ file"
     add("meshes", nargs="+", type=Path, metavar="MESH", help=text)
     text = f"the file: {', '.join(ANIMATION_FORMATS)}"
-    add("--out", type=file_name(ANIMATION_FORMATS), required=True, metavar="FILE", help=text)
-    add_forms(sub)
-    add("--fps", type=positive, metavar="X", help="frames a second (default: as in the file, or 24)")
+    add("--out", type=arguments.file_name(ANIMATION_FORMATS), required=True, metavar="FILE", help=text)
+    arguments.add_forms(sub)
+    add("--fps", type=number(float), metavar="X", help="frames a second (default: as in the file, or 24)")
     add("--cyclic", action="store_true", help="the last frame leads on to the first")
     text = "take out trembling: what has a period of X frames is halved, what is slower hardly changes"
-    add("--smooth", type=positive, metavar="X", help=text)
+    add("--smooth", type=number(float), metavar="X", help=text)
     text = "keep each N-th frame and the last as key-frames, and fill in a smooth path through them"
     add("--every", type=number(int, 2), metavar="N", help=text)
-    add_registration(sub, optional=True)
-    add_common(sub)
+    arguments.add_registration(sub, optional=True)
+    arguments.add_cache(sub)
 
 
 def run(args: argparse.Namespace) -> None:
@@ -56,24 +43,22 @@ def run(args: argparse.Namespace) -> None:
       scans of different connectivity:
         torch-modal bake "scans/*.ply" --register --bones 40 --out motion.glb
     """
-    check_forms(args, args.out)
-    registration = {"register": args.register, **register_options(args), "report": reporter(args)}
+    arguments.check_forms(args, args.out)
 
     import torch
 
     import torch_modal as tm
     from torch_modal.data.sequence import sequence_files, smooth_in_time
-    from torch_modal.view.animation import require_packages
 
-    files, report = sequence_files(args.meshes), reporter(args)
-    check_output([args.out], files, args.overwrite)
-    require_packages(args.out)
-    given, faces, fps = tm.load_sequence(files, args.fps, **registration)
-    n = len(given)
+    files = sequence_files(args.meshes)
+    arguments.check_output(args, [args.out], files)
+    registration = pick_options(args, "register", "report", *arguments.REGISTRATION)
+    originals, faces, fps = tm.load_sequence(files, args.fps, **registration)
+    n = len(originals)
     if n < 2:
         raise ValueError(f"{files[0]} is one shape; a motion has two frames or more: name more meshes, or a folder")
-    report(f"{n} frames of {given.shape[1]} vertices, {fps:g} a second")
-    frames = smooth_in_time(given, args.smooth, args.cyclic) if args.smooth else given
+    args.report(f"{n} frames of {originals.shape[1]} vertices, {fps:g} a second")
+    frames = smooth_in_time(originals, args.smooth, args.cyclic) if args.smooth else originals
     kept = [*range(0, n - 1, args.every), *([n - 1] * (not args.cyclic))] if args.every else list(range(n))
     if args.every:
         welded = tm.weld_seams(frames, faces)
@@ -85,20 +70,21 @@ def run(args: argparse.Namespace) -> None:
     asset = None if files[0].suffix.lower() == ".npz" else tm.open_asset(files[0])
     if asset is not None:
         asset.carries.pop("posing", None)  # it is what is written
-    options: dict[str, Any] = {**pick_options(args, "cyclic", "overwrite", "targets"), "bones": skin, "asset": asset}
-    tm.save_animation(frames, faces, args.out, fps, progress=False if args.quiet else None, **options)
+    options = pick_options(args, "cyclic", "overwrite", "targets", "progress")
+    tm.save_animation(frames, faces, args.out, fps, bones=skin, asset=asset, **options)
     bones = f", {skin.weights.shape[1]} bones" if skin else ""
-    report(f"animation: {args.out}, {args.out.stat().st_size / 1e6:.2f} MB{bones}")
+    args.report(f"animation: {args.out}, {args.out.stat().st_size / 1e6:.2f} MB{bones}")
     shown = frames.clone()
     if args.out.suffix.lower() == ".glb":  # as it plays; the file has a point for each corner of a texture
         parts = asset.parts() if asset else []
         points = torch.cat([torch.from_numpy(part.vertices) for part in parts]) if parts else slice(None)
         shown[:, points] = tm.load_sequence(args.out, fps).frames[:n]
-    used = given[0, faces.unique()]
-    off = (shown - given).square().sum(-1).mean(1) / (used.amax(0) - used.amin(0)).square().sum()
+    used = originals[0, faces.unique()]
+    off = (shown - originals).square().sum(-1).mean(1) / (used.amax(0) - used.amin(0)).square().sum()
     error = f"error:     {100 * off[kept].mean().sqrt():.3f} % at the {'key-' * bool(args.every)}frames"
-    if left := sorted({*range(n)} - {*kept}):
+    left = sorted({*range(n)} - {*kept})
+    if left:
         error += f", {100 * off[left].mean().sqrt():.3f} % at the {len(left)} frames between them"
     elif skin:
         error += f", {100 * skin.error_between_frames:.3f} % half-way between them"
-    report(error)
+    args.report(error)

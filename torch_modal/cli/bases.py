@@ -1,19 +1,10 @@
 """Commands on modes: ``modes`` and ``precompute`` of ``torch-modal``."""
 
 import argparse
-import os
 from pathlib import Path
 
-from torch_modal.cli.arguments import (
-    add_common,
-    add_modes,
-    check_output,
-    is_file,
-    mode_options,
-    number,
-    pick_options,
-    reporter,
-)
+from torch_modal.cli import arguments
+from torch_modal.cli.arguments import number, pick_options
 
 INCOMPLETE = 3  # exit status of `precompute` when some sets have no bases
 
@@ -23,8 +14,8 @@ def add_modes_command(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("meshes", nargs="+", type=Path, metavar="MESH", help="key-frames of one connectivity")
     text = "FILE.safetensors for one mesh, or a folder for a file of each mesh's name"
     sub.add_argument("--out", type=Path, required=True, metavar="FILE_OR_FOLDER", help=text)
-    add_modes(sub)
-    add_common(sub)
+    arguments.add_modes(sub)
+    arguments.add_cache(sub)
 
 
 def modes(args: argparse.Namespace) -> None:
@@ -43,30 +34,22 @@ def modes(args: argparse.Namespace) -> None:
       torch-modal modes gait-?.ply --modes 50 --out bases
     """
     files = [args.out]
-    if not is_file(args, [".safetensors"]):
+    if not arguments.is_file(args, [".safetensors"]):
         files = [args.out / f"{mesh.stem}.safetensors" for mesh in args.meshes]
         if len(set(files)) < len(files):
             args.fail("two meshes have the same file name, so their bases would too; take them one by one")
     elif len(args.meshes) > 1:
         args.fail(f"--out {args.out} is one file, but there are {len(args.meshes)} meshes; name a folder")
-    check_output(files, args.meshes, args.overwrite)
+    arguments.check_output(args, files, args.meshes)
 
     import torch_modal as tm
 
     keyframes, faces = tm.load_keyframes(args.meshes)
-    bases = tm.extract_bases(keyframes, faces, **mode_options(args))
-    report = reporter(args)
-    shown = min(8, args.modes)
-    report(f"{'lowest elastic modes':24s}" + "".join(f"{i + 1:>10d}" for i in range(shown)))
-    for file, mesh, basis in zip(files, args.meshes, bases, strict=True):
+    bases = tm.extract_bases(keyframes, faces, **pick_options(args, *arguments.MODES))
+    for file, basis in zip(files, bases, strict=True):
         file.parent.mkdir(parents=True, exist_ok=True)
         basis.save(file)
-        values = basis.eigenvalues[:shown].tolist()
-        first = next((value for value in basis.eigenvalues.tolist() if value > 0), 1.0)
-        report(f"{mesh.name:24s}" + "".join(f"{value:>10.3g}" for value in values))
-        report(f"{'  frequency / first':24s}" + "".join(f"{(value / first) ** 0.5:>10.3f}" for value in values))
-    report("eigenvalues are squared frequencies, in 1 / (unit of the mesh)^2; solids and shells differ in stiffness")
-    report(f"bases: {files[0]}" + (f" to {files[-1].name}" if len(files) > 1 else ""))
+    args.report(f"bases: {files[0]}" + (f" to {files[-1].name}" if len(files) > 1 else ""))
 
 
 def add_precompute(sub: argparse.ArgumentParser) -> None:
@@ -77,15 +60,10 @@ def add_precompute(sub: argparse.ArgumentParser) -> None:
     text = "sets at a time, each in a process with one thread (default: one for each processor)"
     add("--workers", type=number(int, 1), metavar="N", help=text)
     add("--scheduler", metavar="ADDRESS", help="run on the Dask cluster with this scheduler instead")
-    add("--timeout", type=number(float, 0, above=True), metavar="S", default=600.0, help="for a set (default: 600)")
-    text = (
-        "the meshes of a folder are a motion, in natural order of their names; its file times.txt, if there is "
-        "one, says when each is, and when the first comes again if it is a cycle (default: even times)"
-    )
+    add("--timeout", type=number(float), metavar="S", default=600.0, help="for a set (default: 600)")
+    text = "the meshes of a folder are a motion, in the order of their names, perhaps with a file times.txt"
     add("--sequence", action="store_true", help=text)
-    add_modes(sub)
-    text = "replace stored sets that this command did not write (default: refuse them)"
-    add_common(sub, text, "keep tetrahedra and modes in this cache as well (default: keep the bases only)")
+    arguments.add_modes(sub)
 
 
 def precompute(args: argparse.Namespace) -> int:
@@ -97,7 +75,8 @@ def precompute(args: argparse.Namespace) -> int:
     mirrors the tree, with the key-frames and bases of each set as safetensors. Every set has a
     process and a time limit of its own: one that crashes, hangs or is refused is named at the
     end, and the others go on. The same command again continues where it stopped: it computes
-    the sets that have no bases, and those whose files or options changed.
+    the sets that have no bases, and those whose files or options changed. Stored sets that
+    this command did not write are replaced with --overwrite only.
 
     exit status: 0 all sets have their bases, 3 some have not, 1 an error, 130 interrupted
 
@@ -107,16 +86,12 @@ def precompute(args: argparse.Namespace) -> int:
       on machines that share their files, with a Dask cluster:
         torch-modal precompute shapes --out bases --scheduler tcp://HOST:8786
     """
-    if args.out.suffix.lower() == ".safetensors":
-        args.fail(f"--out is a folder here, got the file name {args.out.name!r}")
     if args.scheduler and args.workers:
         args.fail("--scheduler shares the sets among the workers of its cluster; leave out --workers")
 
     from torch_modal.data.precompute import DONE, Options, precompute_tree
 
-    cache_dir = args.cache_dir and os.path.abspath(os.path.expanduser(args.cache_dir))
-    settings = pick_options(args, "method", "mesher", "timeout", "overwrite", "sequence")
-    options = Options(n_modes=args.modes, cache_dir=cache_dir, **settings)
+    options = Options(**pick_options(args, "n_modes", "method", "mesher", "timeout", "overwrite", "sequence"))
     where = pick_options(args, "workers", "scheduler")
-    records = precompute_tree(args.root, args.out, options, **where, say=reporter(args))
+    records = precompute_tree(args.root, args.out, options, **where, say=args.report)
     return 0 if all(record.status == DONE for record in records.values()) else INCOMPLETE

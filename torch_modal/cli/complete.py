@@ -1,18 +1,16 @@
 """``torch-modal complete``: from a template and what was seen of a motion to files."""
 
 import argparse
-import sys
-import warnings
 from dataclasses import replace
 from pathlib import Path
 
-from torch_modal.cli.arguments import add_common, number, reporter
+from torch_modal.cli.arguments import number, pick_options
 from torch_modal.cli.subdivide import add_output, check_files, write_sequence
 
 
 def add_arguments(sub: argparse.ArgumentParser) -> None:
     """Arguments of ``complete``."""
-    add, positive = sub.add_argument, number(float, 0, above=True)
+    add = sub.add_argument
     add("mesh", type=Path, metavar="MESH", help="a whole mesh: the template, or the first key-frame")
     text = "clouds (PLY), meshes of any connectivity as clouds, markers (CSV with time,vertex,x,y,z)"
     add("observations", nargs="+", type=Path, metavar="SEEN", help=text)
@@ -21,14 +19,13 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
     add("--keyframes", nargs="+", type=Path, default=[], metavar="MESH", help="further whole, exact meshes")
     text = "when the whole meshes are, the first included (default: that is a template of no time)"
     add("--keyframe-times", nargs="+", type=float, metavar="T", help=text)
-    add("--noise", type=positive, metavar="X", help="standard deviation of the points (default: estimated)")
+    add("--noise", type=number(float), metavar="X", help="standard deviation of the points (default: estimated)")
     add("--estimate-times", action="store_true", help="times between the first and the last are not exact")
     add("--contact", action="store_true", help="keep parts from passing through each other (extra contact)")
     add("--view", nargs=3, type=float, metavar=("X", "Y", "Z"), help="direction to the camera of the clouds")
     add_output(sub, "what was seen above the result, coloured by its confidence")
     add("--frames", type=number(int, 2), metavar="N", help="evenly in time (default: 1 to 8 for each interval)")
-    add("--fps", type=positive, metavar="X", default=24.0, help="frames a second (default: %(default)g)")
-    add_common(sub, cache_dir=None)
+    add("--fps", type=number(float), metavar="X", default=24.0, help="frames a second (default: %(default)g)")
 
 
 def run(args: argparse.Namespace) -> None:
@@ -49,63 +46,49 @@ def run(args: argparse.Namespace) -> None:
     whole, times = [args.mesh, *args.keyframes], args.keyframe_times
     if (times or args.keyframes) and len(times or ()) != len(whole):
         args.fail(f"--keyframe-times needs a time for each of {', '.join(map(str, whole))}; got {len(times or ())}")
-    files = check_files(args, [*whole, *args.observations])
+    animation = check_files(args, [*whole, *args.observations])
 
     import torch
 
     import torch_modal as tm
     from torch_modal.completion.read import load_observations
-    from torch_modal.data.tree import natural
-    from torch_modal.view.animation import require_packages
 
-    require_packages(files[0])
-    report, names = reporter(args), [f.as_posix() for f in args.observations if f.suffix.lower() != ".csv"]
-    if not args.times and names != sorted(names, key=natural):
-        message = f"{', '.join(names[:3])}, ... were seen at 0, 1, 2, ..., in this order; --times says other times"
-        warnings.warn(message, stacklevel=2)
     keyframes, faces = tm.load_keyframes(whole)
     view = args.view and torch.tensor(args.view, dtype=torch.float64)
     seen = load_observations(args.observations, keyframes.shape[1], args.times, noise=args.noise, view=view)
-    report(f"{len(seen)} observations of {sum(len(one.points) for one in seen)} points")
+    args.report(f"{len(seen)} observations of {sum(len(one.points) for one in seen)} points")
     welded = tm.weld_seams(keyframes, faces)
     seen = [one if one.is_cloud else replace(one, vertices=welded.vertex_of[one.vertices]) for one in seen]
     rests = welded.keyframes if times else welded.keyframes[0]
-    found = tm.complete(
-        rests,
-        welded.faces,
-        seen,
-        times=times,
-        estimate_times=args.estimate_times,
-        contact=args.contact,
-        progress=not args.quiet and sys.stderr.isatty(),
-    )
-    knots, when = found.path.times if found.path else found.times, found.times
+    options = pick_options(args, "estimate_times", "contact", "progress")
+    completion = tm.complete(rests, welded.faces, seen, times=times, **options)
+    knots, when = completion.path.times if completion.path else completion.times, completion.times
     if len(knots) > 1 and args.frames:
         when = torch.linspace(float(knots[0]), float(knots[-1]), args.frames, dtype=torch.float64)
     elif len(knots) > 1:
         when = tm.frame_times(len(knots), min(3, max(0, 6 - (len(knots) - 2).bit_length())), times=knots)
-    frames, asset = welded.scatter(found(when)), tm.open_asset(args.mesh)
+    frames, asset = welded.scatter(completion(when)), tm.open_asset(args.mesh)
     keys = [i for i, t in enumerate(when.tolist()) if t in (times or ())]
-    write_sequence(args, files, frames, faces, asset, keyframe_indices=keys, times=when.tolist())
+    write_sequence(args, animation, frames, faces, asset, keyframe_indices=keys, times=when.tolist())
     if args.picture:
-        chosen = torch.linspace(0, len(found.times) - 1, min(8, len(found.times))).round().long().tolist()
-        moments = sorted({one.time for one in seen})  # in the order of found.times, which may be estimated
+        chosen = torch.linspace(0, len(completion.times) - 1, min(8, len(completion.times))).round().long().tolist()
+        moments = sorted({one.time for one in seen})  # in the order of completion.times, which may be estimated
         at = [moments.index(one.time) for one in seen]
         tm.render_sequence(
-            {"completed": found.shapes[chosen]},
+            {"completed": completion.shapes[chosen]},
             welded.faces,
             args.picture,
             columns=len(chosen),
-            titles=[f"t = {t:.4g}" for t in found.times[chosen].tolist()],
+            titles=[f"t = {t:.4g}" for t in completion.times[chosen].tolist()],
             keyframe_indices=[],
-            colors={"completed": 1 - found.confidence[chosen]},
+            colors={"completed": 1 - completion.confidence[chosen]},
             color_label="1 - confidence",
             points={"seen": [torch.cat([o.points for o, n in zip(seen, at, strict=True) if n == i]) for i in chosen]},
             overwrite=args.overwrite,
         )
-        report(f"picture:   {args.picture}")
-    used, low = welded.keyframes[0, welded.faces.unique()], (found.confidence < 0.5).double().mean(1)
-    miss = 100 * torch.cat(found.misses).mean() / (used.amax(0) - used.amin(0)).norm()
-    report(f"points lie {miss:.2f} % of the diagonal off the surface, in the mean")
-    most = f"most at t = {found.times[low.argmax()]:g} ({100 * low.max():.0f} %)"
-    report(f"{100 * low.mean():.0f} % of the vertices have a confidence below 0.5" + f", {most}" * bool(low.any()))
+        args.report(f"picture:   {args.picture}")
+    used, low = welded.keyframes[0, welded.faces.unique()], (completion.confidence < 0.5).double().mean(1)
+    miss = 100 * torch.cat(completion.misses).mean() / (used.amax(0) - used.amin(0)).norm()
+    args.report(f"points lie {miss:.2f} % of the diagonal off the surface, in the mean")
+    most = f"most at t = {completion.times[low.argmax()]:g} ({100 * low.max():.0f} %)"
+    args.report(f"{100 * low.mean():.0f} % of the vertices have a confidence below 0.5" + f", {most}" * bool(low.any()))

@@ -53,27 +53,23 @@ EXPECTED_NAMES = ("TetrahedralizationError", "ModalAnalysisError")
 """Further such errors, whose modules take long to import."""
 
 
-Formatter = functools.partial(argparse.RawDescriptionHelpFormatter, max_help_position=30, width=100)
-
-
 def build_parser() -> argparse.ArgumentParser:
     """All commands and their options."""
-    parser = argparse.ArgumentParser(prog=PROGRAM, description=DESCRIPTION, epilog=EXAMPLES, formatter_class=Formatter)
+    formatter = functools.partial(argparse.RawDescriptionHelpFormatter, max_help_position=30, width=100)
+    parser = argparse.ArgumentParser(prog=PROGRAM, description=DESCRIPTION, epilog=EXAMPLES, formatter_class=formatter)
     parser.add_argument("--version", action="version", version=f"{PROGRAM} {__version__}")
     subparsers = parser.add_subparsers(title="commands", required=True, metavar="COMMAND ...")
     for name, (add_arguments, run) in COMMANDS.items():
         summary, _, rest = inspect.cleandoc(run.__doc__ or "").partition("\n\n")
         description, _, examples = rest.rpartition("\n\n")
-        sub = subparsers.add_parser(
-            name,
-            help=summary[:1].lower() + summary[1:].removesuffix("."),
-            description=description,
-            epilog=examples,
-            formatter_class=Formatter,
-            allow_abbrev=False,
-        )
+        texts = {"description": description, "epilog": examples, "formatter_class": formatter}
+        short = summary[:1].lower() + summary[1:].removesuffix(".")
+        sub = subparsers.add_parser(name, help=short, allow_abbrev=False, **texts)  # type: ignore[arg-type]
         add_arguments(sub)
-        sub.add_argument("--debug", action="store_true", help="show the traceback of an error")
+        group = sub.add_argument_group("files and messages")
+        group.add_argument("--overwrite", action="store_true", help="replace files that exist (default: refuse)")
+        group.add_argument("--quiet", action="store_true", help="report warnings and errors only")
+        group.add_argument("--debug", action="store_true", help="show the traceback of an error")
         # Arguments that contradict each other end with the usage and status 2, like all that argparse refuses.
         sub.set_defaults(command=run, fail=sub.error)
     return parser
@@ -89,7 +85,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         args = build_parser().parse_args(argv)
-        with _print_messages(args):
+        args.progress, args.report = (False, lambda line: None) if args.quiet else (None, _print_line)
+        with _print_messages(args.quiet):
             code = args.command(args) or 0
         sys.stdout.flush()
         return code
@@ -106,12 +103,16 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise
         if isinstance(error, OSError) and error.strerror:
             reason = f"{str(error.filename)[:300]}: {error.strerror}" if error.filename else error.strerror
-        elif isinstance(error, MemoryError):
-            reason = "out of memory; take fewer levels or a smaller mesh"
         else:
             reason = str(error) or type(error).__name__
         _print_error(f"error: {reason}")
         return 1
+
+
+def _print_line(line: str) -> None:
+    """Print a line at once; characters that the terminal cannot show are escaped."""
+    encoding = sys.stdout.encoding or "utf-8"
+    print(line.encode(encoding, "backslashreplace").decode(encoding), flush=True)
 
 
 def _print_error(message: str) -> None:
@@ -120,8 +121,8 @@ def _print_error(message: str) -> None:
 
 
 @contextlib.contextmanager
-def _print_messages(args: argparse.Namespace) -> Iterator[None]:
-    """Print the package's log (all of it with --verbose) and each warning about input or result once, as lines."""
+def _print_messages(quiet: bool) -> Iterator[None]:
+    """Print the package's log, unless quiet, and each warning about input or result once, as lines."""
     seen = set()
 
     def show(message: Warning | str, category: type[Warning], *_: Any) -> None:
@@ -130,9 +131,9 @@ def _print_messages(args: argparse.Namespace) -> Iterator[None]:
             _print_error(f"warning: {message}")
 
     logger, handler = logging.getLogger("torch_modal"), logging.StreamHandler()
+    level = logger.level
     handler.setFormatter(logging.Formatter(f"{PROGRAM}: %(message)s"))
-    verbose, quiet, level = getattr(args, "verbose", False), getattr(args, "quiet", False), logger.level
-    logger.setLevel(logging.DEBUG if verbose else logging.WARNING if quiet else logging.INFO)
+    logger.setLevel(logging.WARNING if quiet else logging.INFO)
     logger.addHandler(handler)
     try:
         with warnings.catch_warnings():

@@ -9,7 +9,7 @@ from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from torch_modal.cli.arguments import add_common, check_output, file_name, number, reporter
+from torch_modal.cli.arguments import check_output, file_name, number
 from torch_modal.io.formats import PAGES
 
 if TYPE_CHECKING:
@@ -19,26 +19,19 @@ if TYPE_CHECKING:
 def add_arguments(sub: argparse.ArgumentParser) -> None:
     """Add the arguments of ``view``."""
     add = sub.add_argument
-    add(
-        "meshes",
-        nargs="+",
-        type=Path,
-        metavar="MESH",
-        help="shapes in their order, a folder, or one animated GLB or NPZ",
-    )
+    text = "shapes in their order, a folder, or one animated GLB or NPZ"
+    add("meshes", nargs="+", type=Path, metavar="MESH", help=text)
     text = "another sequence of as many shapes, of the same faces; may be given several times"
     add("--compare", nargs="+", type=Path, action="append", default=[], metavar="FILE", help=text)
     add("--linear", action="store_true", help="also show linear interpolation of the key-frames of the first sequence")
     text = "which frames are key-frames, from 0 (default: the GLB's, or the first and the last)"
-    add("--keyframes", nargs="+", type=number(int, 0), metavar="N", help=text)
+    add("--keyframes", nargs="+", type=number(int), metavar="N", help=text)
     add("--cyclic", action="store_true", help="the last frame leads on to the first")
-    add("--fps", type=number(float, 0, above=True), metavar="X", help="frames a second (default: the GLB's, or 24)")
-    add("--up", choices=("y", "z"), help="what is up (default: Y, unless the first shape is flat in Y)")
+    add("--fps", type=number(float), metavar="X", help="frames a second (default: the GLB's, or 24)")
     text = "write the page there, as .html (default: a temporary file, opened)"
     add("--page", type=file_name(PAGES), metavar="FILE", help=text)
     text = "a page to pick landmarks of two meshes or more; it starts with the landmarks of FILE, if given"
     add("--landmarks", nargs="?", const=True, metavar="FILE", help=text)
-    add_common(sub, "replace the file if it exists (default: refuse)", cache_dir=None)
 
 
 def run(args: argparse.Namespace) -> None:
@@ -68,12 +61,12 @@ def run(args: argparse.Namespace) -> None:
         args.fail("--landmarks needs two meshes or more")
     if args.page:
         inputs = [] if args.landmarks in (None, True) else [Path(args.landmarks)]
-        check_output([args.page], [*chain(*sequences), *inputs], args.overwrite)
+        check_output(args, [args.page], [*chain(*sequences), *inputs])
 
     page, what = _landmarks(args) if args.landmarks else _sequences(sequences, args)
     # Without --page it goes to a temporary folder, and stays: the browser reads it after this process.
     path = page.save(args.page or Path(tempfile.mkdtemp(prefix="torch_modal-"), "page.html"), args.overwrite)
-    reporter(args)(f"{what}: {path}")
+    args.report(f"{what}: {path}")
     if not args.page and not webbrowser.open(path.absolute().as_uri()):
         print(f"no browser was found to open it; open it yourself, or write it elsewhere with --page: {path}")
 
@@ -98,9 +91,11 @@ def _sequences(sequences: list[list[Path]], args: argparse.Namespace) -> tuple[P
     import torch_modal as tm
     from torch_modal.data.sequence import read_shapes
     from torch_modal.io.read import require_same_mesh
+    from torch_modal.io.write import check_indices
 
     first, faces, options = read_shapes(sequences[0])
-    names, shapes, n = [_sequence_name(paths) for paths in sequences], [first], len(first)
+    names = [(paths[0] if len(paths) == 1 else paths[0].parent).absolute().stem for paths in sequences]
+    shapes, n = [first], len(first)
     for paths in sequences[1:]:
         frames, other_faces, _ = read_shapes(paths)
         require_same_mesh(sequences[0][0], (first[0], faces), paths[0], (frames[0], other_faces))
@@ -109,24 +104,16 @@ def _sequences(sequences: list[list[Path]], args: argparse.Namespace) -> tuple[P
                 f"{paths[0]} has {len(frames)} shapes, {sequences[0][0]} has {n}; compared sequences need equally many"
             )
         shapes.append(frames)
-    asked = {"keyframe_indices": args.keyframes, "fps": args.fps, "cyclic": args.cyclic or None, "up": args.up}
+    asked = {"keyframe_indices": args.keyframes, "fps": args.fps, "cyclic": args.cyclic or None}
     options |= {name: value for name, value in asked.items() if value is not None}
     if args.linear:
-        keys, cyclic = sorted(set(options.get("keyframe_indices") or [0, n - 1])), options.get("cyclic", False)
-        if keys[0] != 0 or keys[-1] >= n or (keys[-1] != n - 1 and not cyclic):
-            ends = "the first frame (0)" if cyclic else f"the first frame (0) and the last ({n - 1})"
-            raise ValueError(f"--linear needs {ends} among the key-frames, got {' '.join(map(str, keys))}")
+        keys = check_indices({0, *(options.get("keyframe_indices") or [n - 1])}, n, "key-frames")
+        places = [*keys, n] if options.get("cyclic") else sorted({*keys, n - 1})
         names.append("linear")
-        shapes.append(tm.linear_sequence(torch.from_numpy(first[keys]), [*keys, n] if cyclic else keys).numpy())
+        shapes.append(tm.linear_sequence(torch.from_numpy(first[places[: len(keys)]]), places).numpy())
     page = tm.show(dict(zip(_number_names(names), shapes, strict=True)), faces, **options, title=names[0])
     times = f"{len(shapes)} x " if len(shapes) > 1 else ""
     return page, f"{times}{n} shapes of {first.shape[1]} vertices"
-
-
-def _sequence_name(paths: list[Path]) -> str:
-    """Name of a sequence: its only file or folder, or the folder of its files."""
-    path = paths[0].absolute() if len(paths) == 1 else paths[0].absolute().parent
-    return path.stem if path.is_file() else path.name
 
 
 def _number_names(names: list[str]) -> list[str]:

@@ -17,7 +17,7 @@ from torch_modal.elastic.implicit import ConvergenceWarning
 from torch_modal.elastic.minimise import Status
 from torch_modal.inbetween.results import InBetweenResult
 from torch_modal.inbetween.settings import Settings
-from torch_modal.io.cache import CacheWarning, ContentError, code_digest, content_digest
+from torch_modal.io.cache import CACHE_VERSION, CacheWarning, ContentError, content_digest
 from torch_modal.io.tensors import read_tensors, write_tensors
 from torch_modal.layers.in_between import InBetween
 from torch_modal.modes.basis import ModalBasis
@@ -172,9 +172,9 @@ class PairTables:
         return {"times": str(self.times), "dtype": str(self.dtype), "content": content}
 
 
-def versions() -> tuple[str, str, str]:
+def versions() -> tuple[str, str, int]:
     """Versions that enter the key of a table."""
-    return __version__, str(torch.__version__), code_digest()
+    return __version__, str(torch.__version__), CACHE_VERSION
 
 
 def compute_by_kind(kinds: Tensor, compute: Callable[[list[int], Tensor], Tensor]) -> Tensor:

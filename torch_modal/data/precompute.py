@@ -52,8 +52,6 @@ class Options:
     n_modes: int = 30
     method: Method = "auto"
     mesher: str = "auto"
-    cache_dir: str | None = None
-    """None: no cache."""
     timeout: float = 600.0
     """Seconds for a set."""
     overwrite: bool = False
@@ -277,8 +275,7 @@ def compute(source: Path, target: Path, record: Record, options: Options) -> Non
             options.n_modes,
             method=options.method,
             mesher=options.mesher,
-            cache_dir=options.cache_dir,
-            cache=options.cache_dir is not None,
+            cache=False,
             progress=False,
         )
     texts = (" ".join(str(one.message).split()) for one in caught if issubclass(one.category, UserWarning))

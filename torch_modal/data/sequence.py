@@ -143,18 +143,14 @@ def _animation(asset: GltfAsset, fps: float | None) -> tuple[FloatArray, dict[st
         rate = round(rate) if abs(rate - round(rate)) < 0.01 * rate else rate
         n = int((keys[-1] - keys[0]) * rate + 1.001)
         return asset.play(keys[0] + np.arange(n) / rate), {"fps": float(rate)}
-    kept = [int(number) for number in extras["frames"]]
-    keyframes = [kept.index(number) for number in extras["keyframes"] if number in kept]
-    n, back, rate = len(kept), bool(extras.get("ping_pong")), float(extras["fps"])
+    n = len(extras["frames"])
+    keyframes = [number for number in extras["keyframes"] if number < n]
+    back, rate = bool(extras.get("ping_pong")), float(extras["fps"])
     closed = len(keys) == n + 1 and not back
     if len(keys) != (2 * n - 1 if back else n + closed):
         raise ValueError(f"{n} frames, {len(keys)} times")
     times = keys[:n]
     options: dict[str, Any] = {"keyframe_indices": keyframes or None, "cyclic": closed, "fps": rate}
-    # Steps in time differ where frames of a long sequence were left out, or with ease.
-    even = np.allclose(np.diff(times), times[-1] / (n - 1), rtol=1e-4)
-    if not even or kept != list(range(n)):
-        options["fps"] = float((n - 1) / times[-1])
-    if not even:
-        options["times"] = times.tolist()
+    if not np.allclose(np.diff(times), times[-1] / (n - 1), rtol=1e-4):
+        options |= {"fps": float((n - 1) / times[-1]), "times": times.tolist()}
     return asset.play(times), options

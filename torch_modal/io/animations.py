@@ -7,22 +7,23 @@ from typing import Any
 import numpy as np
 
 from torch_modal.io.asset import CLAY
-from torch_modal.io.formats import ANIMATION_FORMATS, Animation, resample
+from torch_modal.io.formats import Animation, resample
 
 
-def write_mdd(animation: Animation, path: Path) -> None:
-    """Write LightWave's point cache: big-endian counts, times in seconds, float32 positions, at the timing's rate."""
+def write_point_cache(animation: Animation, path: Path) -> None:
+    """Write float32 positions at the timing's rate, as LightWave's cache (MDD) or 3ds Max's (PC2, version 1).
+
+    MDD is big-endian and has times in seconds; PC2 is little-endian, one sample a frame from frame 0 on.
+    """
     sampled = resample(animation.shapes, animation.timing.samples())
-    times = np.arange(len(sampled)) / animation.timing.fps
-    head = struct.pack(">2i", *sampled.shape[:2])
-    path.write_bytes(head + times.astype(">f4").tobytes() + sampled.astype(">f4").tobytes())
-
-
-def write_pc2(animation: Animation, path: Path) -> None:
-    """Write 3ds Max's point cache, version 1: one sample a frame from frame 0 on, float32 positions."""
-    sampled = resample(animation.shapes, animation.timing.samples())
-    head = struct.pack("<12siiffi", b"POINTCACHE2\0", 1, sampled.shape[1], 0.0, 1.0, len(sampled))
-    path.write_bytes(head + sampled.astype("<f4").tobytes())
+    n, n_vertices = sampled.shape[:2]
+    if path.suffix.lower() == ".mdd":
+        order = ">"
+        head = struct.pack(">2i", n, n_vertices) + (np.arange(n) / animation.timing.fps).astype(">f4").tobytes()
+    else:
+        order = "<"
+        head = struct.pack("<12siiffi", b"POINTCACHE2\0", 1, n_vertices, 0.0, 1.0, n)
+    path.write_bytes(head + sampled.astype(f"{order}f4").tobytes())
 
 
 def write_npz(animation: Animation, path: Path) -> None:
@@ -41,8 +42,6 @@ def write_usd(animation: Animation, path: Path) -> None:
     from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 
     shapes, faces, timing, asset = animation.shapes, animation.faces, animation.timing, animation.asset
-    if asset is not None:
-        asset.warn_lost(animation.name, ANIMATION_FORMATS[".usd"].holds)
     triangles = np.full(len(faces), 3), faces.reshape(-1), None
     sizes, corners, texcoords = triangles if asset is None else asset.polygons()
     times, shown = timing.knots()
@@ -63,9 +62,9 @@ def write_usd(animation: Animation, path: Path) -> None:
     points, extent = mesh.CreatePointsAttr(), mesh.CreateExtentAttr()
     for code, number in zip(codes.tolist(), shown.tolist(), strict=True):
         at = Usd.TimeCode(code) if len(codes) > 1 else Usd.TimeCode.Default()
-        points.Set(Vt.Vec3fArray.FromNumpy(single[number]), at)
-        bounds = np.stack([single[number].min(axis=0), single[number].max(axis=0)])
-        extent.Set(Vt.Vec3fArray.FromNumpy(bounds), at)
+        place = Vt.Vec3fArray.FromNumpy(single[number])
+        points.Set(place, at)
+        extent.Set(UsdGeom.PointBased.ComputeExtent(place), at)
     primvars = UsdGeom.PrimvarsAPI(mesh)
     if texcoords is not None:
         st = primvars.CreatePrimvar("st", Sdf.ValueTypeNames.TexCoord2fArray, UsdGeom.Tokens.faceVarying)

@@ -60,7 +60,7 @@ class Part(NamedTuple):
     triangles: IntArray  # (F, 3) indices of points
     material: Material
     texcoords: FloatArray | None = None  # (P, 2) origin at the upper left, as in glTF
-    colors: FloatArray | None = None  # (P, 4) linear RGBA
+    colors: FloatArray | None = None  # (P, 4) linear RGBA, or (P, 3)
     normals: FloatArray | None = None  # (P, 3) as the file has them
 
 
@@ -110,17 +110,21 @@ class Asset(ABC):
         """Files that a copy needs in its folder, by their names there: material libraries, textures."""
         return {}
 
-    def check(self, shapes: FloatArray) -> None:
-        """Raise a ValueError unless shapes have as many vertices as this mesh. *Shape:* ``(N, V, 3)``."""
+    def check(self, shapes: FloatArray, path: Path, holds: Collection[str]) -> None:
+        """Check that shapes can be written to a file with this asset, and warn of its features that the file lacks.
+
+        *Shape:* ``(N, V, 3)``. ``holds`` has the features that the file's format takes from assets of other formats.
+
+        Raises:
+            ValueError: Shapes do not have as many vertices as this mesh.
+        """
         if shapes.shape[1] != len(self.positions):
             raise ValueError(
                 f"{self.path} has {len(self.positions)} vertices, the frames have {shapes.shape[1]}; an asset takes "
                 "frames of its own mesh"
             )
-
-    def warn_lost(self, name: str, holds: Collection[str]) -> None:
-        """Warn of the asset's features that a file of this name cannot hold; ``holds`` has those that it can."""
+        holds = self.keeps if path.suffix.lower() == self.suffix else holds
         lost = [name for feature, name in self.carries.items() if feature not in holds]
         if lost:
-            listed = lost[0] if len(lost) == 1 else ", ".join(lost[:-1]) + " and " + lost[-1]
-            warnings.warn(f"{name} is without the {listed} of {self.path.name}", MeshWarning, stacklevel=4)
+            listed = " and ".join(filter(None, [", ".join(lost[:-1]), lost[-1]]))
+            warnings.warn(f"{path.name} is without the {listed} of {self.path.name}", MeshWarning, stacklevel=4)

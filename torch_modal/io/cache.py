@@ -6,12 +6,11 @@ import os
 import re
 import struct
 import sys
-import time
 import warnings
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from functools import cache
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -21,17 +20,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torch_modal.io.tensors import bytes_of, read_tensors, write_tensors
-from torch_modal.version import __version__
 
 CACHE_VERSION = 6  # part of every key: raise it when the algorithm of cached results changes
 CACHE_VARIABLE = "TORCH_MODAL_CACHE"
 LIMIT_VARIABLE = "TORCH_MODAL_CACHE_LIMIT"
 DEFAULT_LIMIT = 4 * 2**30
-KEPT_FRACTION = 0.9  # of the limit: what is left after entries were removed, so that not each new entry removes others
-ABANDONED = 3600.0  # age in seconds from which a partial file belongs to no running process
 FORMAT = "torch_modal.cache"
 SUFFIX = ".safetensors"
-_ENTRY_NAME = re.compile(r"[a-z]+-[0-9a-f]{64}\.safetensors|\.[a-z]+-[0-9a-f]{64}\.safetensors\..+\.tmp")
+_ENTRY_NAME = re.compile(r"[a-z]+-[0-9a-f]{64}\.safetensors")
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -44,28 +40,6 @@ class ContentError(ValueError):
     """An object has no digest, as its contents are not plain data."""
 
 
-def default_cache_dir() -> Path:
-    """The folder named by ``TORCH_MODAL_CACHE``, or ``torch_modal`` in the user's cache folder."""
-    if named := os.environ.get(CACHE_VARIABLE):
-        return Path(named).expanduser()
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "torch_modal"
-
-
-def size_limit() -> int:
-    """Largest size of a cache folder in bytes: ``TORCH_MODAL_CACHE_LIMIT``, such as ``500M`` or ``4G``, or 4 GiB."""
-    named = os.environ.get(LIMIT_VARIABLE)
-    if not named:
-        return DEFAULT_LIMIT
-    match = re.fullmatch(r"(\d+(?:\.\d+)?) ?(?:([KMGT])(?:i?B)?|B)?", named.strip(), re.IGNORECASE)
-    if match is None:
-        raise ValueError(
-            f"the environment variable {LIMIT_VARIABLE}: {named!r} is no size; give a number of bytes, or something "
-            "like 500M or 4G"
-        )
-    number, unit = match.groups()
-    return int(float(number) * 1024 ** (" KMGT".index((unit or " ").upper())))
-
-
 @dataclass(frozen=True)
 class Cache:
     """A folder of files, one per result, each with digests that every read verifies.
@@ -75,14 +49,24 @@ class Cache:
     """
 
     folder: Path | None  # made when the first entry is written; with None nothing is cached
-    limit: int = DEFAULT_LIMIT  # bytes of all entries; a single one may be larger
+    limit: float = DEFAULT_LIMIT  # bytes of all entries; a single one may be larger
 
     @classmethod
     def at(cls, cache_dir: str | os.PathLike[str] | None = None, *, enabled: bool = True) -> "Cache":
-        """The cache in a folder, by default in :func:`default_cache_dir`, or a disabled one."""
+        """The cache in a folder, or a disabled one.
+
+        The default is ``TORCH_MODAL_CACHE``, or ``torch_modal`` in the user's cache folder. The limit is
+        ``TORCH_MODAL_CACHE_LIMIT``, in bytes, or 4 GiB.
+        """
         if not enabled:
             return cls(None)
-        return cls(default_cache_dir() if cache_dir is None else Path(cache_dir).expanduser(), size_limit())
+        users = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
+        folder = cache_dir or os.environ.get(CACHE_VARIABLE) or os.path.join(users, "torch_modal")
+        limit = os.environ.get(LIMIT_VARIABLE) or DEFAULT_LIMIT
+        try:
+            return cls(Path(folder).expanduser(), float(limit))
+        except ValueError:
+            raise ValueError(f"the environment variable {LIMIT_VARIABLE} is a number of bytes, got {limit!r}") from None
 
     def get(
         self,
@@ -117,25 +101,19 @@ class Cache:
     def _make_room(self, newest: Path) -> None:
         """Remove the entries that were not used for the longest time, if all take too much; the newest one stays.
 
-        Entries and partial files are known by their names: the user's own files in the folder stay.
+        Entries are known by their names: the user's own files in the folder stay.
         """
         entries = []
         for path in newest.parent.iterdir():
             if _ENTRY_NAME.fullmatch(path.name):
                 with contextlib.suppress(FileNotFoundError):  # another process removed it
-                    entries.append((path, path.stat()))
-        total = sum(stat.st_size for _, stat in entries)
-        if total <= self.limit:
-            return
-        for path, stat in sorted(entries, key=lambda entry: entry[1].st_mtime_ns):
-            being_written = path.suffix != SUFFIX and time.time() - stat.st_mtime < ABANDONED
-            if path == newest or being_written:
-                continue
-            if total <= KEPT_FRACTION * self.limit:
-                break
-            total -= stat.st_size
-            with contextlib.suppress(OSError):  # another process removed it, or has it open
-                path.unlink()
+                    entries.append((path == newest, path.stat().st_mtime_ns, path.stat().st_size, path))
+        room = self.limit
+        for is_newest, _, size, path in sorted(entries, reverse=True):
+            room -= size
+            if room < 0 and not is_newest:
+                with contextlib.suppress(OSError):  # another process removed it, or has it open
+                    path.unlink()
 
 
 def entry_name(kind: str, inputs: Mapping[str, NDArray[Any]], parameters: Mapping[str, Any]) -> str:
@@ -157,25 +135,13 @@ def content_digest(value: Any) -> str:
         raise ContentError(f"a {type(value).__name__} is nested too deeply") from None
 
 
-@cache
-def code_digest() -> str:
-    """SHA-256 of the package's code, which may change while its version does not."""
-    root = Path(__file__).parents[1]
-    files = sorted(root.rglob("*.py"))
-    parts = [chunk for file in files for chunk in (file.relative_to(root).as_posix().encode(), file.read_bytes())]
-    return _hash_items(__version__, parts).hex()
-
-
 def _digest(value: Any) -> bytes:
     kind = type(value)
     if value is None or kind in (bool, int, float, str):
         return _hash_items(kind.__name__, [repr(value).encode("utf-8", "surrogatepass")])
-    if kind in (list, tuple):
-        return _hash_items(kind.__name__, map(_digest, value))
-    if kind in (dict, OrderedDict):
-        return _hash_items(kind.__name__, (_digest(item) for pair in value.items() for item in pair))
-    if kind in (set, frozenset):
-        return _hash_items(kind.__name__, sorted(map(_digest, value)))
+    if kind in (list, tuple, dict, OrderedDict, set, frozenset):
+        digests = map(_digest, chain(*value.items()) if isinstance(value, dict) else value)
+        return _hash_items(kind.__name__, sorted(digests) if isinstance(value, (set, frozenset)) else digests)
     if kind in (Tensor, torch.nn.Parameter):
         x = value.detach()
         if x.layout is not torch.strided or x.is_meta or torch.func.debug_unwrap(x, recurse=False) is not x:

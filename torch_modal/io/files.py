@@ -1,7 +1,6 @@
 """Atomic writes, after which a file is whole or absent, and reads of the files that a mesh file names."""
 
 import contextlib
-import logging
 import os
 import uuid
 import warnings
@@ -9,8 +8,6 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from torch_modal.errors import MeshWarning
-
-logger = logging.getLogger("torch_modal")
 
 LARGEST_COMPANION = 2**30  # bytes
 
@@ -64,18 +61,9 @@ def try_companion(document: Path, name: str, what: str, most: int = LARGEST_COMP
     return None
 
 
-def write_file(path: Path, data: bytes) -> None:
-    """Write a whole file or nothing; its folder is made if missing."""
-    write_files([(path, data)])
-
-
 def write_files(files: Iterable[tuple[Path, bytes]]) -> None:
     """Write all files or none: they are moved to their places after the last one was written; folders are made."""
-    sizes = {}
     with contextlib.ExitStack() as written:
         for path, data in files:
             path.parent.mkdir(parents=True, exist_ok=True)
             written.enter_context(atomic_write(path)).write_bytes(data)
-            sizes[path] = len(data) / 1000
-    for path, size in sizes.items():
-        logger.debug("wrote %s, %.1f kB", path, size)

@@ -10,16 +10,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from torch_modal.arrays import FloatArray, IntArray
+from torch_modal.extras import require_installed
+from torch_modal.io.asset import FEATURES, Asset
 from torch_modal.progress import Progress
 from torch_modal.times import check_times
 
 if TYPE_CHECKING:
     from torch_modal.geometry.skin import Skin
-    from torch_modal.io.asset import Asset
 
-SECONDS_OF_A_PAIR = 2.0
-SECONDS_OF_A_CYCLE = 1.0
-SECONDS_OF_AN_INTERVAL = 1.0
 FPS = 24.0
 
 
@@ -44,6 +42,10 @@ class OutputFormat:
     modules: Collection[str] = ()
     extra: str = ""
 
+    def check_installed(self, name: str) -> None:
+        """Raise a MissingPackageError that names the file, before any work, if a module is not installed."""
+        require_installed(self.modules, self.extra, name)
+
     def write(self, *arguments: Any) -> Any:
         """Call the function."""
         function = resolve_name(self.function) if isinstance(self.function, str) else self.function
@@ -60,16 +62,16 @@ MESH_FORMATS: dict[str, OutputFormat] = {
 }
 ANIMATION_FORMATS: dict[str, OutputFormat] = {
     ".glb": OutputFormat("torch_modal.io.glb:write_glb", GLB_HOLDS),
-    ".mp4": OutputFormat("torch_modal.view.animation:write_mp4", (), ("imageio", "imageio_ffmpeg"), "video"),
-    ".gif": OutputFormat("torch_modal.view.animation:write_gif"),
+    ".mp4": OutputFormat("torch_modal.view.animation:write_mp4", FEATURES, ("imageio", "imageio_ffmpeg"), "video"),
+    ".gif": OutputFormat("torch_modal.view.animation:write_gif", FEATURES),
     **dict.fromkeys(
         (".usd", ".usda", ".usdc"),
         OutputFormat("torch_modal.io.animations:write_usd", ("polygons", "texcoords", "colors"), ("pxr",), "usd"),
     ),
-    ".mdd": OutputFormat("torch_modal.io.animations:write_mdd"),
-    ".pc2": OutputFormat("torch_modal.io.animations:write_pc2"),
-    ".npz": OutputFormat("torch_modal.io.animations:write_npz"),
+    **dict.fromkeys((".mdd", ".pc2"), OutputFormat("torch_modal.io.animations:write_point_cache", FEATURES)),
+    ".npz": OutputFormat("torch_modal.io.animations:write_npz", FEATURES),
 }
+"""Videos and point caches have shapes alone, of which nobody needs a warning."""
 PICTURES = (".png", ".pdf")
 PAGES = (".html", ".htm")
 
@@ -96,36 +98,26 @@ class Timing:
         times: Sequence[float] | FloatArray | None = None,
     ) -> None:
         for name, value in (("duration", duration), ("fps", fps)):
-            if value is not None and not (np.isfinite(value) and value > 0):
+            if value is not None and not 0 < value < np.inf:
                 raise ValueError(f"{name} must be a positive number, got {value}")
         if cyclic and (ping_pong or ease):
-            name = "ping_pong" if ping_pong else "ease"
-            raise ValueError(f"{name} is for sequences that begin and end; a cyclic one does neither")
+            raise ValueError("ping_pong and ease are for sequences that begin and end; a cyclic one does neither")
         steps = max(n_frames if cyclic else n_frames - 1, 1)
-        if duration is None and fps is not None:
-            duration = steps / fps
-        elif duration is None:
-            of_keyframes = max(SECONDS_OF_A_PAIR, SECONDS_OF_AN_INTERVAL * (n_keyframes - 1))
-            duration = SECONDS_OF_A_CYCLE if cyclic else of_keyframes
         #: Time of each frame over the duration, from 0 on. *Shape:* ``(N,)``.
         self.parts = np.arange(n_frames) / steps
         if times is not None:
             when = check_times(times, n_frames, cyclic, "frame").numpy()
             if len(when) > 1:
                 self.parts = ((when - when[0]) / (when[-1] - when[0]))[:n_frames]
+        by_default = 1.0 if cyclic else max(2.0, n_keyframes - 1)  # a second for each interval of three and more
         #: Seconds of the sequence once, for a cycle with the step back to its start; pictures a second at a fixed rate.
-        self.duration, self.fps = float(duration), float(FPS if fps is None else fps)
+        self.duration = float(duration or (steps / fps if fps else by_default))
+        self.fps = float(fps or FPS)
         self.cyclic, self.ping_pong, self.ease = cyclic, ping_pong, ease
 
-    def knots(self, frames: IntArray | None = None) -> tuple[FloatArray, IntArray]:
-        """Times in seconds, and the index of the frame shown at each; players interpolate between them linearly.
-
-        Indices are into all frames, or into the given ones, which ascend. *Shape:* ``(n,) -> (T,), (T,)``.
-        """
-        parts = self.parts if frames is None else self.parts[frames]
-        places = np.arange(len(parts))
-        if len(parts) == 1:
-            return np.zeros(1), places
+    def knots(self) -> tuple[FloatArray, IntArray]:
+        """Times in seconds, and the index of the frame shown at each; players interpolate between them linearly."""
+        parts, places = self.parts, np.arange(len(self.parts))
         if self.ease:
             parts = np.arccos(np.clip(1 - 2 * parts, -1, 1)) / np.pi
         times = self.duration * parts
@@ -174,7 +166,6 @@ class Animation(NamedTuple):
     keyframes: list[int]
     """Frame numbers of the key-frames."""
     asset: Asset | None
-    max_targets: int
     progress: Progress
     skin: Skin | None = None
     """The motion as bones, instead of morph targets."""

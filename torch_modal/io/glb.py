@@ -11,13 +11,12 @@ from torch_modal.geometry.connectivity import merge_seams
 from torch_modal.geometry.skin import Skin
 from torch_modal.geometry.vectors import vertex_normals
 from torch_modal.io.asset import Asset, Material, Part
-from torch_modal.io.formats import GLB_HOLDS, Animation
+from torch_modal.io.formats import Animation
 from torch_modal.io.gltf import ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER, Document, Json, world_transforms
 from torch_modal.io.gltf_asset import GltfAsset
 from torch_modal.io.normals import carry_together
 
-# Normals double the file. If POSITION alone is larger than this, normals do not move.
-LARGEST_FILE_WITH_NORMALS = 48 * 2**20
+MANY_TARGETS = 64
 SMALLEST_EXTENT = 1e-30  # instead of zero, where shapes do not move
 
 
@@ -32,36 +31,26 @@ def write_glb(animation: Animation, path: Path) -> None:
     An asset that is a GLB or GLTF file also contributes its nodes and everything else.
     """
     shapes, asset, timing, keyframes = animation.shapes, animation.asset, animation.timing, animation.keyframes
-    name, max_targets = animation.name, animation.max_targets
-    if max_targets < 1:
-        raise ValueError(f"max_targets must be at least 1, got {max_targets}")
-    skin, n_targets = animation.skin, animation.targets
-    kept = np.arange(len(shapes)) if skin or n_targets else thin_frames(len(shapes), max_targets + 1, keyframes)
-    if len(kept) < len(shapes):
+    skin, n_targets, name = animation.skin, animation.targets, animation.name
+    if skin is None and n_targets is None and len(shapes) > MANY_TARGETS:
         warnings.warn(
-            f"{name} holds {len(kept)} of the {len(shapes)} frames (max_targets={max_targets}); "
-            "players interpolate linearly between them",
+            f"{name} has {len(shapes) - 1} morph targets, which players hold in memory; bones or targets are smaller",
             stacklevel=3,
         )
     if skin is not None:
-        drawn, weights = skin.rest[None].double().cpu().numpy(), np.empty((len(kept), 0))
+        drawn, weights = skin.rest[None].double().cpu().numpy(), np.empty((len(shapes), 0))
     elif n_targets:
         drawn, weights = _principal(shapes, n_targets)
     else:
-        drawn, weights = shapes[kept], np.eye(len(kept))[:, 1:]  # frame n is the target n - 1 alone
-    move_normals = drawn.size * 4 <= LARGEST_FILE_WITH_NORMALS
-    if not move_normals:
-        warnings.warn(f"{name} is large: its normals do not move with the shape", stacklevel=3)
-    if asset is not None:
-        asset.warn_lost(name, asset.keeps if isinstance(asset, GltfAsset) else GLB_HOLDS)
+        drawn, weights = shapes, np.eye(len(shapes))[:, 1:]  # frame n is the target n - 1 alone
     if isinstance(asset, GltfAsset):
-        document = asset.rebuild(drawn, move_normals)
+        document = asset.rebuild(drawn)
     else:
-        document = _document(drawn, animation.faces, asset, Path(name).stem, move_normals)
-    if len(kept) > 1:
-        times, shown = timing.knots(kept)
+        document = _document(drawn, animation.faces, asset, Path(name).stem)
+    if len(shapes) > 1:
+        times, shown = timing.knots()
         steps = len(shapes) if timing.cyclic else len(shapes) - 1
-        extras: Json = {"fps": steps / timing.duration, "frames": kept.tolist(), "keyframes": keyframes}
+        extras: Json = {"fps": steps / timing.duration, "frames": list(range(len(shapes))), "keyframes": keyframes}
         if timing.ping_pong:
             extras["ping_pong"] = True
         inputs = document.add(times.astype(np.float32), "SCALAR", bounds=True)
@@ -71,7 +60,7 @@ def write_glb(animation: Animation, path: Path) -> None:
             rows = weights[shown]
             outputs = document.add(rows.astype(np.float32).reshape(-1), "SCALAR")
             samplers = [{"input": inputs, "output": outputs, "interpolation": "LINEAR"}]
-            names = [f"principal-{n}" if n_targets else f"frame-{kept[n]:03d}" for n in range(1, len(drawn))]
+            names = [f"principal-{n}" if n_targets else f"frame-{n:03d}" for n in range(1, len(drawn))]
             for mesh in document.get("meshes"):
                 mesh["weights"] = rows[0].tolist()
                 mesh["extras"] = {**mesh.get("extras", {}), "targetNames": names}
@@ -82,20 +71,6 @@ def write_glb(animation: Animation, path: Path) -> None:
     path.write_bytes(document.to_glb())
 
 
-def thin_frames(n_frames: int, most: int, wanted: list[int]) -> IntArray:
-    """Choose at most ``most`` frame numbers, evenly spread, with both ends and, if they fit, the wanted ones."""
-    if n_frames <= most:
-        return np.arange(n_frames)
-    fixed = sorted({0, n_frames - 1, *wanted})
-    if len(fixed) > most:
-        return np.unique(np.linspace(0, n_frames - 1, most).round().astype(np.int64))
-    gaps, pieces = np.diff(fixed), np.ones(len(fixed) - 1, dtype=np.int64)
-    for _ in range(most - len(fixed)):
-        pieces[np.argmax(gaps / pieces)] += 1  # the widest step is shortened
-    inside = [np.linspace(a, b, n + 1) for a, b, n in zip(fixed[:-1], fixed[1:], pieces, strict=True)]
-    return np.unique(np.concatenate(inside).round().astype(np.int64))
-
-
 def _principal(shapes: FloatArray, n: int) -> tuple[FloatArray, FloatArray]:
     """A base shape, the base plus each of the first n principal shapes, and their weights in the frames, from 0 to 1.
 
@@ -103,15 +78,10 @@ def _principal(shapes: FloatArray, n: int) -> tuple[FloatArray, FloatArray]:
     ``(N, V, 3) -> (1 + n, V, 3), (N, n)``; n is smaller where fewer give the frames exactly.
     """
     mean = shapes.mean(0)
-    moved = (shapes - mean).reshape(len(shapes), -1)
-    few = len(moved) <= moved.shape[1]
-    values, vectors = np.linalg.eigh(moved @ moved.T if few else moved.T @ moved)
-    vectors = vectors[:, np.flatnonzero(values >= 1e-14 * values[-1])[::-1][:n]]
-    if not few:
-        vectors = moved @ vectors
-        vectors /= np.maximum(np.linalg.norm(vectors, axis=0), SMALLEST_EXTENT)
+    vectors, sizes, components = np.linalg.svd((shapes - mean).reshape(len(shapes), -1), full_matrices=False)
+    n = min(n, int((sizes >= 1e-7 * sizes[0]).sum()))
+    vectors, parts = vectors[:, :n], (sizes[:n, None] * components[:n]).reshape(n, *mean.shape)
     low, extent = vectors.min(0), np.maximum(np.ptp(vectors, axis=0), SMALLEST_EXTENT)
-    parts = (vectors.T @ moved).reshape(-1, *mean.shape)
     base = mean + np.tensordot(low, parts, 1)
     return np.concatenate([base[None], base + extent[:, None, None] * parts]), (vectors - low) / extent
 
@@ -166,19 +136,16 @@ def _add_skin(
     return samplers, channels
 
 
-def _document(
-    shapes: FloatArray, faces: IntArray, asset: Asset | None, name: str, move_normals: bool = True
-) -> Document:
+def _document(shapes: FloatArray, faces: IntArray, asset: Asset | None, name: str) -> Document:
     """Document of one node, with shapes as morph targets: the parts of an asset, or all faces in clay without one."""
     parts = [Part(np.arange(shapes.shape[1]), faces, Material())] if asset is None else asset.parts()
     positions = shapes[0] if asset is None else asset.positions
-    frames = shapes if move_normals else shapes[:1]
     copies = merge_seams(shapes[[0, -1]], faces)
     _, first = np.unique(copies, return_index=True)
-    smooth = np.stack([vertex_normals(shape[first], copies[faces])[copies] for shape in frames])
+    smooth = np.stack([vertex_normals(shape[first], copies[faces])[copies] for shape in shapes])
     turned = carry_together(
         [(part.normals, positions[part.vertices], part.triangles) for part in parts],
-        [frames[:, part.vertices] for part in parts],
+        [shapes[:, part.vertices] for part in parts],
     )
     document = Document()
     primitives = []

@@ -17,8 +17,7 @@ from urllib.parse import unquote
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
-from trimesh.transformations import quaternion_matrix
+from scipy.spatial.transform import Rotation, Slerp
 
 from torch_modal.arrays import FloatArray
 from torch_modal.errors import MeshWarning
@@ -52,20 +51,13 @@ class Document:
     @classmethod
     def read(cls, path: Path) -> Document:
         """Read a GLB or GLTF file; raises ValueError for other files and other versions of glTF."""
-        text = data = path.read_bytes()
-        binary, place = b"", 12
-        if data[:4] == b"glTF":
-            text = b""
-            while place + 8 <= len(data):
-                length, kind = struct.unpack_from("<I4s", data, place)
-                chunk = data[place + 8 : place + 8 + length]
-                if len(chunk) < length:
-                    raise ValueError("the file was cut off")
-                if kind == b"JSON":
-                    text = chunk
-                elif kind == b"BIN\0" and not binary:
-                    binary = chunk
-                place += 8 + length
+        text, binary = path.read_bytes(), b""
+        if text[:4] == b"glTF":  # a head of 12 bytes, and two chunks of a length, a kind and content
+            data = text
+            length = struct.unpack_from("<I", data, 12)[0]
+            text, rest = data[20 : 20 + length], data[20 + length :]
+            if rest:
+                binary = rest[8 : 8 + struct.unpack_from("<I", rest)[0]]
         root = json.loads(text.decode("utf-8"))
         json.dumps(root, allow_nan=False)  # raises for NaN and infinite numbers, which Python reads
         if not isinstance(root, dict) or not str(root.get("asset", {}).get("version", "")).startswith("2"):
@@ -188,11 +180,15 @@ class Document:
     def add_frames(self, shapes: FloatArray, normals: FloatArray | None) -> Json:
         """Add the points of a primitive; returns attributes for frame 0, and a morph target for each further frame.
 
-        Normals may be given for frame 0 alone. *Shape:* ``(N, P, 3)``, and ``(N, P, 3)`` or ``(1, P, 3)``.
+        *Shape:* ``(N, P, 3)`` of both.
         """
         added: list[Json] = [{"POSITION": self.add(x, "VEC3", ARRAY_BUFFER, bounds=True)} for x in _differences(shapes)]
         if normals is not None:
-            for attributes, x in zip(added, _differences(_unit(normals)), strict=False):
+            # Unit vectors, as glTF demands, which stay bit for bit; (0, 0, 1) instead of zero vectors.
+            length = np.linalg.norm(normals, axis=-1, keepdims=True)
+            units = np.where(np.abs(length - 1) < 1e-6, normals, normals / np.maximum(length, 1e-12))
+            units = np.where(length > 1e-12, units, [0.0, 0.0, 1.0])
+            for attributes, x in zip(added, _differences(units), strict=True):
                 attributes["NORMAL"] = self.add(x, "VEC3", ARRAY_BUFFER)
         return {"attributes": added[0], **({"targets": added[1:]} if added[1:] else {})}
 
@@ -222,39 +218,25 @@ def key_times(document: Document) -> FloatArray:
     return np.unique([time for sampler in samplers for time in document.floats(sampler["input"])])
 
 
-def animate(document: Document, times: FloatArray) -> Tracks:
-    """Values of the first animation at times in seconds, as players compute them. *Shape:* ``(T,)``."""
-    moved: Tracks = {}
-    for animation in document.get("animations")[:1]:
-        for channel in animation["channels"]:
-            sampler, target = animation["samplers"][channel["sampler"]], channel["target"]
-            if "node" in target:
-                values = _sample(document, sampler, times, target["path"] == "rotation")
-                moved[target["node"], target["path"]] = values
-    return moved
-
-
-def _sample(document: Document, sampler: Json, times: FloatArray, quaternions: bool) -> FloatArray:
+def sample(document: Document, sampler: Json, times: FloatArray, quaternions: bool) -> FloatArray:
     """Values of a sampler, constant before the first key and after the last. *Shape:* ``(T,) -> (T, width)``."""
     keys, mode = document.floats(sampler["input"])[:, 0], sampler.get("interpolation", "LINEAR")
     # Cubics have a tangent before and after each value.
     values = document.floats(sampler["output"]).reshape(len(keys), 3 if mode == "CUBICSPLINE" else 1, -1)
-    middle = values.shape[1] // 2
-    i = np.clip(np.searchsorted(keys, times, "right") - 1, 0, len(keys) - 1)
-    j = np.minimum(i + 1, len(keys) - 1)
-    seconds = (keys[j] - keys[i])[:, None]
-    u = np.clip((times - keys[i])[:, None] / np.maximum(seconds, 1e-30), 0.0, 1.0)
-    a, b = values[i, middle], values[j, middle]
-    if mode == "STEP":
-        return np.where(u < 1, a, b)
+    before, middle, after = values[:, 0], values[:, values.shape[1] // 2], values[:, -1]
+    times = np.clip(times, keys[0], keys[-1])
+    i = np.searchsorted(keys, times, "right") - 1
+    if mode == "STEP" or len(keys) == 1:
+        return middle[i]
+    if quaternions and mode == "LINEAR":
+        return np.asarray(Slerp(keys, Rotation.from_quat(middle))(times).as_quat())
+    i = np.minimum(i, len(keys) - 2)
+    seconds = (keys[i + 1] - keys[i])[:, None]
+    u = (times - keys[i])[:, None] / np.maximum(seconds, 1e-30)
     if mode == "CUBICSPLINE":  # glTF 2.0, appendix C.5
-        tangents = values[i, 2] * u * (1 - u) ** 2 + values[j, 0] * u**2 * (u - 1)
-        return (1 + 2 * u) * (1 - u) ** 2 * a + u**2 * (3 - 2 * u) * b + seconds * tangents
-    if quaternions:
-        first = Rotation.from_quat(a)
-        turn = (first.inv() * Rotation.from_quat(b)).as_rotvec()
-        return np.asarray((first * Rotation.from_rotvec(u * turn)).as_quat())
-    return (1 - u) * a + u * b
+        tangents = after[i] * u * (1 - u) ** 2 + before[i + 1] * u**2 * (u - 1)
+        return (1 + 2 * u) * (1 - u) ** 2 * middle[i] + u**2 * (3 - 2 * u) * middle[i + 1] + seconds * tangents
+    return (1 - u) * middle[i] + u * middle[i + 1]
 
 
 def world_transforms(document: Document, moved: Tracks | None = None) -> dict[int, FloatArray]:
@@ -278,18 +260,14 @@ def world_transforms(document: Document, moved: Tracks | None = None) -> dict[in
         if "matrix" in node:
             local = np.array(node["matrix"], dtype=np.float64).reshape(4, 4).T
         else:
-            x, y, z, w = node.get("rotation", (0.0, 0.0, 0.0, 1.0))
-            local = quaternion_matrix((w, x, y, z))
-            scale = np.array(node.get("scale", (1.0, 1.0, 1.0)), dtype=np.float64)
-            local[:3, 3] = node.get("translation", (0.0, 0.0, 0.0))
-            paths = {path: values for (other, path), values in (moved or {}).items() if other == number}
-            if paths:
-                local = np.tile(local, (len(next(iter(paths.values()))), 1, 1))
-                scale = paths.get("scale", scale)[..., None, :]
-                local[:, :3, 3] = paths.get("translation", local[:, :3, 3])
-                if "rotation" in paths:
-                    local[:, :3, :3] = Rotation.from_quat(paths["rotation"]).as_matrix()
-            local[..., :3, :3] *= scale
+            values = {"translation": [0.0, 0, 0], "rotation": [0.0, 0, 0, 1], "scale": [1.0, 1, 1], **node}
+            shift, turn, scale = (
+                np.array((moved or {}).get((number, path), values[path]), dtype=np.float64)
+                for path in ("translation", "rotation", "scale")
+            )
+            linear = Rotation.from_quat(turn).as_matrix() * scale[..., None, :]
+            local = np.zeros((*np.broadcast_shapes(shift.shape[:-1], linear.shape[:-2]), 4, 4))
+            local[..., :3, :3], local[..., :3, 3], local[..., 3, 3] = linear, shift, 1
         worlds[number] = parent @ local
         waiting += [(child, worlds[number]) for child in reversed(node.get("children", []))]
     return worlds
@@ -299,11 +277,3 @@ def _differences(frames: FloatArray) -> NDArray[np.float32]:
     """Frame 0 in single precision, then each other frame minus it, so that its rounding cancels."""
     first = frames[0].astype(np.float32)
     return np.concatenate([first[None], (frames[1:] - first).astype(np.float32)])
-
-
-def _unit(vectors: FloatArray) -> FloatArray:
-    """Unit vectors, as glTF demands; ``(0, 0, 1)`` for zero vectors. Unit vectors stay bit for bit."""
-    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    usable = length > 1e-12
-    scaled = np.where(np.abs(length - 1) < 1e-6, vectors, vectors / np.where(usable, length, 1.0))
-    return np.where(usable, scaled, np.array([0.0, 0.0, 1.0]))

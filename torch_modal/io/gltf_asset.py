@@ -1,6 +1,8 @@
 """GLB and GLTF files, which are written with other positions and their own nodes, materials and textures."""
 
 import copy
+from functools import cache
+from itertools import groupby
 from pathlib import Path
 from typing import NamedTuple
 
@@ -10,8 +12,17 @@ import torch
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.errors import MeshError
 from torch_modal.geometry.skin import blend_bones
-from torch_modal.io.asset import Asset, Material, Part, as_png_or_jpeg
-from torch_modal.io.gltf import ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER, WHITE, Document, Json, animate, world_transforms
+from torch_modal.io.asset import Asset, Material, Part
+from torch_modal.io.gltf import (
+    ARRAY_BUFFER,
+    ELEMENT_ARRAY_BUFFER,
+    WHITE,
+    Document,
+    Json,
+    Tracks,
+    sample,
+    world_transforms,
+)
 from torch_modal.io.normals import carry_together
 
 _COMPRESSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
@@ -26,6 +37,8 @@ class _Primitive(NamedTuple):
     json: Json
     points: slice
     triangles: IntArray
+    positions: FloatArray  # and normals, in the coordinates of the node
+    normals: FloatArray | None
 
 
 class GltfAsset(Asset):
@@ -58,7 +71,7 @@ class GltfAsset(Asset):
             if "mesh" not in node_json:
                 continue
             posing["skeleton"] |= "skin" in node_json
-            shared: dict[int, slice] = {}
+            shared: dict[int, tuple[FloatArray, slice]] = {}
             for primitive in self.document.get("meshes", node_json["mesh"])["primitives"]:
                 mode = primitive.get("mode", _TRIANGLES)
                 if mode in (_STRIP, _FAN):
@@ -70,25 +83,25 @@ class GltfAsset(Asset):
                 accessor = primitive["attributes"]["POSITION"]
                 if accessor not in shared:
                     local = self.document.floats(accessor)
-                    shared[accessor] = slice(n, n + len(local))
+                    shared[accessor] = local, slice(n, n + len(local))
                     positions.append(local @ world[:3, :3].T + world[:3, 3])
                     n += len(local)
-                points = shared[accessor]
-                count = points.stop - points.start
-                if any(len(self.document.accessor(number)) != count for number in primitive["attributes"].values()):
+                local, points = shared[accessor]
+                count, attributes = len(local), primitive["attributes"]
+                if any(len(self.document.accessor(number)) != count for number in attributes.values()):
                     raise ValueError("a primitive whose attributes have different lengths")
                 if "material" in primitive:
                     self.document.get("materials", primitive["material"])
+                indices = np.arange(count)
                 if "indices" in primitive:
                     indices = self.document.accessor(primitive["indices"])[:, 0].astype(np.int64)
-                else:
-                    indices = np.arange(count)
                 if indices.max(initial=0) >= max(count, 1):
                     raise ValueError("a primitive with indices beyond its vertices")
                 triangles = indices[: len(indices) // 3 * 3].reshape(-1, 3)
                 mirrored = np.linalg.det(world[:3, :3]) < 0  # which turns the winding over
                 faces.append((triangles[:, ::-1] if mirrored else triangles) + points.start)
-                self._primitives.append(_Primitive(node, primitive, points, triangles))
+                normals = self.document.floats(attributes["NORMAL"]) if "NORMAL" in attributes else None
+                self._primitives.append(_Primitive(node, primitive, points, triangles, local, normals))
         self.positions, self.faces = np.concatenate(positions), np.concatenate(faces)
         names = {name for primitive in self._primitives for name in primitive.json["attributes"]}
         self._note("texcoords", "texture coordinates", "TEXCOORD_0" in names)
@@ -100,12 +113,18 @@ class GltfAsset(Asset):
     def play(self, times: FloatArray) -> FloatArray:
         """Shapes of the first animation, as players show them. *Shape:* ``(T,) -> (T, V, 3)``."""
         document = self.document
-        moved = animate(document, times)
+        moved: Tracks = {}
+        for animation in document.get("animations")[:1]:
+            for channel in animation["channels"]:
+                sampler, target = animation["samplers"][channel["sampler"]], channel["target"]
+                if "node" in target:
+                    path = target["path"]
+                    moved[target["node"], path] = sample(document, sampler, times, path == "rotation")
         worlds = world_transforms(document, moved)
         frames = np.empty((len(times), *self.positions.shape))
         for primitive in self._primitives:
             node, read = document.get("nodes", primitive.node), primitive.json["attributes"]
-            points = np.repeat(document.floats(read["POSITION"])[None], len(times), axis=0)
+            points = np.repeat(primitive.positions[None], len(times), axis=0)
             if targets := primitive.json.get("targets"):
                 mesh = document.get("meshes", node["mesh"])
                 still = np.tile(node.get("weights", mesh.get("weights", [0.0] * len(targets))), (len(times), 1))
@@ -130,7 +149,7 @@ class GltfAsset(Asset):
         """The file with other positions."""
         return self.rebuild(positions[None]).to_glb()
 
-    def rebuild(self, frames: FloatArray, move_normals: bool = True) -> Document:
+    def rebuild(self, frames: FloatArray) -> Document:
         """Copy the used content, with frames as positions and morph targets. *Shape:* ``(N, V, 3)``."""
         old = self.document
         root = {key: copy.deepcopy(value) for key, value in old.root.items() if key not in _REBUILT}
@@ -148,33 +167,29 @@ class GltfAsset(Asset):
         for node_json in document.get("nodes"):
             for key in ("mesh", "skin", "weights"):
                 node_json.pop(key, None)
-        copies: dict[int, int] = {}
 
+        @cache
         def take(accessor: int, target: int) -> int:
             """Copy an accessor as it is; returns its number in the copy."""
-            if accessor not in copies:
-                source, numbers = old.get("accessors", accessor), old.accessor(accessor)
-                normalized = source.get("normalized", False)
-                copies[accessor] = document.add(numbers, source["type"], target, "min" in source, normalized)
-                if "name" in source:
-                    document.get("accessors", copies[accessor])["name"] = source["name"]
-            return copies[accessor]
+            source = old.get("accessors", accessor)
+            normalized = source.get("normalized", False)
+            return document.add(old.accessor(accessor), source["type"], target, "min" in source, normalized)
 
-        for node in self._world:
-            primitives = [primitive for primitive in self._primitives if primitive.node == node]
-            if not primitives:
-                continue
-            # Each node gets a mesh of its own: the same mesh may be shown, and deformed, at several places.
+        # Each node gets a mesh of its own: the same mesh may be shown, and deformed, at several places.
+        for node, group in groupby(self._primitives, lambda primitive: primitive.node):
+            primitives = list(group)
+            try:
+                inverse = np.linalg.inv(self._world[node])
+            except np.linalg.LinAlgError:
+                name = old.get("nodes", node).get("name", node)
+                message = (
+                    f"{self.path}: the node {name} flattens its mesh, so that positions cannot be transformed back"
+                )
+                raise MeshError(message) from None
             mesh = copy.deepcopy({**old.get("meshes", old.get("nodes", node)["mesh"]), "primitives": []})
             mesh.pop("weights", None)
-            inverse = self._inverse(node)
-            originals, shapes = [], []
-            for primitive in primitives:
-                normal = primitive.json["attributes"].get("NORMAL")
-                normals = None if normal is None else old.floats(normal)
-                originals.append((normals, old.floats(primitive.json["attributes"]["POSITION"]), primitive.triangles))
-                shapes.append(frames[:, primitive.points] @ inverse[:3, :3].T + inverse[:3, 3])
-            rotated = carry_together(originals, shapes if move_normals else [x[:1] for x in shapes])
+            shapes = [frames[:, one.points] @ inverse[:3, :3].T + inverse[:3, 3] for one in primitives]
+            rotated = carry_together([(one.normals, one.positions, one.triangles) for one in primitives], shapes)
             by_points: dict[tuple[int, int | None], Json] = {}
             for primitive, shape, normals in zip(primitives, shapes, rotated, strict=True):
                 attributes = primitive.json["attributes"]
@@ -192,42 +207,13 @@ class GltfAsset(Asset):
             document.get("nodes", node)["mesh"] = document.append("meshes", mesh)
         return document
 
-    def _inverse(self, node: int) -> FloatArray:
-        try:
-            return np.asarray(np.linalg.inv(self._world[node]), dtype=np.float64)
-        except np.linalg.LinAlgError:
-            name = self.document.get("nodes", node).get("name", node)
-            raise MeshError(
-                f"{self.path}: the node {name} flattens its mesh, so that positions cannot be transformed back"
-            ) from None
-
     # --------------------------------------------------------------------------------------------- for other formats
     def parts(self) -> list[Part]:
-        """One part for each primitive."""
+        """One part for each primitive, with its colours alone: materials stay in the document."""
         parts = []
         for primitive in self._primitives:
-            read = {name: self.document.floats(index) for name, index in primitive.json["attributes"].items()}
-            colors, normals = read.get("COLOR_0"), read.get("NORMAL")
-            if colors is not None and colors.shape[1] == 3:
-                colors = np.concatenate([colors, np.ones((len(colors), 1))], axis=1)
-            if normals is not None:
-                normals = normals @ self._inverse(primitive.node)[:3, :3]  # n^T M^-1
-                normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+            index = primitive.json["attributes"].get("COLOR_0")
+            colors = None if index is None else self.document.floats(index)
             vertices = np.arange(primitive.points.start, primitive.points.stop)
-            material = self._material(primitive.json.get("material"))
-            parts.append(Part(vertices, primitive.triangles, material, read.get("TEXCOORD_0"), colors, normals))
+            parts.append(Part(vertices, primitive.triangles, Material(), colors=colors))
         return parts
-
-    def _material(self, number: int | None) -> Material:
-        if number is None:
-            return Material("default", (1.0, 1.0, 1.0, 1.0), 1.0, 1.0)
-        material = self.document.get("materials", number)
-        surface = material.get("pbrMetallicRoughness", {})
-        image = None
-        if "baseColorTexture" in surface:
-            texture = self.document.get("textures", surface["baseColorTexture"]["index"])
-            if "source" in texture:
-                image = as_png_or_jpeg(self.document.image(texture["source"]))
-        color = tuple(float(c) for c in surface.get("baseColorFactor", (1, 1, 1, 1)))
-        metallic, roughness = surface.get("metallicFactor", 1.0), surface.get("roughnessFactor", 1.0)
-        return Material(material.get("name", f"material-{number}"), color, metallic, roughness, image)

@@ -37,10 +37,12 @@ class ObjAsset(Asset):
         materials: dict[str, int] = {}
         corners: list[tuple[int, ...]] = []  # vertex, texture coordinate, normal; -1 where there is none
         known: dict[str, tuple[int, ...]] = {}
+        triangles: list[tuple[int, int, int]] = []  # polygons as fans, of corners of the file
         sizes, material_of, material, groups = [], [], -1, set()
         for number, line in enumerate(self.lines):
-            kind, *words = line.partition("#")[0].split() or [""]
-            rest = line.partition("#")[0].strip()[len(kind) :].strip()
+            content = line.partition("#")[0].strip()
+            kind, *words = content.split() or [""]
+            rest = content[len(kind) :].strip()
             if kind in self._line_of:
                 self._line_of[kind].append(number)
             if kind == "v" and len(words) < 3:
@@ -52,12 +54,14 @@ class ObjAsset(Asset):
                 place = f"{path}: face line {line.strip()[:60]!r}"
                 if len(words) < 3:
                     raise MeshError(f"{place} has fewer than three corners")
+                first, n_triangles = len(corners), len(words) - 2
+                triangles += [(first, first + i, first + i + 1) for i in range(1, n_triangles + 1)]
+                material_of += [material] * n_triangles
                 for word in words:
                     if word not in known or "-" in word:  # negative indices count back from the place of the line
                         known[word] = _corner(word, counts, place)
                     corners.append(known[word])
                 sizes.append(len(words))
-                material_of.append(material)
             elif kind == "usemtl":
                 material = materials.setdefault(rest, len(materials))
             elif kind == "mtllib":
@@ -73,11 +77,8 @@ class ObjAsset(Asset):
             self._corners[self._corners[:, column] >= count, column] = -1  # faces may name what the file does not have
         self._sizes = np.array(sizes, dtype=np.int64)
         self._starts = np.cumsum(self._sizes) - self._sizes
-        # Polygons as fans of triangles: corners of the file, and the material of each.
-        fan = np.repeat(np.arange(len(sizes)), self._sizes - 2)
-        second = np.arange(len(fan)) - np.repeat(np.cumsum(self._sizes - 2) - (self._sizes - 2), self._sizes - 2) + 1
-        self._triangles = self._starts[fan][:, None] + np.stack([0 * second, second, second + 1], axis=1)
-        self._material_of = np.array(material_of, dtype=np.int64)[fan]
+        self._triangles = np.array(triangles, dtype=np.int64).reshape(-1, 3)
+        self._material_of = np.array(material_of, dtype=np.int64)
         self.faces = self._corners[self._triangles, 0]
         self._note("polygons", "quads" if (self._sizes <= 4).all() else "polygons", (self._sizes > 3).any())
         self._note("texcoords", "texture coordinates", (self._corners[:, 1] >= 0).any())

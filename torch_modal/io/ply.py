@@ -78,10 +78,9 @@ class PlyFile:
             return self.data[: self._start] + b"".join(lines[:first]), words, b"".join(lines[last:])
         place = self._start
         for length, properties in before:
-            fixed = all(len(kinds) == 1 for kinds in properties.values())
-            for _ in range(1 if fixed else length):
+            for _ in range(length):
                 for *of_list, kind in properties.values():
-                    repeat = length if fixed else 1
+                    repeat = 1
                     if of_list:
                         count = np.dtype(self._order + of_list[0])
                         repeat = int(np.frombuffer(self.data, count, 1, place)[0])
@@ -178,11 +177,8 @@ class OffAsset(Asset):
     def __init__(self, path: Path) -> None:
         super().__init__(path)
         text = re.sub(r"#[^\n]*", "", path.read_text(encoding="utf-8", errors="replace"))
-        content = re.sub(r"^\s*\w*OFF", "", text, count=1)
-        counts, *rows = [line.split() for line in content.splitlines() if line.strip()]
-        n_vertices, n_faces = map(int, counts[:2])
+        n_vertices, n_faces = map(int, re.sub(r"^\s*\w*OFF", "", text).split()[:2])
         self.positions, self.faces = read_triangles(path, n_vertices, n_faces)
-        self._note("properties", "further numbers of vertices", rows and len(rows[0]) > 3)
         self._note("polygons", "polygons", len(self.faces) > n_faces)
 
     def with_positions(self, positions: FloatArray) -> bytes:

@@ -53,13 +53,10 @@ def open_asset(path: str | os.PathLike[str]) -> Asset:
     """
     path = Path(path)
     suffix = path.suffix.lower()
-    if suffix == ".stl":
-        raise MeshError(
-            f"{path}: STL stores loose triangles without shared, ordered vertices, so key-frames cannot be "
-            "matched vertex by vertex; export OBJ, PLY, OFF or GLB instead"
-        )
     if suffix not in READERS:
-        raise MeshError(f"{path}: unknown extension {suffix!r}; supported are {', '.join(SUFFIXES)}")
+        raise MeshError(
+            f"{path}: unknown extension {suffix!r}; supported are {', '.join(SUFFIXES)} (STL has no shared vertices)"
+        )
     if not os.path.lexists(path):
         raise FileNotFoundError(f"{str(path)[:300]}: no such file")
     if not os.path.isfile(path):
@@ -86,19 +83,16 @@ def require_same_mesh(
 ) -> None:
     """Raise a MeshError unless two files have equally many vertices and the same faces."""
     hint = "all key-frames need the same vertices and faces, in the same vertex order"
-    (_, faces), (_, other_faces) = mesh, other_mesh
     for what, mine, its in zip(("vertices", "faces"), mesh, other_mesh, strict=True):
         if len(mine) != len(its):
             raise MeshError(f"{other} has {len(its)} {what}, {first} has {len(mine)}; {hint}")
-    if np.array_equal(faces, other_faces):
+    if np.array_equal(mesh[1], other_mesh[1]):
         return
-    here, there = (set(map(tuple, np.sort(rows, axis=1).tolist())) for rows in (faces, other_faces))
-    # There are equally many faces, so that some are new, or some are missing, or both.
-    for file, rows, known, whole in ((other, other_faces, here, first), (first, faces, there, other)):
-        strange = [number for number, row in enumerate(np.sort(rows, axis=1).tolist()) if tuple(row) not in known]
+    here, there = ({*map(frozenset, faces.tolist())} for _, faces in (mesh, other_mesh))
+    for file, strange, whole in ((other, there - here, first), (first, here - there, other)):
         if strange:
             raise MeshError(
-                f"face {strange[0]} of {file}, vertices {rows[strange[0]].tolist()}, is not in {whole} "
-                f"({len(strange)} of {len(faces)} faces differ); {hint}; polygons "
-                "that start at another corner are cut along another diagonal, so export triangles"
+                f"the face of {file} with the vertices {min(map(sorted, strange))} is not in {whole} ({len(strange)} "
+                f"of {len(mesh[1])} faces differ); {hint}; polygons that start at another corner are cut along another "
+                "diagonal, so export triangles"
             )

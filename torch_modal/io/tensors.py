@@ -63,13 +63,9 @@ class TensorFile:
             self.metadata: dict[str, Any] = dict(json.loads(header))  # with what the writer added
         except (TypeError, ValueError, RecursionError):  # not of this package
             self.metadata = {}
-        if self.metadata.get("format") != format:
-            raise ValueError(f"{path} holds no {format}: its format is {self.metadata.get('format')!r}")
-        if self.metadata.get("version") != version:
-            raise ValueError(
-                f"{path} has version {self.metadata.get('version')!r} of {format}, this program reads version "
-                f"{version!r}; make the file again"
-            )
+        written = {key: self.metadata.get(key) for key in ("format", "version")}
+        if written != {"format": format, "version": version}:
+            raise ValueError(f"{path} holds no {format} of version {version!r}, but {written}; make the file again")
         names = [name for name in names if name != DIGESTS]
         if missing := [name for name in needs if name not in names]:
             raise ValueError(f"{path} lacks the tensors {', '.join(missing[:4])}; make the file again")

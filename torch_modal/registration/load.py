@@ -67,8 +67,8 @@ def load_keyframes(
     paths = list(paths)
     if not paths:
         raise MeshError("paths is empty; pass one file per key-frame")
-    if landmarks is not None and not register:
-        raise MeshError("landmarks are for registration; pass register=True too")
+    if (landmarks is not None or not same_subject) and not register:
+        raise MeshError("landmarks and different subjects are for registration; pass register=True (--register) too")
     meshes, posed = [], []
     for asset in map(open_asset, paths):
         meshes.append((asset.positions, asset.faces))

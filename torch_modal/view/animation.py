@@ -1,6 +1,5 @@
 """A sequence as one file that plays, in the format of its suffix. The formats that are drawn, MP4 and GIF, are here."""
 
-import logging
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -9,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from torch_modal.arrays import Array
-from torch_modal.extras import require_installed
 from torch_modal.geometry.skin import Skin
 from torch_modal.io.asset import Asset
 from torch_modal.io.files import atomic_write
@@ -20,16 +18,7 @@ from torch_modal.progress import Progress, ProgressReport
 from torch_modal.view.drawing import ByteArray, draw_shape
 from torch_modal.view.picture import BETWEEN_COLOR, fit_into_cells, view_rotation
 
-logger = logging.getLogger("torch_modal")
-
 PIXELS = 640  # the longer side of a picture of a video
-
-
-def require_packages(path: Path) -> None:
-    """Raise a MissingPackageError, before any work, if the format of a file needs a package that is not installed."""
-    if path.suffix.lower() in ANIMATION_FORMATS:
-        fmt = ANIMATION_FORMATS[path.suffix.lower()]
-        require_installed(fmt.modules, fmt.extra, path.name)
 
 
 def save_animation(
@@ -40,7 +29,6 @@ def save_animation(
     keyframe_indices: Sequence[int] | None = None,
     cyclic: bool = False,
     overwrite: bool = False,
-    max_targets: int = 64,
     *,
     duration: float | None = None,
     ping_pong: bool = False,
@@ -55,10 +43,10 @@ def save_animation(
 
     ``.glb`` is glTF 2.0 with a morph target for each frame after the first; viewers interpolate linearly between
     neighbouring frames. glTF calls Y up and metres the unit; the caller's coordinates are written as they are
-    (float32), so a Z-up sequence lies on its back there. Normals move with the shape, except where that would make
-    a very large file (with a warning). ``.usd``, ``.usda`` and ``.usdc`` (extra ``usd``) hold the points over time in
-    the same manner. A GLB with ``bones`` holds a skin instead (:func:`torch_modal.bake`), a tenth of the size, with
-    which every engine plays; with ``targets``, the mean and a few principal shapes.
+    (float32), so a Z-up sequence lies on its back there. Normals move with the shape. ``.usd``, ``.usda`` and ``.usdc``
+    (extra ``usd``) hold the points over time in the same manner. A GLB with ``bones`` holds a skin instead
+    (:func:`torch_modal.bake`), a tenth of the size, with which every engine plays; with ``targets``, the mean and a few
+    principal shapes.
 
     ``.mp4`` (extra ``video``) and ``.gif`` are drawn. ``.mdd`` and ``.pc2`` are point caches, for a mesh that is
     already in Blender, Maya or Houdini. ``.npz`` holds ``frames``, ``faces``, ``times`` and ``keyframes`` as arrays.
@@ -74,8 +62,6 @@ def save_animation(
             too many themselves), named in the GLB's ``extras``, and their number gives the default duration.
         cyclic: Add the step from the last frame back to the first, unless the two are equal already.
         overwrite: Replace the file if it exists.
-        max_targets: Most morph targets of a GLB. Players hold every target in memory, and the weights grow with their
-            square; a longer sequence loses frames evenly, with a warning, and players fill in linearly.
         duration: Of the sequence once, in seconds. Default: from ``fps`` where that is given; otherwise 1 s for a
             cycle, 2 s for two key-frames, and 1 s for each interval of more.
         ping_pong: Play forwards and then backwards, which takes twice the duration.
@@ -111,8 +97,8 @@ def save_animation(
             f"targets must be a whole number, at least 1, and below the {len(shapes)} frames; got {targets!r}"
         )
     if asset is not None:
-        asset.check(shapes)
-    require_packages(path)
+        asset.check(shapes, path, ANIMATION_FORMATS[suffix].holds)
+    ANIMATION_FORMATS[suffix].check_installed(path.name)
     refuse_existing(path, overwrite)
     keyframes = [] if keyframe_indices is None else check_indices(keyframe_indices, len(shapes), "keyframe_indices")
     if cyclic and len(shapes) > 1 and np.array_equal(shapes[0], shapes[-1]):
@@ -129,10 +115,9 @@ def save_animation(
             raise ValueError(f"bones is a skin of {n} other frames than these {len(shapes)}; bake these")
         skin = replace(skin, transforms=skin.transforms[: len(shapes)])
     path.parent.mkdir(parents=True, exist_ok=True)
-    animation = Animation(shapes, triangles, timing, path.name, keyframes, asset, max_targets, progress, skin, targets)
+    animation = Animation(shapes, triangles, timing, path.name, keyframes, asset, progress, skin, targets)
     with atomic_write(path, suffix) as temporary:
         ANIMATION_FORMATS[suffix].write(animation, temporary)
-    logger.debug("wrote %s, %.1f kB", path, path.stat().st_size / 1000)
     return path
 
 

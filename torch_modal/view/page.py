@@ -19,7 +19,7 @@ from typing import Any, Literal
 import numpy as np
 
 from torch_modal.arrays import Array
-from torch_modal.io.files import write_file
+from torch_modal.io.files import write_files
 from torch_modal.io.formats import PAGES
 from torch_modal.io.write import check_frames, check_indices, check_suffix, refuse_existing, to_numpy
 from torch_modal.times import check_times
@@ -65,7 +65,7 @@ class Page:
         path = Path(out)
         check_suffix(path, PAGES)
         refuse_existing(path, overwrite)
-        write_file(path, self.html.encode("utf-8"))
+        write_files([(path, self.html.encode("utf-8"))])
         return path
 
 

@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 
 from torch_modal.arrays import Array, FloatArray, IntArray
-from torch_modal.io.files import write_file
+from torch_modal.io.files import write_files
 from torch_modal.io.formats import PICTURES
 from torch_modal.io.write import check_frames, check_indices, check_suffix, refuse_existing, to_numpy
 from torch_modal.view.drawing import ByteArray, draw_points, draw_shape
@@ -243,7 +243,7 @@ def render_sequence(
         dots = np.stack([draw_points(cloud, DOT_COLOR, half, pixels) for cloud in seen])
         rows, images = [label, *rows], np.concatenate([dots[None], images])
     labels = [(title, "#b4581a" if n in keyframes else "#333333") for n, title in zip(chosen, titles, strict=True)]
-    write_file(path, _sheet(images, rows, labels, color_bar, fmt))
+    write_files([(path, _sheet(images, rows, labels, color_bar, fmt))])
     return path
 
 
