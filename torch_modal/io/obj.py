@@ -9,7 +9,7 @@ import numpy as np
 
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.errors import MeshError
-from torch_modal.io.asset import Asset, Material, Part, linear_rgba
+from torch_modal.io.asset import CLAY, Asset, Material, Part, linear_rgba
 from torch_modal.io.mtl import read_libraries
 from torch_modal.io.normals import CarriedNormals
 
@@ -158,11 +158,8 @@ class ObjAsset(Asset):
             points, triangles = np.unique(corners, axis=0, return_inverse=True)
             vertices, texcoords, normals = points.T
             name = self._materials[number] if number >= 0 else ""
-            material = self._library_content[0].get(name)
-            if material is None:
-                material = Material(name) if name else Material()
-                if colors is not None:
-                    material = material._replace(color=(1.0, 1.0, 1.0, 1.0))
+            bare = Material(name or "clay", CLAY if colors is None else (1.0, 1.0, 1.0, 1.0))
+            material = self._library_content[0].get(name, bare)
             uv = self._texcoords[texcoords] * [1, -1] + [0, 1] if (texcoords >= 0).all() else None
             rgba = None if colors is None else colors[vertices]
             vectors = self._normals[normals] if (normals >= 0).all() else None
