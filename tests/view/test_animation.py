@@ -43,18 +43,13 @@ def test_ease_is_slow_at_both_ends():
     np.testing.assert_allclose(8 * (1 - np.cos(np.pi * times / 2)) / 2, places, atol=1e-9)
 
 
-def test_thinned_frames_keep_their_times():
-    times, places = Timing(9, duration=8).knots(np.array([0, 3, 8]))
-    assert times.tolist() == [0, 3, 8] and places.tolist() == [0, 1, 2]
-
-
 @pytest.mark.parametrize(
     ("options", "match"),
     [
         ({"duration": 0}, "duration must be a positive"),
         ({"fps": float("nan")}, "fps must be a positive"),
-        ({"cyclic": True, "ping_pong": True}, "ping_pong is for sequences that begin"),
-        ({"cyclic": True, "ease": True}, "ease is for"),
+        ({"cyclic": True, "ping_pong": True}, "ping_pong and ease are for sequences that begin"),
+        ({"cyclic": True, "ease": True}, "ping_pong and ease are for"),
     ],
 )
 def test_timing_that_cannot_be(options, match):

@@ -107,10 +107,11 @@ def _sequences(sequences: list[list[Path]], args: argparse.Namespace) -> tuple[P
     asked = {"keyframe_indices": args.keyframes, "fps": args.fps, "cyclic": args.cyclic or None}
     options |= {name: value for name, value in asked.items() if value is not None}
     if args.linear:
-        keys = check_indices({0, *(options.get("keyframe_indices") or [n - 1])}, n, "key-frames")
-        places = [*keys, n] if options.get("cyclic") else sorted({*keys, n - 1})
+        cyclic = bool(options.get("cyclic"))
+        ends = [0] if cyclic else [0, n - 1]
+        keys = check_indices([*ends, *(options.get("keyframe_indices") or [n - 1])], n, "key-frames")
         names.append("linear")
-        shapes.append(tm.linear_sequence(torch.from_numpy(first[places[: len(keys)]]), places).numpy())
+        shapes.append(tm.linear_sequence(torch.from_numpy(first[keys]), [*keys, n] if cyclic else keys).numpy())
     page = tm.show(dict(zip(_number_names(names), shapes, strict=True)), faces, **options, title=names[0])
     times = f"{len(shapes)} x " if len(shapes) > 1 else ""
     return page, f"{times}{n} shapes of {first.shape[1]} vertices"

@@ -69,9 +69,11 @@ class ObjAsset(Asset):
             elif kind in ("g", "o", "s"):
                 groups.add(line.strip())
         self._materials = list(materials)
-        self.positions = _columns(numbers["v"], 0, 3)
-        self._texcoords, self._normals = _columns(numbers["vt"], 0, 2), _columns(numbers["vn"], 0, 3)
-        self._colors = _columns(numbers["v"], 3, 6) if all(len(row) >= 6 for row in numbers["v"]) else None
+        self.positions = np.array([row[:3] for row in numbers["v"]], np.float64).reshape(-1, 3)
+        self._texcoords = np.array([[*row, 0.0, 0.0][:2] for row in numbers["vt"]], np.float64).reshape(-1, 2)
+        self._normals = np.array([row[:3] for row in numbers["vn"]], np.float64).reshape(-1, 3)
+        colored = all(len(row) >= 6 for row in numbers["v"])
+        self._colors = np.array([row[3:6] for row in numbers["v"]]) if colored else None
         self._corners = np.array(corners, dtype=np.int64).reshape(-1, 3)
         for column, count in ((1, len(self._texcoords)), (2, len(self._normals))):
             self._corners[self._corners[:, column] >= count, column] = -1  # faces may name what the file does not have
@@ -177,12 +179,6 @@ def _corner(word: str, counts: tuple[int, ...], place: str) -> tuple[int, ...]:
         for index, count in zip(indices, counts, strict=True)
     ]
     return v, *(max(index, -1) for index in others)
-
-
-def _columns(rows: list[list[float]], start: int, stop: int) -> FloatArray:
-    """Numbers ``start`` to ``stop`` of each line; 0 where a line has fewer. *Shape:* ``(n, stop - start)``."""
-    padded = [[*row[start:stop], 0.0, 0.0][: stop - start] for row in rows]
-    return np.array(padded, dtype=np.float64).reshape(-1, stop - start)
 
 
 def obj_bytes(vertices: FloatArray, faces: IntArray, asset: Any = None) -> bytes:

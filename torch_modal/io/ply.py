@@ -126,10 +126,9 @@ class PlyAsset(Asset):
         self._note("colors", "vertex colours", names >= {*_COLORS})
         self._note("texcoords", "texture coordinates", self._uv_names)
         self._note("materials", "texture", self._file.textures)
-        of_vertices = names - {"x", "y", "z", *_NORMALS, *_COLORS, "alpha", *(self._uv_names or ())}
-        of_faces = face_properties.keys() - {"vertex_indices", "vertex_index"}
+        known = {*"xyz", *_NORMALS, *_COLORS, "alpha", *(self._uv_names or ()), "vertex_indices", "vertex_index"}
         others = [name for name in self._file.elements if name not in ("vertex", "face")]
-        further = [*sorted(of_vertices | of_faces), *others]
+        further = [*sorted((names | face_properties.keys()) - known), *others]
         self._note("properties", "properties " + ", ".join(further), further)
 
     @cached_property
@@ -154,16 +153,14 @@ class PlyAsset(Asset):
         if "colors" in self.carries or self._file.textures:
             image = as_png_or_jpeg(next(iter(self.companions.values()))) if self.companions else None
             material = Material(self.path.stem, (1.0, 1.0, 1.0, 1.0), texture=image)
-        colors = texcoords = normals = None
+        colors = None
         if "colors" in self.carries:
             kind = np.dtype(self._file.properties["red"][0])
             scale = float(np.iinfo(kind).max) if kind.kind in "iu" else 1.0
             alpha = ["alpha"] if "alpha" in self._file.properties else []
             colors = linear_rgba(self._file.columns(*_COLORS, *alpha) / scale)
-        if self._uv_names is not None:
-            texcoords = self._file.columns(*self._uv_names) * [1, -1] + [0, 1]
-        if "normals" in self.carries:
-            normals = self._file.columns(*_NORMALS)
+        texcoords = self._file.columns(*self._uv_names) * [1, -1] + [0, 1] if self._uv_names else None
+        normals = self._file.columns(*_NORMALS) if "normals" in self.carries else None
         everything = np.arange(len(self.positions))
         return [Part(everything, self.faces, material, texcoords, colors, normals)]
 
