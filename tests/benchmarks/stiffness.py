@@ -17,7 +17,7 @@ from timing import limit_threads
 
 import torch_modal as tm
 from torch_modal.modes.extract import MESHERS
-from torch_modal.modes.solid import larger_pieces
+from torch_modal.modes.solid import without_small_pieces
 from torch_modal.modes.stiffness import HessianForm, arap_hessian, mass_matrix
 from torch_modal.modes.surface import CanonicalSurface
 from torch_modal.modes.tetrahedra import Mesher, Tetrahedra
@@ -45,7 +45,7 @@ def bodies() -> Iterator[tuple[str, CanonicalSurface]]:
 
 def filled(mesher: Mesher, surface: CanonicalSurface) -> Tetrahedra:
     """Tetrahedra without small loose pieces, which fTetWild may leave."""
-    return larger_pieces(mesher.fill(surface, threading.Event()))[0]
+    return without_small_pieces(mesher.fill(surface, threading.Event()))
 
 
 def main() -> None:

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from torch_modal.io.tensors import bytes_of, read_tensors, write_tensors
 
-CACHE_VERSION = 6  # part of every key: raise it when the algorithm of cached results changes
+CACHE_VERSION = 7  # part of every key: raise it when the algorithm of cached results changes
 CACHE_VARIABLE = "TORCH_MODAL_CACHE"
 LIMIT_VARIABLE = "TORCH_MODAL_CACHE_LIMIT"
 DEFAULT_LIMIT = 4 * 2**30

@@ -70,8 +70,7 @@ class _Mesh:
         # The tetrahedron of a point follows from the order of its coordinates within the cube.
         cube = points.astype(np.int64)
         order = np.argsort(-(points - cube), axis=1, kind="stable")
-        within = np.take_along_axis(points - cube, order, axis=1)
-        self.shares = -np.diff(within, axis=1, prepend=1.0, append=0.0)
+        self.points = points
         number, place = np.zeros((3, 3, 3), dtype=np.int64), np.full(counts, -1)
         number[tuple(_ORDERS.T)], place[tuple(cubes.T)] = np.arange(6), np.arange(len(cubes))
         self.owner = place[tuple(cube.T)] * 6 + number[tuple(order.T)]
@@ -115,21 +114,16 @@ class _Mesh:
         middle = (old[:, 0] + old[row, tag]) // 2
         first, second = old.copy(), np.take_along_axis(old, _SECOND_HALF[tag], axis=1)
         first[row, tag] = second[row, tag] = middle
-        # In the half, the difference of both barycentric coordinates stays at one end; the rest goes to the midpoint.
-        other = np.full(len(self.tets), -1)
-        other[index] = len(self.tets) + row
-        moved = np.flatnonzero(other[self.owner] >= 0)
-        owner, shares, at = self.owner[moved], self.shares[moved], np.arange(len(moved))
-        d = 3 - self.halvings[owner] % 3
-        start, end = shares[:, 0].copy(), shares[at, d].copy()
-        near = start >= end
-        shares[near, 0] -= end[near]
-        far = ~near
-        shares[far] = np.take_along_axis(shares[far], _SECOND_HALF[d[far]], axis=1)
-        shares[far, d[far] - 1] = (end - start)[far]
-        shares[at, d] = 2 * np.minimum(start, end)
-        self.shares[moved] = shares
-        self.owner[moved] = np.where(near, owner, other[owner])
+        # Points whose barycentric coordinate of the end is larger lie in the second half.
+        place = np.full(len(self.tets), -1)
+        place[index] = row
+        moved = np.flatnonzero(place[self.owner] >= 0)
+        half = place[self.owner[moved]]
+        corners = self.coordinates(old[half])
+        edges = (corners[:, 1:] - corners[:, :1]).transpose(0, 2, 1)
+        shares = np.linalg.solve(edges, (self.points[moved] - corners[:, 0])[..., None])[..., 0]
+        far = shares[np.arange(len(half)), tag[half] - 1] > 1 - shares.sum(axis=1)
+        self.owner[moved[far]] = len(self.tets) + half[far]
 
         self.tets[index] = first
         self.tets = np.concatenate([self.tets, second])

@@ -56,7 +56,7 @@ class ElasticBody(NamedTuple):
 class ElasticModes(NamedTuple):
     """Lowest elastic modes of a mesh, M-orthonormal and M-orthogonal to the rigid motions, by ascending eigenvalues.
 
-    ``n_zero`` eigenvalues are zero, with the six rigid ones. *Shape:* ``(k,), (3N, k), (6,)``.
+    ``n_zero`` eigenvalues are zero, with six of each connected piece. *Shape:* ``(k,), (3N, k), (6,)``.
     """
 
     eigenvalues: FloatArray
@@ -67,19 +67,15 @@ class ElasticModes(NamedTuple):
 
 
 def lowest_modes(body: ElasticBody, n_modes: int) -> ElasticModes:
-    """Lowest elastic modes of a body, at most ``3N - 6`` for each connected component.
+    """Lowest elastic modes of a body, M-orthogonal to the rigid motions of each connected piece.
 
     Shift-invert Lanczos with a negative shift: ``K + shift M`` is positive definite and has the modes of ``K``. Rigid
-    motions of the components are known and projected out, so that Lanczos need not find as many equal eigenvalues.
-    Small problems are solved densely. The first of the largest components of each mode is positive.
-
-    Returns:
-        The modes. Rigid motions of connected components against each other come first, six for each further component,
-        in addition to the ``n_modes`` requested ones.
+    motions of the pieces are known and projected out, so that Lanczos need not find as many equal eigenvalues. Small
+    problems are solved densely. The first of the largest components of each mode is positive.
 
     Raises:
-        ModalAnalysisError: Rigid motions have energy, the stiffness is indefinite, all modes are zero modes, or a
-            residual is too large.
+        ModalAnalysisError: There are fewer modes, rigid motions have energy, the stiffness is indefinite, all modes are
+            zero modes, or a residual is too large.
         RuntimeError, LinAlgError: Of SuperLU, ARPACK or LAPACK, where a matrix is singular.
     """
     positions, k, mass, _, shift, largest_residual = body
@@ -93,7 +89,11 @@ def lowest_modes(body: ElasticBody, n_modes: int) -> ElasticModes:
     rigid = np.zeros((k.shape[0], N_RIGID * n_pieces))
     for index in range(n_pieces):
         rigid[:, N_RIGID * index : N_RIGID * (index + 1)] = rigid_motions(positions, inertia, piece == index)
-    n_modes = min(n_modes, k.shape[0] - rigid.shape[1])
+    if n_modes > k.shape[0] - rigid.shape[1]:
+        raise ModalAnalysisError(
+            f"only {k.shape[0] - rigid.shape[1]} modes deform the {n_pieces} loose pieces, {n_modes} are requested; "
+            "request fewer, or give a finer mesher"
+        )
     momentum = inertia @ rigid
     if k.shape[0] < DENSE_BELOW or 2 * n_modes > k.shape[0]:
         complement = scipy.linalg.qr(momentum)[0][:, rigid.shape[1] :]
@@ -108,9 +108,7 @@ def lowest_modes(body: ElasticBody, n_modes: int) -> ElasticModes:
     restricted = span.T @ forces
     eigenvalues, rotation = np.linalg.eigh((restricted + restricted.T) / 2)
     modes, forces = span @ rotation, forces @ rotation
-    # Of the rigid motions of components, the first six mixes are rigid motions of the whole.
-    mixes = scipy.linalg.qr(momentum.T @ rigid_motions(positions, inertia, piece >= 0))[0]
-    energies = mixes.T @ (rigid.T @ (k @ rigid)) @ mixes
+    rigid_eigenvalues = np.linalg.eigvalsh(rigid.T @ (k @ rigid))
 
     n_zero = int((eigenvalues < ZERO * shift).sum())
     if eigenvalues[0] < -ZERO * shift:
@@ -122,7 +120,7 @@ def lowest_modes(body: ElasticBody, n_modes: int) -> ElasticModes:
             f"all of the lowest {n_zero} modes are motions without deformation: the mesh consists of parts that hang "
             "together on vertices or edges; join them, or request more modes"
         )
-    first_elastic, not_rigid = eigenvalues[n_zero], np.abs(np.linalg.eigvalsh(energies)).max()
+    first_elastic, not_rigid = eigenvalues[n_zero], np.abs(rigid_eigenvalues).max()
     if not not_rigid < RIGID_TOLERANCE * first_elastic:
         raise ModalAnalysisError(
             f"the rigid motions have eigenvalues up to {not_rigid:.2e}, which is not zero compared with the "
@@ -136,11 +134,9 @@ def lowest_modes(body: ElasticBody, n_modes: int) -> ElasticModes:
             f"the modes leave a relative residual of {residual:.2e} (allowed: {largest_residual:g}); the mesh is "
             "likely degenerate"
         )
-    modes = np.concatenate([rigid @ mixes[:, N_RIGID:], modes], axis=1)
     # Zero eigenvalues of hinges may be -1e-13; their roots must exist.
-    eigenvalues = np.append(np.zeros(rigid.shape[1] - N_RIGID), np.maximum(eigenvalues, 0.0))
-    rigid_eigenvalues = np.linalg.eigvalsh(energies[:N_RIGID, :N_RIGID])
-    return ElasticModes(eigenvalues, modes * _signs(modes), rigid_eigenvalues, rigid.shape[1] + n_zero, n_pieces)
+    eigenvalues, n_zero = np.maximum(eigenvalues, 0.0), rigid.shape[1] + n_zero
+    return ElasticModes(eigenvalues, modes * _signs(modes), rigid_eigenvalues[-N_RIGID:], n_zero, n_pieces)
 
 
 def rigid_motions(positions: FloatArray, inertia: sp.csr_matrix, moves: BoolArray) -> FloatArray:

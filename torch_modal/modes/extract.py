@@ -11,12 +11,10 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.errors import MeshError, MeshWarning
 from torch_modal.geometry.bodies import bodies
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.inspect import OPEN, open_part
-from torch_modal.geometry.rigid import infinitesimal_motions
 from torch_modal.io.cache import Arrays, Cache
 from torch_modal.keyframes.check import check_keyframes
 from torch_modal.modes.basis import ModalBasis
@@ -41,8 +39,6 @@ THIN = 0.01
 """Mean thickness, in roots of the area, below which the shell is taken."""
 VERTICES_AT_ONCE = 30_000
 """Total size of concurrent eigenproblems: about 2 GiB."""
-DEFORMS = 1e-6
-"""Norm of the non-rigid part of a motion, relative to the motion, above which it is a deformation."""
 
 
 def extract_modes(vertices: Any, faces: Any, n_modes: int = 30, **options: Any) -> ModalBasis:
@@ -191,7 +187,7 @@ def _bases_of_bodies(several: Sequence[Any], keyframes: torch.Tensor, n_modes: i
 def why_shell(surfaces: list[CanonicalSurface]) -> str:
     """Reason for which a set of key-frames has modes of the surface itself; empty if of the solid."""
     for index, surface in enumerate(surfaces):
-        holes = open_part(surface.points, Connectivity(surface.faces, len(surface.points)))
+        holes = open_part(surface.points, surface.mesh)
         thickness = surface.thickness / surface.area**0.5
         what = f"key-frame {index} is" if len(surfaces) > 1 else "the shape is"
         if holes > OPEN:
@@ -291,11 +287,10 @@ class _Extraction:
 
     def _modes_of(self, index: int, make_body: Callable[[], ElasticBody]) -> Arrays:
         """Modes of a body, at the points of its surface. *Shape:* ``modes (k, U, 3)``."""
-        surface = self.surfaces[index]
         with self.stage(index, "modes"):
             try:
                 body = make_body()
-                result = lowest_modes(body, min(self.n_modes, body.points.size - N_RIGID))
+                result = lowest_modes(body, self.n_modes)
                 modes = body.to_surface(result.modes.reshape(len(body.points), 3, -1))
             except ModalAnalysisError:
                 raise
@@ -304,17 +299,9 @@ class _Extraction:
                     f"the modes cannot be computed: {error}; the mesh is likely degenerate: check the surface, or try "
                     "another method or mesher"
                 ) from error
-            modes = np.ascontiguousarray(modes.transpose(2, 0, 1))
-            n_zero = result.n_zero - N_RIGID
-            modes = np.concatenate([_deforming_motions(modes[:n_zero], surface.points, surface.faces), modes[n_zero:]])
-            if len(modes) < self.n_modes:
-                raise ModalAnalysisError(
-                    f"only {len(modes)} modes deform the {result.n_pieces} loose pieces, {self.n_modes} are requested; "
-                    "request fewer, or give a finer mesher"
-                )
         return {
-            "eigenvalues": result.eigenvalues[len(result.eigenvalues) - len(modes) :][: self.n_modes],
-            "modes": modes[: self.n_modes],
+            "eigenvalues": result.eigenvalues,
+            "modes": np.ascontiguousarray(modes.transpose(2, 0, 1)),
             "rigid_eigenvalues": result.rigid_eigenvalues,
             "n_zero": np.array([result.n_zero]),
             "n_pieces": np.array([result.n_pieces]),
@@ -332,21 +319,3 @@ class _Extraction:
             if self.n_keyframes == 1:
                 raise
             raise type(error)(f"key-frame {index}: {error}") from error
-
-
-def _deforming_motions(motions: FloatArray, points: FloatArray, faces: IntArray) -> FloatArray:
-    """Combinations of motions without energy that deform a surface, as where a piece spans several of tetrahedra.
-
-    Rigid motions of pieces are left to the interpolation of the key-frames. *Shape:* ``(k, U, 3) -> (m, U, 3)``.
-    """
-    if len(motions) == 0:
-        return motions
-    left, piece = motions.copy(), Connectivity(faces, len(points)).vertex_pieces
-    for members in (np.flatnonzero(piece == index) for index in range(piece.max() + 1)):
-        arms = torch.from_numpy(points[members] - points[members].mean(axis=0))
-        rigid = infinitesimal_motions(arms).flatten(1).numpy()
-        flat = motions[:, members].reshape(len(motions), -1)
-        left[:, members] = (flat - flat @ np.linalg.pinv(rigid) @ rigid).reshape(len(motions), -1, 3)
-    size = np.linalg.norm(motions)
-    mixes, sizes, _ = np.linalg.svd(left.reshape(len(motions), -1), full_matrices=False)
-    return np.tensordot(mixes[:, sizes > DEFORMS * size].T, motions, 1)

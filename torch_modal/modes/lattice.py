@@ -15,7 +15,6 @@ from scipy.spatial import cKDTree
 
 from torch_modal.arrays import BoolArray, FloatArray, IntArray
 from torch_modal.geometry.canonical import CANONICAL_SIZE
-from torch_modal.geometry.connectivity import Connectivity, connected_pieces
 from torch_modal.modes.bisection import bisect
 from torch_modal.modes.surface import CanonicalSurface, SurfaceSamples, clearances
 from torch_modal.modes.tetrahedra import (
@@ -37,9 +36,7 @@ TURN = np.array([[2.0, -1.0, 2.0], [2.0, 2.0, -1.0], [-1.0, 2.0, 2.0]]) / 3
 ROOT = 2.0
 """Edge length of the root cubes, relative to the cubes at the surface."""
 ACROSS = 2.0
-"""Tetrahedra across the thickness."""
-ACROSS_GAP = 1.0
-"""Tetrahedra across a gap."""
+"""Tetrahedra across the thickness; a gap has one."""
 SMALLEST = 1 / 12
 """Smallest tetrahedron size, relative to the largest at the surface."""
 MOST_TETRAHEDRA = 12_000
@@ -103,9 +100,7 @@ class Lattice:
     def fill(self, surface: CanonicalSurface, stop: threading.Event) -> Tetrahedra:
         """Fill a surface with tetrahedra."""
         tetrahedra = lattice(surface, self.cube)
-        pairs = np.concatenate([surface.faces[:, :2], surface.faces[:, 1:]])
-        most = connected_pieces(pairs, len(surface.points)).max()
-        if (n_pieces := face_connected_pieces(tetrahedra.tets).max()) <= most:
+        if (n_pieces := face_connected_pieces(tetrahedra.tets).max()) <= surface.mesh.vertex_pieces.max():
             return tetrahedra
         rotated = lattice(replace(surface, points=surface.points @ TURN.T), self.cube)
         better = face_connected_pieces(rotated.tets).max() < n_pieces
@@ -192,14 +187,12 @@ def lattice(surface: CanonicalSurface, cube: float) -> Tetrahedra:
             break
         largest *= COARSER
     thickness, gap = clearances(surface)
-    sizes = np.clip(np.minimum(thickness / ACROSS, gap / ACROSS_GAP), SMALLEST * largest, largest)
+    sizes = np.clip(np.minimum(thickness / ACROSS, gap), SMALLEST * largest, largest)
     samples = SurfaceSamples(surface, np.minimum(SAMPLES_APART * sizes, (surface.area / FEWEST_SAMPLES) ** 0.5))
     points, wanted = samples.points, sizes[samples.faces]
     spacing = max(GRID_SPACING * wanted.min(), (np.prod(counts * root) / MOST_POINTS) ** (1 / 3))
     grid = [next_fast_len(int(np.ceil(length)) + 1, real=True) for length in counts * root / spacing]
-    at_rim = np.zeros(len(surface.points), dtype=bool)
-    at_rim[Connectivity(surface.faces).boundary_edges] = True
-    has_sides = np.asarray(~at_rim[surface.faces[samples.faces]].any(axis=1))
+    has_sides = np.asarray(~np.isin(surface.faces[samples.faces], surface.mesh.boundary_edges).any(axis=1))
     indicator = Indicator(samples, has_sides, low, spacing, np.array(grid))
 
     def is_inside(places: FloatArray) -> BoolArray:

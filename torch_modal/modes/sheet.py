@@ -48,7 +48,7 @@ def sheet_body(surface: CanonicalSurface, n_modes: int) -> ElasticBody:
     Vertices are clustered by edge collapses, and modes are computed on the mesh of the clusters, with stretching as
     stiff as the fine mesh: in Eq. 5 it grows as edges become shorter. Small loose pieces follow the rest.
     """
-    fine = Connectivity(surface.faces, len(surface.points))
+    fine = surface.mesh
     piece = fine.vertex_pieces[surface.faces[:, 0]]
     amounts = np.bincount(piece, double_areas(surface.points, surface.faces))
     large = surface.faces[~small_pieces(amounts, surface.points[surface.faces], piece)[piece]]
@@ -118,21 +118,17 @@ def _averages(mesh: Connectivity) -> sp.csr_matrix:
 
 def _vertex_gradients(motions: FloatArray, points: FloatArray, faces: IntArray) -> FloatArray:
     """Gradient of displacements at vertices, a mean of their faces by area. *Shape:* ``(N, 3, k) -> (3, N, 3, k)``."""
-    corners = points[faces]
-    one, other = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    normals = np.cross(one, other)
-    doubled = np.linalg.norm(normals, axis=1)
-    areas = np.maximum(doubled, 1e-9 * doubled.max())[:, None]
-    normals /= areas
-    hats = np.cross(other, normals) / areas, np.cross(normals, one) / areas
-    n, k = len(points), motions.shape[2]
-    share = sp.csr_matrix(
-        (np.repeat(areas[:, 0], 3), faces.reshape(-1), np.arange(0, faces.size + 1, 3)), (len(faces), n)
-    )
-    total = np.asarray(share.sum(axis=0)).reshape(-1, 1)
-    moves = [motions[faces[:, corner]] - motions[faces[:, 0]] for corner in (1, 2)]
-    # How the normal turns, in the directions of the plane.
-    lifts = [np.einsum("fck,fc->fk", move, normals) for move in moves]
-    last_move = -sum(hat[:, :, None] * lift[:, None] for hat, lift in zip(hats, lifts, strict=True))
-    gradients = np.einsum("pfck,pfa->fack", np.stack([*moves, last_move]), np.stack([*hats, normals]))
-    return np.moveaxis(((share.T @ gradients.reshape(len(faces), -1)) / total).reshape(n, 3, 3, k), 1, 0)
+    sides = points[faces[:, 1:]] - points[faces[:, :1]]
+    normals = np.cross(sides[:, 0], sides[:, 1])
+    areas = np.linalg.norm(normals, axis=1)
+    areas = np.maximum(areas, 1e-9 * areas.max())
+    normals /= areas[:, None]
+    hats = np.stack([np.cross(sides[:, 1], normals), np.cross(normals, sides[:, 0])], axis=1) / areas[:, None, None]
+    moves = motions[faces[:, 1:]] - motions[faces[:, :1]]
+    gradients = np.einsum("fpa,fpck->fack", hats, moves)
+    # The normal turns with the plane.
+    gradients -= np.einsum("fa,fcbk,fb->fack", normals, gradients, normals)
+    corners = np.arange(0, faces.size + 1, 3)
+    share = sp.csr_matrix((np.repeat(areas, 3), faces.reshape(-1), corners), (len(faces), len(points)))
+    means = share.T @ gradients.reshape(len(faces), -1) / np.asarray(share.sum(axis=0)).T
+    return np.moveaxis(means.reshape(len(points), 3, *motions.shape[1:]), 1, 0)

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.errors import MeshError
 from torch_modal.geometry.canonical import CANONICAL_SIZE, in_order, to_canonical
-from torch_modal.geometry.connectivity import vertex_areas
+from torch_modal.geometry.connectivity import Connectivity, vertex_areas
 from torch_modal.geometry.inspect import FLATNESS, principal_extents, signed_volume
 from torch_modal.geometry.vectors import vertex_normals
 from torch_modal.threads import n_threads
@@ -91,6 +91,11 @@ class CanonicalSurface:
                 f"the surface is flat: its extents are {lengths}, so it encloses nothing that could be filled with "
                 'tetrahedra; take the modes of the surface (method="shell"), or give it a thickness'
             )
+
+    @cached_property
+    def mesh(self) -> Connectivity:
+        """Edges and pieces."""
+        return Connectivity(self.faces, len(self.points))
 
     @cached_property
     def area(self) -> float:
