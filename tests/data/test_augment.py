@@ -91,7 +91,7 @@ def test_same_on_batch(bars: Shapes, space: tm.ShapeSpace, kind: str) -> None:
     augment(bars.keyframes)
     for value in augment.params.values():
         assert torch.equal(value, value[:1].expand_as(value))
-    assert len(augment(bars.keyframes[:0])) == 0 and "p=1.0" in repr(augment)
+    assert len(augment(bars.keyframes[:0])) == 0
     if kind in ("deformation", "rigid"):
         out = augment(bars.keyframes[[1, 1, 1]])
         torch.testing.assert_close(out, out[:1].expand_as(out), rtol=0, atol=1e-9)
@@ -150,15 +150,13 @@ def test_wrong_calls(bars: Shapes, space: tm.ShapeSpace) -> None:
         deformation(x)
     with pytest.raises(ValueError, match=r"\(B, 164, 3\).*got \(3, 163, 3\)"):
         deformation(x[:, 1:], space=space)
-    with pytest.raises(ValueError, match=r"got .* of torch\.int64"):
+    with pytest.raises(ValueError, match="shapes must be floating-point"):
         deformation(x.long(), space=space)
     deformation(x, space=space)
     with pytest.raises(ValueError, match="2 shapes need parameters with 2 rows"):
         deformation(x[:2], params=deformation.params, space=space)
     with pytest.raises(ValueError, match="a pool holds the 3 key-frames"):
         tm.RandomInBetween(p=1.0)(x, space=space, pool=tm.ShapeBatch(x[:2]))
-    with pytest.raises(ValueError, match=r"ShapeBatch.of_keyframes\(space\); got a ShapeSpace"):
-        tm.RandomInBetween(p=1.0)(x, space=space, pool=space)
     with pytest.raises(ValueError, match="no in-between"):
         mirrored = x * torch.tensor([1.0, 1, -1], dtype=F64)
         tm.RandomInBetween(p=1.0, t=(0.5, 0.5))(torch.stack([x[0], mirrored[0]]), space=space)
@@ -219,15 +217,12 @@ def test_interpolation_is_cubic() -> None:
 
 
 def test_a_shape_alone_has_key_frames_as_partners(bars: Shapes, space: tm.ShapeSpace) -> None:
-    """As with a pool, of a call or of the transform; without other key-frames, or with labels, there are none."""
+    """As with a pool; without other key-frames, or with labels, there are none."""
     x, pool = bars.keyframes[0], tm.ShapeBatch.of_keyframes(space)
     given: dict[str, Any] = {"t": (0.4, 0.6), "p": 1.0, "keepdim": True}
     found = tm.RandomInBetween(**given, space=space, generator=seeded())(x)
     assert float((found - x).abs().max()) > 0.1
     assert torch.equal(tm.RandomInBetween(**given, space=space, generator=seeded())(x, pool=pool), found)
-    assert torch.equal(tm.RandomInBetween(**given, space=space, generator=seeded(), pool=pool)(x), found)
-    one = tm.AugmentationSequential(tm.RandomInBetween(**given), generator=seeded(), space=space, pool=pool)
-    assert not torch.equal(one(x[None]), x[None])
     assert torch.equal(tm.RandomInBetween(**given, space=tm.ShapeSpace(bars.bases[:1], bars.faces))(x), x)
     labelled = tm.RandomInBetween(**given, space=space, data_keys=["shapes", "shape_labels"])
     assert torch.equal(labelled(x, torch.tensor(3))[0], x)

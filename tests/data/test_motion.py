@@ -8,7 +8,6 @@ import torch
 from conftest import Shapes
 
 import torch_modal as tm
-from torch_modal.data.stored import KeyframeTimes
 
 F64 = torch.float64
 TIMES = (0.0, 0.5, 2.0, 3.0, 4.5)
@@ -29,20 +28,21 @@ def largest(x: torch.Tensor) -> float:
 
 
 # ------------------------------------------------------------------------------------------------------------ times
-def test_neighbours_in_time() -> None:
-    assert KeyframeTimes(range(4), 4).neighbours.tolist() == [[1, 1], [0, 2], [1, 3], [2, 2]]
-    assert KeyframeTimes(range(5), 4, cyclic=True).neighbours.tolist() == [[3, 1], [0, 2], [1, 3], [2, 0]]
-    assert KeyframeTimes(range(2), 2).neighbours.tolist() == [[1, 1], [0, 0]]
-
-
-def test_spans_of_successive_key_frames() -> None:
-    motion = KeyframeTimes((0, 1, 3, 4), 4)
-    assert [motion.span(*pair) for pair in ((0, 1), (1, 2), (2, 1), (2, 3))] == [(0, 1), (1, 3), (3, 1), (3, 4)]
-    assert motion.span(0, 2) is None and motion.span(0, 3) is None and motion.span(1, 1) is None
-    cycle = KeyframeTimes((0, 1, 3, 5), 3, cyclic=True)
-    assert [cycle.span(*pair) for pair in ((2, 0), (0, 2), (0, 1))] == [(3, 5), (5, 3), (0, 1)]
-    # Two have nobody to be smooth with, whichever way they go round.
-    assert KeyframeTimes(range(2), 2).span(0, 1) is None and KeyframeTimes(range(3), 2, cyclic=True).span(0, 1) is None
+@pytest.mark.parametrize(
+    ("places", "cyclic", "wanted"),
+    [
+        ((0, 1, 2, 0), False, [[1, 1], [0, 2], [1, 3], [2, 2]]),
+        ((0, 1, 2, 0), True, [[3, 1], [0, 2], [1, 3], [2, 0]]),
+        ((0, 1), False, [[1, 1], [0, 0]]),
+    ],
+)
+def test_neighbours_in_time(bars: Shapes, places: tuple[int, ...], cyclic: bool, wanted: list[list[int]]) -> None:
+    n = len(places)
+    space = space_of(bars.pick(*places), keyframe_times=range(n + cyclic), cyclic=cyclic)
+    pool, draw = tm.ShapeBatch.of_keyframes(space), torch.tensor([0.2, 0.8]).repeat(n)
+    partners = pool.partners(torch.arange(n).repeat_interleave(2), draw, space, pool)
+    assert partners is not None and partners.nearest is not None
+    assert partners.nearest.view(n, 2).tolist() == wanted
 
 
 # ----------------------------------------------------------------------------------------------------------- shapes
@@ -65,7 +65,7 @@ def test_neighbours_are_joined_by_the_path_and_others_by_the_pair(bar_motion: Sh
         torch.testing.assert_close(space.in_betweens.of_keyframes(j, i, 1 - u), found, rtol=0, atol=1e-6)
     assert torch.equal(space.in_betweens.of_keyframes(0, 2, u), pairs.in_betweens.of_keyframes(0, 2, u))
     x = shapes.keyframes[:2] + 0.01 * torch.sin(shapes.keyframes[:2])
-    given = x[:1], x[1:], u[2:3], *torch.tensor([[0], [1]]), torch.tensor([False])
+    given = x[:1], x[1:], u[2:3], *torch.tensor([[0], [1]])
     assert torch.equal(space.in_betweens(*given), pairs.in_betweens(*given))
 
 
@@ -109,7 +109,7 @@ def test_other_shapes_are_solved_with_their_partner_alone(bar_motion: Shapes) ->
     nearest = space.nearest(x)
     for row, i in enumerate(nearest.tolist()):
         ends = x[row : row + 1], bar_motion.keyframes[i + 1 : i + 2]
-        expected = pairs.in_betweens(*ends, params["t"][:1], *torch.tensor([[i], [i + 1]]), torch.tensor([False]))
+        expected = pairs.in_betweens(*ends, params["t"][:1], *torch.tensor([[i], [i + 1]]))
         torch.testing.assert_close(found[row : row + 1], expected, rtol=0, atol=1e-6)
 
 

@@ -55,13 +55,11 @@ def test_times_of_a_motion(small_bars: Shapes, folder: Path) -> None:
         found = pickle.loads(pickle.dumps(StoredSet(folder)))
         assert (found.times, found.cyclic) == (times, cyclic)
         space = ShapeSpace.open(found)
-        assert space.motion is not None and space.motion.times.tolist() == list(times)
-        assert space.motion.cyclic == cyclic
+        assert space.motion is not None and space.motion.tolist() == list(times) and space.cyclic == cyclic
     for wrong, message in (
         ({"times": (0, 1)}, "must be 3 ascending numbers, one for each key-frame"),
         ({"times": (0, 1, 2), "cyclic": True}, "must be 4 ascending numbers"),
         ({"times": (0, 1, 1)}, "got 1 at place 2, after 1"),
-        ({"cyclic": True}, r"need their times: range\(4\)"),
     ):
         with pytest.raises(ValueError, match=message):
             write_set(folder, *small_bars, NAMES, **wrong)
@@ -134,11 +132,6 @@ def test_refuses_parts_that_do_not_fit(small_bars: Shapes, bars: Shapes, tmp_pat
 def test_refuses_what_is_no_set(small_bars: Shapes, folder: Path) -> None:
     with pytest.raises(FileNotFoundError, match=SET_FILE):
         StoredSet(folder.parent)
-    shapes = {"keyframes": small_bars.keyframes, "faces": small_bars.faces}
-    for tensors, message in (
-        (shapes, r"lacks the tensors 0\.reference"),
-        ({**shapes, "faces": small_bars.faces[0]}, r"needs keyframes \(K, V, 3\) and faces"),
-    ):
-        write_tensors(folder / SET_FILE, FORMAT, VERSION, tensors, {"names": [], "times": None, "note": ""})
-        with pytest.raises(ValueError, match=message):
-            read_note(folder)
+    write_tensors(folder / SET_FILE, FORMAT, VERSION, {"keyframes": small_bars.keyframes})
+    with pytest.raises(ValueError, match="lacks the tensors faces"):
+        read_note(folder)

@@ -41,7 +41,6 @@ class ShapeAugmentation(nn.Module):
         data_keys: Arguments and results of a call; ``"shapes"`` must be among them.
         generator: Source of random numbers; by default PyTorch's own generator.
         space: Default key-frames and modes of the calls.
-        pool: Default pool of the calls, as for :meth:`transform`.
 
     Raises:
         ValueError: ``p`` is no probability, a data key is unknown or doubled, or there are no shapes.
@@ -49,8 +48,6 @@ class ShapeAugmentation(nn.Module):
 
     uses_keyframes = True
     """True if the transform needs key-frames and modes."""
-    shown: tuple[str, ...] = ()
-    """Settings of a subclass that its ``repr`` shows."""
 
     def __init__(
         self,
@@ -61,27 +58,20 @@ class ShapeAugmentation(nn.Module):
         data_keys: Sequence[str] = ("shapes",),
         generator: torch.Generator | None = None,
         space: ShapeSpace | None = None,
-        pool: ShapeBatch | None = None,
     ) -> None:
         super().__init__()
         if not 0 <= p <= 1:
             raise ValueError(f"p must be a probability, from 0 to 1; got {p}")
         self.data_keys = tuple(data_keys)
-        if "shapes" not in self.data_keys or len(set(self.data_keys)) < len(self.data_keys):
-            raise ValueError(f"data_keys must be unique and include 'shapes'; got {self.data_keys}")
-        if set(self.data_keys) - set(DATA_KEYS):
-            raise ValueError(f"data_keys must be among {DATA_KEYS}; got {self.data_keys}")
+        keys = set(self.data_keys)
+        if "shapes" not in keys or len(keys) < len(self.data_keys) or keys - set(DATA_KEYS):
+            raise ValueError(f"data_keys must be unique, among {DATA_KEYS}, and include 'shapes'; got {self.data_keys}")
         self.p = p
         self.same_on_batch = same_on_batch
         self.keepdim = keepdim
         self.generator = generator
         self.space = space
-        self.pool = pool
         self.params: Any = {}
-
-    def extra_repr(self) -> str:
-        """Settings, as kornia shows them."""
-        return ", ".join(f"{name}={getattr(self, name)}" for name in (*self.shown, "p", "same_on_batch", "keepdim"))
 
     # ------------------------------------------------------------------------------------------------ for subclasses
     def generate_parameters(self, n: int, space: Any, generator: torch.Generator | None) -> Parameters:
@@ -144,7 +134,7 @@ class ShapeAugmentation(nn.Module):
         Raises:
             ValueError: There is no space, or the rows of ``params`` or ``pool`` do not fit.
         """
-        space, pool = self._space(space), self.pool if pool is None else pool
+        space = self._space(space)
         if self.uses_keyframes or torch.compiler.is_exporting():
             require_numbers(type(self).__name__, batch.shapes)
         n, dtype, device = len(batch.shapes), batch.shapes.dtype, batch.shapes.device
@@ -166,13 +156,11 @@ class ShapeAugmentation(nn.Module):
             kind = mine.shapes.dtype if value.is_floating_point() else None
             chosen_params[name] = value[chosen.to(value.device)].to(device, kind)
         result = self.apply_transform(mine, chosen_params, space, partners)
-        if batch.is_keyframe is not None:
-            result = result._replace(is_keyframe=torch.zeros(len(chosen), dtype=torch.bool))
-        parts = (
+        fields = (
             before if before is None or after is None else before.index_copy(0, chosen.to(before.device), after)
             for before, after in zip(batch, result, strict=True)
         )
-        batch = ShapeBatch._make(parts)
+        batch = ShapeBatch._make(fields)
         return batch._replace(shapes=batch.shapes.to(dtype))
 
     @disable_compile
@@ -210,11 +198,9 @@ class ShapeAugmentation(nn.Module):
         self.params = self.forward_parameters(len(batch.shapes), space) if params is None else params
         out = self.transform(batch, self.params, space, pool)
         if "normals" in named:
-            own_spaces = (each.space for each in self.modules() if isinstance(each, ShapeAugmentation))
-            known = [each for each in (space, *own_spaces) if each is not None]
-            if not known:
+            if space is None:
                 raise ValueError("normals need faces: pass space=ShapeSpace(bases, faces) when it is made or called")
-            normals = vertex_normals(out.shapes, known[0].faces)
+            normals = vertex_normals(out.shapes, space.faces)
         results = [normals if name == "normals" else getattr(out, name) for name in named]
         if single and self.keepdim:
             results = [None if value is None else value[0] for value in results]
@@ -239,7 +225,6 @@ class AugmentationSequential(ShapeAugmentation):
         keepdim: Likewise.
         generator: Source of random numbers of all transforms; by default each has its own.
         space: Key-frames and modes, for all transforms; by default each has its own.
-        pool: Likewise.
 
     Raises:
         ValueError: A data key is unknown or doubled, there are no shapes, or an argument is no transform.
@@ -254,9 +239,8 @@ class AugmentationSequential(ShapeAugmentation):
         keepdim: bool = False,
         generator: torch.Generator | None = None,
         space: ShapeSpace | None = None,
-        pool: ShapeBatch | None = None,
     ) -> None:
-        super().__init__(1.0, keepdim=keepdim, data_keys=data_keys, generator=generator, space=space, pool=pool)
+        super().__init__(1.0, keepdim=keepdim, data_keys=data_keys, generator=generator, space=space)
         others = [type(one).__name__ for one in transforms if not isinstance(one, ShapeAugmentation)]
         if others:
             raise ValueError(f"pass the transforms one by one, AugmentationSequential(*transforms); got {others}")
@@ -280,7 +264,7 @@ class AugmentationSequential(ShapeAugmentation):
         if len(params) != len(self.transforms):
             raise ValueError(f"{len(self.transforms)} transforms need as many sets of parameters; got {len(params)}")
         for one, parameters in zip(self.transforms, params, strict=True):
-            batch = one.transform(batch, parameters, self._space(space), self.pool if pool is None else pool)
+            batch = one.transform(batch, parameters, self._space(space), pool)
         return batch
 
 
@@ -300,8 +284,7 @@ def draw_uniform(
 ) -> Tensor:
     """Uniform numbers in a range, float64. *Shape:* ``(n, ...)``."""
     device = "cpu" if generator is None else generator.device
-    drawn = torch.rand(n, *size, dtype=torch.float64, generator=generator, device=device)
-    return span[0] + (span[1] - span[0]) * drawn
+    return span[0] + (span[1] - span[0]) * torch.rand(n, *size, dtype=torch.float64, generator=generator, device=device)
 
 
 def draw_normal(n: int, generator: torch.Generator | None, *size: int) -> Tensor:

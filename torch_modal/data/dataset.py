@@ -52,7 +52,7 @@ class ShapeDataset(Dataset[Sample]):
 
     Raises:
         FileNotFoundError: There is no such folder, or no set in it.
-        ValueError: ``samples_per_set`` is below 1, or ``seed`` below 0.
+        ValueError: ``samples_per_set`` is below 1.
     """
 
     def __init__(
@@ -70,14 +70,12 @@ class ShapeDataset(Dataset[Sample]):
     ) -> None:
         if samples_per_set < 1:
             raise ValueError(f"samples_per_set is 1 or more, got {samples_per_set}")
-        if not isinstance(seed, int | np.integer) or seed < 0:
-            raise ValueError(f"seed is an integer, 0 or more; got {seed!r}")
         self.sets = [str(path) for path in find_sets(root)]
         if not self.sets:
             raise FileNotFoundError(f"no stored key-frame set in {root}; torch-modal precompute makes them")
         transform = RandomInBetween(p=1.0) if transform is None else transform
-        chained = isinstance(transform, AugmentationSequential)
-        self.transform = transform if chained else AugmentationSequential(transform)
+        is_chain = isinstance(transform, AugmentationSequential)
+        self.transform = transform if is_chain else AugmentationSequential(transform)
         self.samples_per_set = samples_per_set
         self.labels = labels
         self.seed = seed
@@ -104,7 +102,7 @@ class ShapeDataset(Dataset[Sample]):
 
     def space(self, number: int) -> ShapeSpace:
         """Key-frames and modes of a set."""
-        return self._open(number)[0]
+        return self._opened.get(number, lambda: self._read(number))[0]
 
     def __getitem__(self, index: int) -> Sample:
         """One sample."""
@@ -120,14 +118,14 @@ class ShapeDataset(Dataset[Sample]):
             by_set.setdefault(index % len(self) // self.samples_per_set, []).append(place)
         with torch.no_grad(), one_thread():
             for number, places in by_set.items():
-                made = self._make(number, [indices[place] % len(self) for place in places])
-                samples.update(zip(places, made, strict=True))
+                of_set = self._make_samples(number, [indices[place] % len(self) for place in places])
+                samples.update(zip(places, of_set, strict=True))
         return [samples[place] for place in range(len(indices))]
 
-    def _make(self, number: int, indices: Sequence[int]) -> list[Sample]:
-        space, pool = self._open(number)
-        turn = self.epoch * self.samples_per_set
-        start = torch.tensor([(index % self.samples_per_set + turn) % len(space) for index in indices])
+    def _make_samples(self, number: int, indices: Sequence[int]) -> list[Sample]:
+        space, pool = self._opened.get(number, lambda: self._read(number))
+        before = self.epoch * self.samples_per_set
+        start = torch.tensor([(index % self.samples_per_set + before) % len(space) for index in indices])
         drawn = []
         for index in indices:
             state = np.random.SeedSequence([self.seed, self.epoch, index]).generate_state(1, np.uint64)
@@ -137,23 +135,19 @@ class ShapeDataset(Dataset[Sample]):
             {name: torch.cat([row[name] for row in rows]) for name in rows[0]} for rows in zip(*drawn, strict=True)
         ]
         batch = self.transform.transform(pool.rows(start), params, space, pool)
-        parts = {"vertices": batch.shapes, "vertex_labels": batch.vertex_labels, "shape_labels": batch.shape_labels}
+        fields = {"vertices": batch.shapes, "vertex_labels": batch.vertex_labels, "shape_labels": batch.shape_labels}
         if self.with_normals:
-            parts["normals"] = vertex_normals(batch.shapes, space.faces)
+            fields["normals"] = vertex_normals(batch.shapes, space.faces)
         # Copies: a view would carry the whole batch to another process.
-        samples: list[Sample] = [
-            {name: tensor[row].clone() for name, tensor in parts.items() if tensor is not None}
+        return [
+            {name: tensor[row].clone() for name, tensor in fields.items() if tensor is not None}
             | {"set": number, "keyframe": int(start[row])}
             | ({"faces": space.faces} if self.with_faces else {})
             for row in range(len(indices))
         ]
-        return samples
-
-    def _open(self, number: int) -> tuple[ShapeSpace, ShapeBatch]:
-        """The space of a set, and its key-frames with their labels."""
-        return self._opened.get(number, lambda: self._read(number))
 
     def _read(self, number: int) -> tuple[ShapeSpace, ShapeBatch]:
+        """The space of a set, and its key-frames with their labels."""
         stored = StoredSet(self.sets[number])
         space = ShapeSpace.open(stored, dtype=self.dtype, **self.options)
         path = stored.folder / LABELS_FILE

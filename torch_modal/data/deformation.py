@@ -5,7 +5,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torch_modal.autograd import is_transformed
 from torch_modal.data.augmentation import Parameters, ShapeAugmentation, check_range, draw_normal, draw_uniform
 from torch_modal.data.in_betweens import compute_by_kind
 from torch_modal.data.shape_batch import ShapeBatch
@@ -19,12 +18,6 @@ from torch_modal.geometry.triangle_frames import bend, bent_sides, frames_of, si
 _WITHIN_BOUND = 0.98
 _SMALLEST_FACTOR = 0.05
 _SCALING_ROUNDS = 8
-
-# The same draw with and without gradients differs by rounding; both must stay within the bound.
-_ROUNDING = 1e-4
-
-# Largest number of coordinates of edge vectors in memory at a time.
-_NUMBERS_AT_ONCE = 2**22
 
 
 class RandomModalDeformation(ShapeAugmentation):
@@ -48,8 +41,6 @@ class RandomModalDeformation(ShapeAugmentation):
         ValueError: ``strain`` is no range of positive numbers, or ``max_strain`` is not between 0 and 1.
     """
 
-    shown = ("strain", "max_strain")
-
     def __init__(
         self, strain: float | tuple[float, float] = (0.0, 0.02), max_strain: float = 0.2, p: float = 0.5, **options: Any
     ) -> None:
@@ -70,52 +61,38 @@ class RandomModalDeformation(ShapeAugmentation):
         """Deform each shape along the modes of its nearest key-frame."""
         assert batch.nearest is not None
         amplitudes = params["strain"][:, None] * params["noise"]
-        chunk = max(1, _NUMBERS_AT_ONCE // (9 * len(space.faces)))
 
         def deform_rows(kind: list[int], rows: Tensor) -> Tensor:
-            chunks = rows.to(amplitudes.device).split(chunk)
-            return torch.cat([self._deform_nearest(batch.shapes[r], amplitudes[r], space, kind[0]) for r in chunks])
+            rows = rows.to(amplitudes.device)
+            return self._deform_nearest(batch.shapes[rows], amplitudes[rows], space, kind[0])
 
         return batch._replace(shapes=compute_by_kind(batch.nearest[:, None], deform_rows))
 
     def _deform_nearest(self, x: Tensor, amplitudes: Tensor, space: ShapeSpace, index: int) -> Tensor:
-        """Deform shapes whose nearest key-frame is the same. *Shape:* ``(B, V, 3), (B, n) -> (B, V, 3)``."""
+        """Deform shapes whose nearest key-frame is the same. *Shape:* ``(B, V, 3), (B, n) -> (B, V, 3)``.
+
+        Each draw is scaled down, by a constant of the graph, until it keeps the bound; without any such scale, the
+        shape stays as it was.
+        """
         basis, reconstruction = space.bases[index], space.reconstruction(x.device)
         keyframe, modes, scales = (tensor.to(x) for tensor in (basis.reference, basis.modes, space.mode_scales(index)))
         displacement = (amplitudes[:, : len(scales)] * scales) @ modes.flatten(1)
         displacement = displacement.unflatten(1, (-1, 3)).movedim(-1, 0).contiguous()
         with torch.no_grad():
-            scale, deformed = self._scale_to_bound(x.detach(), displacement.detach(), keyframe, space)
-        recording = torch.is_grad_enabled() and (x.requires_grad or amplitudes.requires_grad)
-        if not recording and not is_transformed(x) and not is_transformed(amplitudes):
-            return deformed
-        deformed = deform(x, scale[:, None] * displacement, keyframe, reconstruction)
-        # Shapes beyond the bound stay as they were.
-        with torch.no_grad():
-            within = (space.strain(deformed, x).abs() <= self.max_strain).all(1) & (scale > 0)
-        return torch.where(within[:, None, None], deformed, x)
-
-    def _scale_to_bound(
-        self, x: Tensor, displacement: Tensor, keyframe: Tensor, space: ShapeSpace
-    ) -> tuple[Tensor, Tensor]:
-        """Scale of each draw that keeps the bound, ``(B,)``, and the shapes; unchanged shapes if there is none."""
-        reconstruction = space.reconstruction(x.device)
-        bound = (1 - _ROUNDING) * self.max_strain
-        expected = edge_strains(displacement, keyframe, reconstruction.edges).abs().amax(1)
-        scale = (_WITHIN_BOUND * bound / expected.clamp_min(torch.finfo(x.dtype).tiny)).clamp_max(1)
-        shapes = x.clone()
-        rows = torch.arange(len(x), device=x.device)
-        for _ in range(_SCALING_ROUNDS):
-            tried = deform(x[rows], (scale[:, None] * displacement)[:, rows], keyframe, reconstruction)
-            largest = space.strain(tried, x[rows]).abs().amax(1).nan_to_num(torch.inf)
-            within = largest <= bound
-            shapes = shapes.index_copy(0, rows[within], tried[within])
-            rows, largest = rows[~within], largest[~within]
+            largest = edge_strains(displacement, keyframe, reconstruction.edges).abs().amax(1)
+        scale, shapes, rows = torch.ones_like(largest), x, torch.arange(len(x), device=x.device)
+        for trial in range(_SCALING_ROUNDS):
+            factor = _WITHIN_BOUND * self.max_strain / largest.clamp_min(torch.finfo(x.dtype).tiny)
+            scale = scale * (factor.clamp_max(1) if not trial else factor.clamp_min(_SMALLEST_FACTOR))
+            deformed = deform(x[rows], scale[:, None] * displacement[:, rows], keyframe, reconstruction)
+            with torch.no_grad():
+                largest = space.strain(deformed, x[rows]).abs().amax(1).nan_to_num(torch.inf)
+            within = largest <= self.max_strain
+            shapes = shapes.index_copy(0, rows[within], deformed[within])
+            rows, scale, largest = rows[~within], scale[~within], largest[~within]
             if not len(rows):
-                return scale, shapes
-            factor = (_WITHIN_BOUND * bound / largest).clamp_min(_SMALLEST_FACTOR)
-            scale = scale.index_copy(0, rows, scale[rows] * factor)
-        return scale.index_fill(0, rows, 0), shapes
+                break
+        return shapes
 
 
 def deform(x: Tensor, displacement: Tensor, keyframe: Tensor, reconstruction: Reconstruction) -> Tensor:

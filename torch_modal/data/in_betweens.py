@@ -11,13 +11,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torch_modal.autograd import Recent
-from torch_modal.data.stored import KeyframeTimes
+from torch_modal.autograd import Recent, is_transformed
 from torch_modal.elastic.implicit import ConvergenceWarning
 from torch_modal.elastic.minimise import Status
 from torch_modal.inbetween.results import InBetweenResult
 from torch_modal.inbetween.settings import Settings
-from torch_modal.io.cache import CACHE_VERSION, CacheWarning, ContentError, content_digest
+from torch_modal.io.cache import CACHE_VERSION, ContentError, content_digest
 from torch_modal.io.tensors import read_tensors, write_tensors
 from torch_modal.layers.in_between import InBetween
 from torch_modal.modes.basis import ModalBasis
@@ -47,7 +46,7 @@ class PairTables:
         bases: list[ModalBasis],
         faces: Tensor,
         settings: Settings,
-        motion: KeyframeTimes | None,
+        motion: Tensor | None,
         times: int | None,
         dtype: torch.dtype,
         folder: str | os.PathLike[str] | None,
@@ -57,9 +56,10 @@ class PairTables:
         self.bases, self.faces, self.settings, self.motion = bases, faces, settings, motion
         self.times, self.dtype = times, dtype
         self.folder = None if folder is None else Path(folder)
+        self.keyframes = torch.stack([basis.reference.double() for basis in bases])
         self._solvers, self._tables = Recent(32), Recent(64)
 
-    def __call__(self, x_a: Tensor, x_b: Tensor, t: Tensor, i: Tensor, j: Tensor, keyframes: Tensor) -> Tensor:
+    def __call__(self, x_a: Tensor, x_b: Tensor, t: Tensor, i: Tensor, j: Tensor) -> Tensor:
         """In-betweens of a batch of shapes ``x_a`` at 0 and ``x_b`` at 1, at the times ``t``. *Shape:* ``(B, V, 3)``.
 
         Args:
@@ -68,7 +68,6 @@ class PairTables:
             t: *Shape:* ``(B,)``.
             i: The key-frame whose modes serve at 0, on the CPU. *Shape:* ``(B,)``.
             j: Likewise at 1, perhaps the same.
-            keyframes: Whether both shapes are these key-frames, on the CPU. *Shape:* ``(B,)``, bool.
 
         Raises:
             ValueError: A shape is not finite, has no size, or is the mirror image of the other.
@@ -76,6 +75,7 @@ class PairTables:
         Warns:
             ConvergenceWarning: Some did not converge.
         """
+        keyframes = (i != j) & self._is_keyframe(x_a, i) & self._is_keyframe(x_b, j)
         # The same two key-frames in either order are solved together.
         swap = (i > j).to(t.device)
         t = torch.where(swap, 1 - t, t)
@@ -102,29 +102,34 @@ class PairTables:
             return _check_converged(self._solve(i, j, t), i, j)
         return interpolate(self.table(i, j), t.to("cpu", self.dtype)).to(t)
 
+    def _is_keyframe(self, x: Tensor, i: Tensor) -> Tensor:
+        """True for shapes without a gradient that are these key-frames, up to float32. *Shape:* ``(B,)``."""
+        if x.requires_grad or is_transformed(x):
+            return torch.zeros(len(x), dtype=torch.bool)
+        return (x.float() == self.keyframes[i].to(x.device, torch.float32)).flatten(1).all(1).cpu()
+
     def table(self, i: int, j: int) -> Tensor:
         """In-betweens of two key-frames at even times, from disk if stored. *Shape:* ``(T, V, 3)``.
 
         Raises:
-            ValueError: There are no tables, or no in-betweens of the two.
+            ValueError: There are no in-betweens of the two.
 
         Warns:
-            CacheWarning: The objective has a term of the user's own, so that each process computes its tables again.
             ConvergenceWarning: Some did not converge; the table is not stored, so that each run warns.
         """
-        times = self.times
-        if times is None:
-            raise ValueError("a space of times=None solves each in-between: it has no tables")
-        return self._tables.get((i, j), lambda: self._read_or_solve(i, j, times))
+        times, span = self.times, self._span(i, j)
+        assert times is not None
 
-    def _read_or_solve(self, i: int, j: int, times: int) -> Tensor:
         def compute() -> tuple[Tensor, bool]:
             with torch.no_grad():
                 result = self._solve(i, j, torch.linspace(0, 1, times, dtype=torch.float64))
             return _check_converged(result, i, j).to(self.dtype), bool(result.solution.usable.all())
 
-        key = None if self.folder is None else self._key(i, j)
-        return read_or_compute(self.folder, f"between-{i}-{j}", key, compute)
+        bases = [self.bases[i], self.bases[j]] if span is None else self.bases
+        tensors = [(basis.reference, basis.eigenvalues, basis.modes) for basis in bases]
+        when = (times, span, None if span is None else self.motion)
+        content = [tensors, self.faces, when, str(self.dtype), *self.settings]
+        return self._tables.get((i, j), lambda: read_or_compute(self.folder, f"between-{i}-{j}", content, compute))
 
     def _layer(self, i: int, j: int, like: Tensor) -> InBetween:
         def make_layer() -> InBetween:
@@ -133,48 +138,35 @@ class PairTables:
 
         return self._solvers.get((i, j, like.dtype, like.device), make_layer)
 
+    def _span(self, i: int, j: int) -> tuple[float, float] | None:
+        """Times of two key-frames, ``i < j``, that follow each other in a motion of three or more; otherwise None."""
+        n = len(self.bases)
+        if self.motion is None or n < 3:
+            return None
+        if j == i + 1:
+            return float(self.motion[i]), float(self.motion[j])
+        is_end_of_cycle = len(self.motion) > n and (i, j) == (0, n - 1)
+        return (float(self.motion[n]), float(self.motion[j])) if is_end_of_cycle else None
+
     def _solve(self, i: int, j: int, t: Tensor) -> InBetweenResult:
         """Solve between two key-frames: along the motion if they follow each other in it, otherwise the pair alone."""
-        motion, span = self.motion, None if self.motion is None else self.motion.span(i, j)
-        bases = [self.bases[i], self.bases[j]] if span is None else self.bases
+        span = self._span(i, j)
+        places = [i, j] if span is None else list(range(len(self.bases)))
+        shapes = self.keyframes[places].to(t)
         if span is None and not self.settings.objective.contact:
-            first, last = (basis.reference.to(t.device, t.dtype) for basis in bases)
-            return self._layer(i, j, t).solve(first, last, t)
+            return self._layer(i, j, t).solve(shapes[0], shapes[1], t)
 
-        def make_path() -> tuple[MotionPath, Tensor]:
+        def make_path() -> MotionPath:
             # A path separates contacts the same way at all times, so that tables are smooth.
-            when = (motion.times, motion.cyclic) if motion is not None and span is not None else (None, False)
-            path = MotionPath(bases, self.faces, *when, **self.settings._asdict())
-            return path.to(t), torch.stack([basis.reference for basis in bases]).to(t)
+            bases, times = [self.bases[place] for place in places], None if span is None else self.motion
+            cyclic = times is not None and len(times) > len(bases)
+            return MotionPath(bases, self.faces, times, cyclic, **self.settings._asdict()).to(t)
 
-        path, shapes = self._solvers.get((span is None and (i, j), t.dtype, t.device), make_path)
+        path = self._solvers.get((span is None and (i, j), t.dtype, t.device), make_path)
         if span is not None:
             start, end = torch.tensor(span, dtype=torch.float64, device=t.device)
             t = torch.lerp(start, end, t.double())  # exact at both ends
         return path.solve(shapes, t)
-
-    def _key(self, i: int, j: int) -> dict[str, str] | None:
-        """Digest of all inputs of a table; None, with a warning, if the objective has terms of the user's own."""
-        span = None if self.motion is None else self.motion.span(i, j)
-        bases = self.bases if span else [self.bases[place] for place in (i, j)]
-        tensors = [(basis.reference, basis.eigenvalues, basis.modes) for basis in bases]
-        when = self.motion and span and (span, self.motion.times)
-        try:
-            content = content_digest([*versions(), tensors, self.faces, when, *self.settings])
-        except ContentError as error:
-            warnings.warn(
-                f"tables of in-betweens are not stored in {self.folder}, as the objective has terms without a "
-                f"digest: {error}",
-                CacheWarning,
-                stacklevel=5,
-            )
-            return None
-        return {"times": str(self.times), "dtype": str(self.dtype), "content": content}
-
-
-def versions() -> tuple[str, str, int]:
-    """Versions that enter the key of a table."""
-    return __version__, str(torch.__version__), CACHE_VERSION
 
 
 def compute_by_kind(kinds: Tensor, compute: Callable[[list[int], Tensor], Tensor]) -> Tensor:
@@ -205,13 +197,18 @@ def interpolate(table: Tensor, t: Tensor) -> Tensor:
 
 
 def read_or_compute(
-    folder: Path | None, name: str, key: dict[str, str] | None, compute: Callable[[], tuple[Tensor, bool]]
+    folder: Path | None, name: str, content: list[Any], compute: Callable[[], tuple[Tensor, bool]]
 ) -> Tensor:
     """A table from its file in a folder; or a new one, which is written there if it is worth keeping.
 
-    Without a folder or a key, tables are neither read nor written.
+    Content is everything that a table depends on but code and versions. Without a folder, or where an objective has
+    terms of the user's own, whose code has no digest, tables are neither read nor written.
     """
-    if folder is None or key is None:
+    if folder is None:
+        return compute()[0]
+    try:
+        key = {"content": content_digest([__version__, str(torch.__version__), CACHE_VERSION, *content])}
+    except ContentError:
         return compute()[0]
     path = folder / f"{name}.safetensors"
     if (stored := read_tensors(path, FORMAT, VERSION, key)) is not None:

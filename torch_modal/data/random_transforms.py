@@ -39,8 +39,6 @@ class RandomInBetween(ShapeAugmentation):
         ValueError: ``t`` is no range within [0, 1].
     """
 
-    shown: tuple[str, ...] = ("t", "blend_labels")
-
     def __init__(
         self, t: tuple[float, float] = (0.0, 1.0), blend_labels: bool = False, p: float = 0.5, **options: Any
     ) -> None:
@@ -65,25 +63,23 @@ class RandomInBetween(ShapeAugmentation):
         return batch._replace(
             shapes=self.shapes(batch, partners, t, space),
             nearest=torch.where(nearer, partners.nearest, batch.nearest),
-            vertex_labels=self._labels("vertex_labels", batch.vertex_labels, partners.vertex_labels, t),
-            shape_labels=self._labels("shape_labels", batch.shape_labels, partners.shape_labels, t),
+            vertex_labels=self._labels(batch.vertex_labels, partners.vertex_labels, t),
+            shape_labels=self._labels(batch.shape_labels, partners.shape_labels, t),
         )
 
     def shapes(self, batch: ShapeBatch, partners: ShapeBatch, t: Tensor, space: ShapeSpace) -> Tensor:
         """The shapes at the times ``t``. *Shape:* ``(B,) -> (B, V, 3)``."""
-        (x_a, i, is_a), (x_b, j, is_b) = batch[:3], partners[:3]
-        assert i is not None and j is not None and is_a is not None and is_b is not None
-        tracked = x_a.requires_grad or x_b.requires_grad
-        return space.in_betweens(x_a, x_b, t, i, j, is_a & is_b & (i != j) & (not tracked))
+        assert batch.nearest is not None and partners.nearest is not None
+        return space.in_betweens(batch.shapes, partners.shapes, t, batch.nearest, partners.nearest)
 
-    def _labels(self, name: str, labels: Tensor | None, others: Tensor | None, t: Tensor) -> Tensor | None:
+    def _labels(self, labels: Tensor | None, others: Tensor | None, t: Tensor) -> Tensor | None:
         if labels is None or others is None:
             return labels
         t = t.detach().to(labels.device).reshape(-1, *[1] * (labels.dim() - 1))
         if not self.blend_labels:
             return torch.where(t > 0.5, others, labels)
         if not labels.is_floating_point():
-            raise ValueError(f"blended {name} must be floating-point, one-hot for classes; got {labels.dtype}")
+            raise ValueError(f"blended labels must be floating-point, one-hot for classes; got {labels.dtype}")
         return torch.lerp(labels, others, t.clamp(0, 1).to(labels.dtype))
 
 
@@ -106,8 +102,6 @@ class RandomExtrapolation(RandomInBetween):
     Raises:
         ValueError: ``beyond`` is no range within [0, 1].
     """
-
-    shown = ("beyond", "blend_labels")
 
     def __init__(
         self, beyond: tuple[float, float] = (0.0, 0.2), blend_labels: bool = False, p: float = 0.5, **options: Any
@@ -159,8 +153,6 @@ class RandomBlend(ShapeAugmentation):
     Raises:
         ValueError: ``concentration``, ``locality`` or ``members`` is out of range.
     """
-
-    shown = ("concentration", "locality", "members")
 
     def __init__(
         self,
@@ -219,7 +211,6 @@ class RandomRigidMotion(ShapeAugmentation):
     """
 
     uses_keyframes = False
-    shown = ("degrees", "axis", "translation")
 
     def __init__(
         self,

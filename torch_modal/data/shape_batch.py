@@ -17,8 +17,6 @@ class ShapeBatch(NamedTuple):
     """*Shape:* ``(B, V, 3)``."""
     nearest: Tensor | None = None
     """Index of the key-frame whose modes a shape uses; None: the nearest one. On the CPU. *Shape:* ``(B,)``."""
-    is_keyframe: Tensor | None = None
-    """True for shapes that equal that key-frame; None: none does. On the CPU. *Shape:* ``(B,)``, bool."""
     vertex_labels: Tensor | None = None
     """*Shape:* ``(B, V, ...)``."""
     shape_labels: Tensor | None = None
@@ -36,8 +34,7 @@ class ShapeBatch(NamedTuple):
 
         *Shape:* ``(K, V, ...), (K, ...)``.
         """
-        every = torch.arange(len(space))
-        return cls(space.keyframes(like), every, every >= 0, vertex_labels, shape_labels)
+        return cls(space.keyframes(like), torch.arange(len(space)), vertex_labels, shape_labels)
 
     def rows(self, index: Tensor) -> "ShapeBatch":
         """Select shapes by their indices."""
@@ -45,10 +42,8 @@ class ShapeBatch(NamedTuple):
 
     def locate(self, space: ShapeSpace, dtype: torch.dtype) -> "ShapeBatch":
         """Convert the batch to a dtype, and find the nearest key-frame of each shape."""
-        shapes, none = self.shapes.to(dtype), torch.zeros(len(self.shapes), dtype=torch.bool)
-        nearest = space.nearest(shapes) if self.nearest is None else self.nearest
-        is_keyframe = none if self.is_keyframe is None else self.is_keyframe
-        return self._replace(shapes=shapes, nearest=nearest, is_keyframe=is_keyframe)
+        shapes = self.shapes.to(dtype)
+        return self._replace(shapes=shapes, nearest=space.nearest(shapes) if self.nearest is None else self.nearest)
 
     def partners(
         self, chosen: Tensor, draw: Tensor, space: ShapeSpace, pool: "ShapeBatch | None"
@@ -72,17 +67,16 @@ class ShapeBatch(NamedTuple):
         others, indices = self, chosen
         if pool is not None:
             if not isinstance(pool, ShapeBatch) or len(pool.shapes) != len(space):
-                got = f"{len(pool.shapes)} shapes" if isinstance(pool, ShapeBatch) else f"a {type(pool).__name__}"
-                raise ValueError(
-                    f"a pool holds the {len(space)} key-frames of the space, ShapeBatch.of_keyframes(space); got {got}"
-                )
+                raise ValueError(f"a pool holds the {len(space)} key-frames: ShapeBatch.of_keyframes(space)")
             assert self.nearest is not None
             others, indices = pool.locate(space, self.shapes.dtype), self.nearest[chosen]
         size = len(others.shapes)
         if size < 2:
             return None
         if pool is not None and space.motion is not None:
-            return others.rows(space.motion.neighbours[indices, (draw >= 0.5).long()])
+            places = indices + torch.where(draw < 0.5, -1, 1)
+            last = size - 1  # the key-frames at both ends have one neighbour
+            return others.rows(places % size if space.cyclic else last - (last - places.abs()).abs())
         return others.rows((indices + (draw * (size - 1)).long().clamp(0, size - 2) + 1) % size)
 
 
@@ -90,8 +84,6 @@ def check_shapes(shapes: Any, space: ShapeSpace | None) -> None:
     """Raise a ValueError unless given shapes are a batch of shapes of a space, or one of them."""
     lead = () if isinstance(shapes, Tensor) and shapes.dim() == 2 else ("B",)
     check_tensor("shapes", shapes, *lead, "V" if space is None else space.n_vertices, 3)
-    if shapes.dtype not in (torch.float32, torch.float64):
-        raise ValueError(f"shapes must be float32 or float64; got {shapes.dtype}")
 
 
 def check_labels(shape: Sequence[int], labels: Mapping[str, Tensor | None]) -> None:

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from torch_modal.autograd import Recent, outside_inference_mode
-from torch_modal.data.in_betweens import PairTables, read_or_compute, versions
-from torch_modal.data.stored import KeyframeTimes, StoredSet
+from torch_modal.data.in_betweens import PairTables, read_or_compute
+from torch_modal.data.stored import StoredSet, motion_times
 from torch_modal.data.strain import mode_scales
 from torch_modal.geometry.canonical import size
 from torch_modal.geometry.crossings import require_contact
@@ -18,7 +18,6 @@ from torch_modal.geometry.poisson import Reconstruction
 from torch_modal.geometry.rigid import best_fit
 from torch_modal.geometry.vectors import norm, pick
 from torch_modal.inbetween.settings import Objective, Preset, Solver, settings
-from torch_modal.io.cache import content_digest
 from torch_modal.keyframes.check import check_keyframes
 from torch_modal.layers.blend import Blend
 from torch_modal.modes.basis import ModalBasis, check_bases
@@ -84,9 +83,10 @@ class ShapeSpace:
         if self.settings.objective.contact:
             require_contact()
         self.dtype = dtype
-        self.motion = KeyframeTimes.of(keyframe_times, len(self.bases), cyclic)
+        #: Times of the key-frames, if they are a motion; if cyclic, with the time when the first comes again.
+        self.motion, self.cyclic = motion_times(keyframe_times, len(self.bases), cyclic), cyclic
         self.in_betweens = PairTables(self.bases, self.faces, self.settings, self.motion, times, dtype, folder)
-        self._keyframes = torch.stack([basis.reference.double() for basis in self.bases])
+        self._keyframes = self.in_betweens.keyframes
         length = size(self._keyframes[0].numpy(), self.faces.numpy())
         #: The least precise dtype that can square areas of these shapes.
         self.least_dtype = torch.float32 if _FLOAT32_SIZES[0] <= length <= _FLOAT32_SIZES[1] else torch.float64
@@ -118,9 +118,8 @@ class ShapeSpace:
 
     def keyframes(self, like: Tensor | None = None) -> Tensor:
         """A copy of the key-frames, in the dtype and on the device of another tensor. *Shape:* ``(K, V, 3)``."""
-        if like is None:
-            return self._keyframes.to(self.dtype, copy=True)
-        return self._keyframes.to(like.device, like.dtype, copy=True)
+        device, dtype = ("cpu", self.dtype) if like is None else (like.device, like.dtype)
+        return self._keyframes.to(device, dtype, copy=True)
 
     def nearest(self, x: Tensor) -> Tensor:
         """Index of the closest key-frame, up to a rigid motion. *Shape:* ``(B, V, 3) -> (B,)``."""
@@ -236,11 +235,9 @@ class ShapeSpace:
             generator = torch.Generator().manual_seed(0)
             return self.sample(n, generator, concentration=concentration, locality=locality), True
 
-        def table() -> Tensor:
-            content = content_digest([*versions(), self._keyframes, self.faces, str(self.dtype), *settings])
-            return read_or_compute(self.in_betweens.folder, "between-all", {"content": content}, draw)
-
-        return self._made.get(settings, table)
+        content = [self._keyframes, self.faces, str(self.dtype), settings]
+        folder = self.in_betweens.folder
+        return self._made.get(settings, lambda: read_or_compute(folder, "between-all", content, draw))
 
     def fit(
         self,

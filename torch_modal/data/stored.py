@@ -11,7 +11,6 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from torch_modal.autograd import outside_inference_mode
@@ -26,56 +25,6 @@ LABELS_FILE = "labels.safetensors"
 #: Tables of in-betweens, which follow from a set and are removed when it is replaced.
 TABLE_FILES = "between-*.safetensors"
 _BASIS_FIELDS = tuple(field.name for field in fields(ModalBasis))
-
-
-class KeyframeTimes:
-    """Order and times of the key-frames of a motion.
-
-    Args:
-        times: Times of the key-frames, ascending; if cyclic, one more, when the first comes again. *Shape:* ``(K,)``,
-            or ``(K + 1,)`` if cyclic.
-        n_keyframes: Their number, K.
-        cyclic: Whether the last key-frame leads on to the first.
-
-    Attributes:
-        neighbours: The key-frames before and after each in time; twice the same at an end. *Shape:* ``(K, 2)``.
-
-    Raises:
-        ValueError: There is another number of times, or they do not ascend.
-    """
-
-    def __init__(self, times: Tensor | Sequence[float], n_keyframes: int, cyclic: bool = False) -> None:
-        self.times = check_times(times, n_keyframes, cyclic)
-        self.n_keyframes = n_keyframes
-        self.cyclic = cyclic
-        both, last = torch.arange(n_keyframes)[:, None] + torch.tensor([-1, 1]), n_keyframes - 1
-        self.neighbours = both % n_keyframes if cyclic else last - (last - both.abs()).abs()
-
-    @classmethod
-    def of(cls, times: Tensor | Sequence[float] | None, n_keyframes: int, cyclic: bool) -> "KeyframeTimes | None":
-        """The motion of key-frames; None without times.
-
-        Raises:
-            ValueError: As for the constructor, or cyclic key-frames without times.
-        """
-        if times is None and cyclic:
-            raise ValueError(f"cyclic key-frames are a motion and need their times: range({n_keyframes + 1}) if even")
-        return None if times is None else cls(times, n_keyframes, cyclic)
-
-    def span(self, i: int, j: int) -> tuple[float, float] | None:
-        """The times of two successive key-frames, in either direction.
-
-        Returns:
-            The times of ``i`` and of ``j``; in a cycle, times go on before the first and after the last. None if they
-            are not successive, or have no neighbours.
-        """
-        n, back = self.n_keyframes, -1 % self.n_keyframes if self.cyclic else -1
-        step = (j - i) % n if self.cyclic else j - i
-        if n < 3 or step not in (1, back):
-            return None
-        first = i if step == 1 else j
-        start, end = self.times[first : first + 2].tolist()
-        return (start, end) if step == 1 else (end, start)
 
 
 class StoredSet:
@@ -166,25 +115,20 @@ def write_set(
         OSError: The file cannot be written. Nothing is left behind.
         ValueError: Shapes of the arguments do not fit each other.
     """
-    shape = tuple(keyframes.shape)
-    if len(shape) != 3 or shape[2] != 3 or not shape[0]:
-        raise ValueError(f"keyframes have the shape {shape}; a set needs (K, V, 3)")
-    if faces.dim() != 2 or faces.shape[1] != 3:
-        raise ValueError(f"faces have the shape {tuple(faces.shape)}; a set needs (F, 3)")
-    sizes = [basis.n_vertices for basis in bases]
-    if sizes != [shape[1]] * shape[0] or len(names) != shape[0]:
+    sizes = [tuple(basis.reference.shape) for basis in bases]
+    if sizes != [tuple(x.shape) for x in keyframes] or len(names) != len(sizes) or faces.shape[1:] != (3,):
         raise ValueError(
-            f"{shape[0]} key-frames of {shape[1]} vertices need as many bases and names; got bases of {sizes} vertices "
-            f"and {len(names)} names"
+            f"a set needs keyframes (K, V, 3), faces (F, 3), and a basis and a name of each key-frame; got "
+            f"{tuple(keyframes.shape)}, {tuple(faces.shape)}, bases of {sizes} and {len(names)} names"
         )
-    motion = KeyframeTimes.of(times, len(keyframes), cyclic)
+    motion = motion_times(times, len(keyframes), cyclic)
     tensors = {"keyframes": keyframes.double(), "faces": faces.long()}
     for i, basis in enumerate(bases):
         tensors |= {f"{i}.{name}": getattr(basis, name) for name in _BASIS_FIELDS}
-    times = None if motion is None else motion.times.tolist()
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    metadata = {"names": [str(name) for name in names], "times": times, "note": note}
+    motion_seconds = None if motion is None else motion.tolist()
+    metadata = {"names": [str(name) for name in names], "times": motion_seconds, "note": note}
     write_tensors(folder / SET_FILE, FORMAT, VERSION, tensors, metadata)
     for table in folder.glob(TABLE_FILES):
         table.unlink(missing_ok=True)
@@ -207,14 +151,11 @@ def find_sets(root: str | os.PathLike[str]) -> list[Path]:
     return sorted(folders)
 
 
+def motion_times(times: Tensor | Sequence[float] | None, n_keyframes: int, cyclic: bool) -> Tensor | None:
+    """Times of key-frames, if they are a motion; of a cycle even ones by default. Raises as :func:`check_times`."""
+    return None if times is None and not cyclic else check_times(times, n_keyframes, cyclic)
+
+
 def _open_file(folder: Path) -> TensorFile:
     """Open the file of a set and check its header; raises as :class:`StoredSet`."""
-    file = TensorFile(folder / SET_FILE, FORMAT, VERSION, ("keyframes", "faces"))
-    keyframes, faces = file.shapes["keyframes"], file.shapes["faces"]
-    if len(keyframes) != 3 or keyframes[2] != 3 or len(faces) != 2 or faces[1] != 3:
-        raise ValueError(f"{file.path} needs keyframes (K, V, 3) and faces (F, 3); has {file.shapes}")
-    needed = [f"{i}.{name}" for i in range(keyframes[0]) for name in _BASIS_FIELDS]
-    missing = [name for name in needed if name not in file.shapes]
-    if missing:
-        raise ValueError(f"{file.path} lacks the tensors {', '.join(missing[:4])}; make the file again")
-    return file
+    return TensorFile(folder / SET_FILE, FORMAT, VERSION, ("keyframes", "faces"))

@@ -1,11 +1,10 @@
 """Local weights of a set's shapes, and the rigid motion, that bring them closest to a few observed points."""
 
 import math
-from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple
 
 import torch
+from scipy.optimize import least_squares
 from torch import Tensor
 
 from torch_modal.autograd import is_double_backward
@@ -18,15 +17,12 @@ from torch_modal.statistics.variation import Variation
 # from the points there are other minima, which a more certain prior does not have.
 NOISE, COARSE_NOISE = 0.01, (10.0, 3.0)
 
-# Gauss-Newton steps for the weights, with coarse noise or changing weights and at last, and the part of the cost that
-# ends them; rounds of weights of the observations; Newton steps that follow, and products in each.
+# Levenberg-Marquardt steps for the weights, with coarse noise or changing weights and at last, and the part of the
+# cost that ends them; rounds of weights of the observations; Newton steps that follow, and products in each.
 FEW_STEPS, MOST_STEPS, TOLERANCE, ROBUST_ROUNDS, LAST_STEPS, PRODUCTS = 5, 30, 1e-6, 8, 2, 20
 
 # Rows of the Jacobian that are computed together.
 CHUNK = 32
-
-# Larger dampings that are tried for one step.
-MOST_TRIALS = 8
 
 
 class Observations(NamedTuple):
@@ -88,8 +84,15 @@ class LocalWeights:
         to, factors = self.to, self.about.new_zeros(len(self.about) * len(self.variation.fields))
 
         def descend(noise: float, n_steps: int) -> Tensor:
-            cost, linearise = partial(self.cost, to=to, noise=noise), partial(self.linearise, to=to, noise=noise)
-            return levenberg_marquardt(factors, cost, linearise, n_steps, TOLERANCE)
+            solution = least_squares(
+                lambda z: self.residuals(torch.from_numpy(z), to, noise).numpy(),
+                factors.numpy(),
+                lambda z: self.slopes(torch.from_numpy(z), to, noise).numpy(),
+                method="lm",
+                ftol=TOLERANCE,
+                max_nfev=n_steps,
+            )
+            return torch.from_numpy(solution.x)
 
         for noise in COARSE_NOISE:
             factors = descend(noise * self.noise, FEW_STEPS)
@@ -108,18 +111,20 @@ class LocalWeights:
             factors = tried
         return factors, to.weights
 
-    def linearise(self, factors: Tensor, to: Observations, noise: float) -> tuple[Tensor, Tensor]:
-        """Gauss-Newton matrix without the rigid motion, and half the negative gradient. *Shape:* ``(K n,)``."""
+    def residuals(self, factors: Tensor, to: Observations, noise: float) -> Tensor:
+        """Numbers whose squares add up to the cost. *Shape:* ``(K n,) -> (3m + K n,)``."""
         seen = self.shape(factors)[to.vertices]
-        off = best_fit(seen, to.points, to.weights).inverse().apply(to.points) - seen
+        off = seen - best_fit(seen, to.points, to.weights).inverse().apply(to.points)
+        return torch.cat([((to.weights.sqrt() / noise)[:, None] * off).flatten(), factors])
+
+    def slopes(self, factors: Tensor, to: Observations, noise: float) -> Tensor:
+        """Their derivatives, without the rigid motion. *Shape:* ``(K n,) -> (3m + K n, K n)``."""
+        seen = self.shape(factors)[to.vertices]
         rigid = infinitesimal_motions(seen - centroid(seen, to.weights)).flatten(1).mT
         root = (to.weights.sqrt() / noise).repeat_interleave(3)[:, None]
         q = torch.linalg.qr(root * rigid)[0]
         rows = root * self.jacobian(factors)
-        rows = rows - q @ (q.mT @ rows)
-        matrix = rows.mT @ rows
-        matrix.diagonal().add_(1)
-        return matrix, rows.mT @ (root[:, 0] * off.flatten()) - factors
+        return torch.cat([rows - q @ (q.mT @ rows), torch.eye(len(factors)).to(rows)])
 
     def jacobian(self, factors: Tensor) -> Tensor:
         """Derivatives of the observed vertices, without loose pieces' rotations. *Shape:* ``(K n,) -> (3m, K n)``."""
@@ -144,7 +149,8 @@ class LocalWeights:
 
     def newton(self, factors: Tensor, to: Observations, right: Tensor) -> Tensor:
         """Inverse of half the Hessian, times a vector, by conjugate gradients. *Shape:* ``(K n,)``."""
-        matrix = self.linearise(factors, to, self.noise)[0]
+        slopes = self.slopes(factors, to, self.noise)
+        matrix = slopes.mT @ slopes
         matrix.diagonal().add_(len(matrix) * torch.finfo(matrix.dtype).eps * matrix.diagonal().max())  # its rounding
         factor = torch.linalg.cholesky_ex(matrix).L
         with torch.enable_grad():
@@ -198,42 +204,3 @@ class _FactorsOfPoints(torch.autograd.Function):
             cost = 0.5 * ctx.problem.cost(leaf, ctx.to._replace(points=to_points), ctx.problem.noise)
             slope = torch.autograd.grad(cost, leaf, create_graph=True)[0]
             return None, -torch.autograd.grad(slope, to_points, adjoint)[0], None, None
-
-
-def levenberg_marquardt(
-    x: Tensor,
-    cost: Callable[[Tensor], Tensor],
-    linearise: Callable[[Tensor], tuple[Tensor, Tensor]],
-    n_steps: int,
-    tolerance: float,
-) -> Tensor:
-    """Minimise a sum of squares by Gauss-Newton steps, damped where the cost does not fall.
-
-    Args:
-        x: Start. *Shape:* ``(n,)``.
-        cost: The sum of squares. *Shape:* ``(n,) -> ()``.
-        linearise: Gauss-Newton matrix and half the negative gradient. *Shape:* ``(n,) -> (n, n), (n,)``.
-        n_steps: Maximum number of steps.
-        tolerance: Relative decrease of the cost below which the iteration ends.
-
-    Returns:
-        *Shape:* ``(n,)``; its cost is at most the cost of the start.
-    """
-    value, damping = cost(x), 0.0
-    eye = torch.eye(len(x)).to(x)
-    for _ in range(n_steps):
-        matrix, downhill = linearise(x)
-        for _ in range(MOST_TRIALS):
-            tried = x + torch.linalg.solve_ex(matrix + damping * eye, downhill).result
-            lower = cost(tried)
-            if lower < value:
-                break
-            damping = max(10 * damping, 1.0)
-        else:
-            return x
-        damping = damping / 10 if damping > 1 else 0.0
-        has_converged = value - lower < tolerance * value
-        x, value = tried, lower
-        if has_converged:
-            return x
-    return x

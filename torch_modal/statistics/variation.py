@@ -127,24 +127,17 @@ class Variation:
         if n < 0:
             raise ValueError(f"n is 0 or more, got {n}")
         check_density(concentration, locality)
-        device = torch.device("cpu") if generator is None else generator.device
-        shape = torch.full((len(self),), concentration, dtype=torch.float64, device=device)
-        weights = torch.empty(n, len(self), dtype=torch.float64)
-        factors = torch.empty(n, len(self), len(self.fields) - 1, dtype=torch.float64)
-        for i in range(n):
-            # Logarithms of gamma variates: small concentrations underflow.
-            drawn = torch._standard_gamma(shape + 1, generator=generator).log()
-            drawn = drawn + torch.rand(len(self), dtype=torch.float64, generator=generator, device=device).log() / shape
-            weights[i] = torch.softmax(drawn, 0)
-            factors[i] = torch.randn(factors.shape[1:], dtype=torch.float64, generator=generator, device=device)
-        return weights, locality * factors
+        device = "cpu" if generator is None else generator.device
+        densities = torch.full((n, len(self)), concentration, dtype=torch.float64, device=device)
+        weights = torch._sample_dirichlet(densities, generator)
+        shape = n, len(self), len(self.fields) - 1
+        factors = torch.randn(shape, dtype=torch.float64, generator=generator, device=device)
+        return weights.cpu(), locality * factors.cpu()
 
     def members(self, weights: Tensor, factors: Tensor) -> Tensor:
         """Members of the set, in the pose of the mean. *Shape:* ``(n, K), (n, K, n_fields - 1) -> (n, V, 3)``."""
-        out = self.shapes.new_empty(len(weights), *self.shapes.shape[1:])
-        for i, drawn in enumerate(zip(weights, factors, strict=True)):
-            out[i] = self.member(*drawn)[0]
-        return out
+        shapes = [self.member(*each)[0] for each in zip(weights, factors, strict=True)]
+        return torch.stack(shapes) if shapes else self.shapes[:0]
 
     def member(self, weights: Tensor, factors: Tensor) -> tuple[Tensor, Tensor]:
         """A member of the set, in the pose of the mean, and its local weights; less local, if it would fold.
