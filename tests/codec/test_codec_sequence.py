@@ -195,11 +195,11 @@ def test_bad_input_is_refused(motion: Tensor, bars: Shapes) -> None:
         with pytest.raises(ValueError, match=match):
             tm.encode(**arguments, progress=False)
 
-    refused("first and the last", keyframes=[0, 4])
+    refused("with {0, 8}", keyframes=[0, 4])
     refused("ascending", keyframes=[0, 5, 5, 8])
     refused("ascending", keyframes=[0])
     refused("from 2 to the number of frames, 9", keyframes=10)
-    refused("n_modes must be .*got 0", n_modes=0)
+    refused("n_modes is 0", n_modes=0)
     refused("fraction of the diagonal", error=0.0)
     refused("ascend", times=[0.0] * 9)
     refused("NaN", frames=torch.full_like(motion, torch.nan))
@@ -245,8 +245,6 @@ def test_saved_and_loaded(encoded: tm.ModalSequence, tmp_path: Path) -> None:
     [
         ("amplitudes", torch.zeros(9, 11).double(), "12 modes needs the shapes"),
         ("times", torch.arange(9).flip(0).double(), "ascend"),
-        ("times", torch.arange(9).double() + 1, "within those of the key-frames, 0 to 8"),
-        ("motions", torch.full((9, 6), torch.nan).double(), "not finite"),
         ("keyframe_times", torch.zeros(3).double(), "ascend"),
     ],
 )

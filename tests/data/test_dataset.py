@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import torch
 from conftest import Shapes
-from safetensors.torch import save_file
+from safetensors.torch import load_file, save_file
 from torch.utils.data import DataLoader, default_collate
 
 import torch_modal as tm
@@ -186,23 +186,20 @@ def soft_poses(stored: tm.StoredSet) -> dict[str, torch.Tensor]:
     return {"shape_labels": label_poses(stored)["shape_labels"]}
 
 
-def test_labels_from_the_folder(bars: Shapes, tmp_path: Path) -> None:
+def test_labels_of_each_key_frame(bars: Shapes, tmp_path: Path) -> None:
+    """From a file in the folder of the set, which is the user's."""
     tm.write_set(tmp_path / "set", *bars, ["0", "1", "2"])
-    per_keyframe = torch.stack([torch.full((164,), k) for k in range(3)])
-    save_file(
-        {"vertex_labels": per_keyframe, "shape_labels": torch.tensor([4, 5, 6])},
-        tmp_path / "set" / "labels.safetensors",
+    per_keyframe = torch.arange(3)[:, None].repeat(1, 164)
+    save_file({"vertex_labels": per_keyframe, "shape_labels": torch.tensor([4, 5, 6])}, tmp_path / "set" / "labels")
+    transform = tm.RandomModalDeformation(p=1.0)
+    data = tm.ShapeDataset(
+        tmp_path, transform, samples_per_set=3, labels=lambda stored: load_file(stored.folder / "labels")
     )
-    data = tm.ShapeDataset(tmp_path, tm.RandomModalDeformation(p=1.0), samples_per_set=3)
     for k in range(3):
         assert data[k]["shape_labels"] == 4 + k
         assert data[k]["vertex_labels"].unique().tolist() == [k]
-    save_file({"vertex_labels": torch.zeros(163)}, tmp_path / "set" / "labels.safetensors")
     with pytest.raises(ValueError, match=r"set: vertex_labels begin with the shape \(3, 164\).*got \(163,\)"):
-        tm.ShapeDataset(tmp_path)[0]
-    (tmp_path / "set" / "labels.safetensors").write_bytes(b"no tensors")
-    with pytest.raises(ValueError, match=r"set/labels\.safetensors is no safetensors file, or a damaged one: "):
-        tm.ShapeDataset(tmp_path)[0]
+        tm.ShapeDataset(tmp_path, labels=lambda _: {"vertex_labels": torch.zeros(163)})[0]
 
 
 def test_tables_are_kept_in_the_folders(bars: Shapes, tmp_path: Path) -> None:

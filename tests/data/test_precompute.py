@@ -15,7 +15,7 @@ import torch_modal as tm
 from torch_modal.cli import main as cli
 from torch_modal.data import precompute
 from torch_modal.data.precompute import Options, Record, read_record
-from torch_modal.data.stored import LABELS_FILE, SET_FILE, StoredSet, find_sets, write_set
+from torch_modal.data.stored import SET_FILE, StoredSet, find_sets, write_set
 from torch_modal.io.write import save_frames
 
 # In place of the process that computes a set: the set's name says what becomes of it. The package itself starts it,
@@ -226,15 +226,15 @@ def test_stored_sets_of_others_are_replaced_only_if_asked(bench: Bench, bars: Sh
 def test_files_of_the_user_are_never_touched(bench: Bench) -> None:
     bench.add("a", "b", "a/inner")
     (bench.out / "a").mkdir(parents=True)
-    for file in (bench.out / "a" / LABELS_FILE, bench.out / "b"):
+    for file in (bench.out / "a" / "labels.safetensors", bench.out / "b"):
         file.write_text("mine")
     assert bench.run("--overwrite") == 3 and bench.computed() == ["a", "b", "inner"]
     assert "File exists" in bench.said[-1]
-    assert (bench.out / "b").read_text() == (bench.out / "a" / LABELS_FILE).read_text() == "mine"
+    assert (bench.out / "b").read_text() == (bench.out / "a" / "labels.safetensors").read_text() == "mine"
     (bench.out / "b").unlink()
     (bench.root / "a" / "1.obj").write_text("v 5 0 0")
     assert bench.run() == 0 and bench.computed() == ["a", "b"]
-    assert (bench.out / "a" / LABELS_FILE).read_text() == "mine"
+    assert (bench.out / "a" / "labels.safetensors").read_text() == "mine"
 
 
 def test_sets_within_sets_and_in_the_root(bench: Bench) -> None:

@@ -6,12 +6,10 @@ from pathlib import Path
 import pytest
 import torch
 from conftest import Shapes
-from safetensors.torch import load_file, save_file
 
 from torch_modal.data.space import ShapeSpace
 from torch_modal.data.stored import (
     FORMAT,
-    LABELS_FILE,
     SET_FILE,
     VERSION,
     StoredSet,
@@ -92,15 +90,13 @@ def test_pickle_carries_the_path_alone(folder: Path) -> None:
 
 
 def test_replaces_a_set_and_nothing_else(small_bars: Shapes, folder: Path) -> None:
-    save_file({"vertex_labels": torch.arange(30)}, folder / LABELS_FILE)
     (folder / "notes.txt").write_text("mine")
     (folder / "between-0-1.safetensors").write_bytes(b"")  # made from a set, and out of date with it
     write_set(folder, 2 * small_bars.keyframes, small_bars.faces, small_bars.bases, NAMES, note="new")
     assert torch.equal(StoredSet(folder).keyframes, 2 * small_bars.keyframes)
     assert StoredSet(folder).note == read_note(folder) == "new"
-    assert torch.equal(load_file(folder / LABELS_FILE)["vertex_labels"], torch.arange(30))
     assert (folder / "notes.txt").read_text() == "mine"
-    assert sorted(path.name for path in folder.iterdir()) == [LABELS_FILE, "notes.txt", SET_FILE]
+    assert sorted(path.name for path in folder.iterdir()) == ["notes.txt", SET_FILE]
     with pytest.raises(OSError, match=r"notes\.txt"):
         write_set(folder / "notes.txt", *small_bars, NAMES)
 

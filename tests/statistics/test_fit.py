@@ -197,10 +197,10 @@ def test_outliers_are_ignored_if_asked(creature: tuple[tm.ShapeSpace, Tensor]) -
     assert float(robust.trust[[3, 17]].max()) < 0.05 and float(robust.trust.median()) > 0.5
 
 
-def test_second_pieces_and_vertices_of_no_face_are_met(bars: Shapes) -> None:
+def test_second_pieces_are_met(bars: Shapes) -> None:
     shapes, faces = with_second_piece(bars.keyframes, bars.faces)
     variation, n = Variation(shapes, faces), bars.keyframes.shape[1]
-    picked = torch.cat([markers(bars.keyframes[0], 20), torch.arange(n, n + 6)])
+    picked = torch.cat([markers(bars.keyframes[0], 20), torch.arange(n, n + 4)])
     found = fit(variation, shapes[2, picked] - variation.origin, picked)
     off = (found.shape - shapes[2] + variation.origin).norm(dim=-1) / variation.size
     assert float(off.max()) < 0.01
@@ -219,8 +219,9 @@ def test_far_from_the_origin(bars: Shapes) -> None:
 def test_second_derivatives_are_refused(space: tm.ShapeSpace, bars: Shapes) -> None:
     picked = markers(bars.keyframes[1], 12)
     leaf = (0.5 * (bars.keyframes[1] + bars.keyframes[2])[picked]).requires_grad_()
-    with pytest.raises(RuntimeError, match="first derivatives only"):
-        torch.autograd.grad(space.fit(leaf, picked).shape.sum(), leaf, create_graph=True)
+    with pytest.raises(RuntimeError, match="once_differentiable"):
+        (slope,) = torch.autograd.grad(space.fit(leaf, picked).shape.square().sum(), leaf, create_graph=True)
+        slope.sum().backward()
 
 
 def test_a_keyframe_comes_back(space: tm.ShapeSpace, bars: Shapes) -> None:
@@ -273,8 +274,8 @@ def test_what_no_mixture_meets_falls_back_to_a_keyframe(
     [
         (torch.zeros(2, 3), torch.tensor([0, 1]), None, "three vertices or more"),
         (torch.full((3, 3), torch.nan), torch.tensor([0, 1, 2]), None, "a weight of zero"),
-        (torch.zeros(3, 3), torch.tensor([0, 1]), None, "one vertex index for each"),
-        (torch.zeros(3, 3), torch.tensor([0, 1, 10**6]), None, "lie in 0 to 163"),
+        (torch.zeros(3, 3), torch.tensor([0, 1]), None, "an index from 0 to 163 for each of 3 points"),
+        (torch.zeros(3, 3), torch.tensor([0, 1, 10**6]), None, "an index from 0 to 163"),
         (torch.zeros(3, 3), torch.tensor([0, 1, 1]), None, "three vertices"),
         (torch.zeros(3, 3), torch.tensor([0, 1, 2]), 3, "one of 3 key-frames"),
         (torch.zeros(3, 3), torch.tensor([0, 1, 2]), torch.tensor([0.5, 0.5, 0.5]), "add up to one"),
@@ -294,8 +295,8 @@ def test_arguments_that_do_not_fit(
         ({"weights": torch.ones(3, 5)}, r"do not broadcast: points \(2,\), weights \(3,\)"),
         ({"weights": torch.tensor([1.0, 1.0, 1.0, 1.0, -1.0])}, "none below zero; got -1.0 to 1.0"),
         ({"weights": torch.tensor([1.0, 1.0, 1.0, 1.0, torch.nan])}, "finite"),
-        ({"weights": [[1, 1, 1, 1, 1], [1, 1, 0, 0, 0]]}, "set 1 of the points, got 2"),
-        ({"weights": [0, 0, 0, 1, 0]}, "set 0 of the points, got 1"),
+        ({"weights": [[1, 1, 1, 1, 1], [1, 1, 0, 0, 0]]}, "a set has 2"),
+        ({"weights": [0, 0, 0, 1, 0]}, "a set has 1"),
         ({"noise": -1.0}, "noise is a standard deviation"),
         ({"noise": torch.nan}, "noise is a standard deviation"),
     ],

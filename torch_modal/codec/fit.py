@@ -12,7 +12,6 @@ from torch_modal.motion.decoder import ModalDecoder
 
 MAX_STEPS = 6
 MIN_GAIN = 0.01  # a frame has converged when a step lowers the squared residual by less than this fraction
-SHORT_STEP = 0.4  # fraction of a step that is tried where the whole step does not lower the residual
 AMPLITUDE_RIDGE = 1e-4
 """Times the mean diagonal of the normal equations: amplitudes that hardly move the vertices stay near zero."""
 AMPLITUDE_STEP = 1e-3  # difference of amplitudes, for the Jacobian
@@ -40,7 +39,7 @@ def fit(
     Each frame starts from the amplitudes of the frame before, if both are in the same interval of key-frames.
     """
     n, k = len(frames), decoder.n_modes
-    found = FittedFrames(torch.zeros(n, k).double(), torch.zeros(n, 6).double(), torch.zeros(n).double())
+    amplitudes, motions, errors = (torch.zeros(n, *size).double() for size in ((k,), (6,), ()))
     intervals = decoder.locate(times)[0]
     with torch.no_grad():
         for interval in intervals.unique():
@@ -49,13 +48,13 @@ def fit(
                 if linear is None or not linear.holds(decoder(a, times[f])):
                     linear = _Linearisation(decoder, a, times[f])
                 a = _fit_frame(decoder, frames[f], times[f], a, linear)
+                amplitudes[f] = a
                 x = decoder(a, times[f])
                 motion = best_fit(x, frames[f])
-                found.amplitudes[f] = a
-                found.motions[f] = torch.cat([log(motion.rotation), (motion.target - motion.source) / decoder.size])
-                found.errors[f] = (motion.apply(x) - frames[f]).norm(dim=-1).mean() / decoder.size
+                motions[f] = torch.cat([log(motion.rotation), (motion.target - motion.source) / decoder.size])
+                errors[f] = (motion.apply(x) - frames[f]).norm(dim=-1).mean() / decoder.size
                 on_frame()
-    return found
+    return FittedFrames(amplitudes, motions, errors)
 
 
 class _Linearisation:
@@ -103,13 +102,10 @@ def _fit_frame(decoder: ModalDecoder, frame: Tensor, t: Tensor, start: Tensor, l
     best = min((evaluate(a) for a in (start, torch.zeros_like(start))), key=lambda one: float(one[2]))
     for _ in range(MAX_STEPS):
         a, residual, squared = best
-        step = linear.step(residual, a)
-        new = evaluate(a + step)
-        if new[2] > squared:
-            new = evaluate(a + SHORT_STEP * step)
+        new = evaluate(a + linear.step(residual, a))
         if new[2] > squared:
             break
         best = new
-        if 1 - float(new[2] / squared.clamp_min(torch.finfo(torch.float64).tiny)) < MIN_GAIN:
+        if new[2] > (1 - MIN_GAIN) * squared:
             break
     return best[0]

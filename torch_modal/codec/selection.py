@@ -76,7 +76,7 @@ class Selection:
     def __init__(self, frames: Tensor, faces: Tensor, times: Tensor, cyclic: bool, modes: Tensor) -> None:
         self.frames, self.times, self.cyclic = frames, times, cyclic
         self._decoder = ModalDecoder(frames[:2], faces, torch.arange(2).double(), frames[0], modes)
-        self._known: dict[tuple[int, ...], dict[int, float]] = {}
+        self._known: dict[tuple[int, ...], dict[int, float]] = {}  # errors of the intervals that were fitted
 
     def run(self, n_keyframes: int | None, error: float, progress: Progress = None) -> list[int]:
         """The key-frames; see :func:`select_keyframes`.
@@ -117,10 +117,14 @@ class Selection:
             else:
                 around = list(keys[max(i - 1, 0) : i + 3])
             name = (*around, a)
-            if name not in self._known:
+            if name not in self._known and b - a > 1:
                 samples = torch.linspace(a + 1, b - 1, min(N_SAMPLES, b - a - 1)).round().long()
-                self._known[name] = self._fit_samples(around, samples)
-            result.append((self._known[name], a, b))
+                cycles, frames = (torch.tensor(around) // period, torch.tensor(around) % period)
+                times = self.times[frames] + (self.times[-1] - self.times[0]) * cycles
+                decoder = self._decoder.with_keyframes(self.frames[frames], times)
+                errors = fit(decoder, self.frames[samples], self.times[samples]).errors
+                self._known[name] = dict(zip(samples.tolist(), errors.tolist(), strict=True))
+            result.append((self._known.get(name, {}), a, b))
         return result
 
     def mean(self, keys: Sequence[int]) -> float:
@@ -128,30 +132,19 @@ class Selection:
         each = [sum(e.values()) / max(len(e), 1) * (b - a - 1) for e, a, b in self.intervals(keys)]
         return sum(each) / len(self.frames)
 
-    def _fit_samples(self, around: list[int], samples: Tensor) -> dict[int, float]:
-        if not len(samples):
-            return {}
-        period = len(self.frames)
-        duration = self.times[-1] - self.times[0]
-        key_times = torch.stack([self.times[key % period] + duration * (key // period) for key in around])
-        decoder = self._decoder.with_keyframes(self.frames[[key % period for key in around]], key_times)
-        fitted = fit(decoder, self.frames[samples], self.times[samples])
-        return dict(zip(samples.tolist(), fitted.errors.tolist(), strict=True))
-
     def _move_keyframes(self, keys: list[int]) -> list[int]:
         """Move key-frames one at a time, by steps that halve, as long as the mean error falls."""
         n = len(self.frames)
         step = max(1, n // (4 * len(keys)))
         best = self.mean(keys)
         while step:
-            improved = False
+            before = best
             for j in range(1, len(keys) if self.cyclic else len(keys) - 1):
                 low, high = keys[j - 1] + 1, (keys[j + 1] if j + 1 < len(keys) else n) - 1
                 for place in {min(max(keys[j] + side * step, low), high) for side in (-1, 1)} - {keys[j]}:
-                    tried = [*keys[:j], place, *keys[j + 1 :]]
-                    mean = self.mean(tried)
-                    if mean < best * (1 - 1e-3):
-                        best, keys, improved = mean, tried, True
-            if not improved:
+                    moved = [*keys[:j], place, *keys[j + 1 :]]
+                    if (mean := self.mean(moved)) < best * (1 - 1e-3):
+                        best, keys = mean, moved
+            if best == before:
                 step //= 2
         return keys

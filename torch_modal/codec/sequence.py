@@ -67,12 +67,7 @@ class ModalSequence:
         wanted = {"times": (t,), "amplitudes": (t, k), "motions": (t, 6), "errors": (t,)}
         if not t or shapes != wanted:
             raise ValueError(f"a motion of {t} frames and {k} modes needs the shapes {wanted}; got {shapes}")
-        if not all(bool(part.isfinite().all()) for part in (self.times, self.amplitudes, self.motions)):
-            raise ValueError("times, amplitudes or motions are not finite")
         check_times(self.times, t, of="frame")
-        start, *_, end = self.keyframe_times
-        if self.times[0] < start or self.times[-1] > end:
-            raise ValueError(f"times lie within those of the key-frames, {float(start):g} to {float(end):g}")
         object.__setattr__(self, "decoder", decoder)
 
     @property
@@ -217,19 +212,19 @@ def encode(
         ValueError: Key-frames, times or numbers that cannot be used.
     """
     x, triangles, when = check_motion(frames, faces, times, cyclic)
-    if isinstance(n_modes, bool) or not isinstance(n_modes, int) or n_modes < 1:
-        raise ValueError(f"n_modes must be a whole number of at least 1; got {n_modes!r}")
     if not 0 < error < 1:
         raise ValueError(f"error must be a positive fraction of the diagonal, such as 0.002; got {error!r}")
-    listed = not isinstance(keyframes, (int, type(None)))
-    keys = _check_keys(keyframes, len(x), cyclic) if listed else []
+    n = len(x)
     modes = extract_modes(x[0], triangles, n_modes, cache_dir=cache_dir, cache=cache).modes
-    if not listed:
-        keys = Selection(x, triangles, when, cyclic, modes).run(keyframes, error, progress)  # type: ignore[arg-type]
-    n, k = len(x), len(modes)
+    if keyframes is None or isinstance(keyframes, int):
+        keys = Selection(x, triangles, when, cyclic, modes).run(keyframes, error, progress)
+    else:
+        keys, required = [int(i) for i in keyframes], {0} if cyclic else {0, n - 1}
+        if len(keys) < 2 or keys != sorted({*keys}) or not required <= {*keys} <= {*range(n)}:
+            raise ValueError(f"keyframes must be two or more ascending frame numbers, with {required}; got {keys}")
     while True:
         key_times = when[[*keys, n]] if cyclic else when[keys]
-        amplitudes, motions, errors = (torch.zeros(n, *size, dtype=torch.float64) for size in ((k,), (6,), ()))
+        amplitudes, motions, errors = (torch.zeros(n, *size).double() for size in ((len(modes),), (6,), ()))
         sequence = ModalSequence(x[keys], triangles, key_times, when[:n], amplitudes, motions, modes, errors)
         others = torch.nonzero(~sequence.is_keyframe)[:, 0]
         with ProgressReport(len(others), "encoded frames", progress) as bar:
@@ -240,16 +235,3 @@ def encode(
         # Errors were estimated from samples: add the worst frame of each interval that has one above the error.
         worst = [a + int(errors[a:b].argmax()) for a, b in pairwise([*keys, n])]
         keys = sorted({*keys, *(f for f in worst if float(errors[f]) > error)})
-
-
-def _check_keys(keyframes: Any, n_frames: int, cyclic: bool) -> list[int]:
-    keys, last = [int(i) for i in keyframes], n_frames - 1
-    required = "the first frame" if cyclic else "the first and the last frame"
-    ends = {0} if cyclic else {0, last}
-    ascending = all(a < b for a, b in pairwise(keys))
-    if len(keys) < 2 or not ascending or not ends <= set(keys) or keys[-1] > last or keys[0] < 0:
-        raise ValueError(
-            f"keyframes must be two or more ascending frame numbers from 0 to {last}, with {required} among them; "
-            f"got {keys}"
-        )
-    return keys

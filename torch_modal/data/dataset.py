@@ -6,8 +6,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load_file
 from torch import Tensor
 from torch.utils.data import BatchSampler, Dataset, Sampler
 
@@ -16,7 +14,7 @@ from torch_modal.data.augmentation import AugmentationSequential, ShapeAugmentat
 from torch_modal.data.random_transforms import RandomInBetween
 from torch_modal.data.shape_batch import ShapeBatch, check_labels
 from torch_modal.data.space import ShapeSpace
-from torch_modal.data.stored import LABELS_FILE, StoredSet, find_sets
+from torch_modal.data.stored import StoredSet, find_sets
 from torch_modal.geometry.vectors import vertex_normals
 
 Labels = Mapping[str, Tensor]
@@ -35,15 +33,14 @@ class ShapeDataset(Dataset[Sample]):
     the most recent open, so that memory does not grow with their number.
 
     A sample is a dict: ``vertices`` (V, 3); ``set``, the index of its set in :attr:`sets`; ``keyframe``, its
-    key-frame; and if requested or stored, ``faces`` (F, 3), ``normals`` (V, 3), ``vertex_labels`` and ``shape_labels``.
+    key-frame; and if requested, ``faces`` (F, 3), ``normals`` (V, 3), ``vertex_labels`` and ``shape_labels``.
 
     Args:
         root: Folder of stored sets, at any depth.
         transform: Transforms the key-frames; in-betweens by default. Its ``same_on_batch`` has no effect here.
         samples_per_set: Samples of each set in an epoch.
         labels: Returns the labels of a set: ``vertex_labels`` (V, ...) or (K, V, ...), and ``shape_labels`` (K, ...),
-            each if there are any. A function of a module, if workers are spawned. By default the tensors in the file
-            ``labels.safetensors`` of the set's folder.
+            each if there are any. A function of a module, if workers are spawned.
         seed: Seed of all random numbers.
         dtype: Dtype of the vertices.
         faces: Whether samples have their faces. A loader stacks them for each sample; a :meth:`space` has them once.
@@ -150,14 +147,7 @@ class ShapeDataset(Dataset[Sample]):
         """The space of a set, and its key-frames with their labels."""
         stored = StoredSet(self.sets[number])
         space = ShapeSpace.open(stored, dtype=self.dtype, **self.options)
-        path = stored.folder / LABELS_FILE
-        if self.labels is not None:
-            labels = dict(self.labels(stored))
-        else:
-            try:
-                labels = load_file(path) if path.is_file() else {}
-            except SafetensorError as error:
-                raise ValueError(f"{path} is no safetensors file, or a damaged one: {error}") from error
+        labels = {} if self.labels is None else dict(self.labels(stored))
         k, v = len(space), space.n_vertices
         of_vertices = labels.get("vertex_labels")
         if of_vertices is not None and of_vertices.shape[:2] != (k, v) and of_vertices.shape[:1] == (v,):

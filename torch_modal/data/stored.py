@@ -2,7 +2,7 @@
 
 ``set.safetensors`` holds ``keyframes``, ``faces`` and the tensors of each :class:`~torch_modal.ModalBasis`, with the
 number of the key-frame and a dot before their names. Its metadata has the names of the source files, and the times if
-the key-frames are a motion. Other files in the folder, ``labels.safetensors`` for example, are the user's.
+the key-frames are a motion. Other files in the folder are the user's.
 """
 
 import os
@@ -21,7 +21,6 @@ from torch_modal.times import check_times
 FORMAT = "torch_modal.set"
 VERSION = "2"
 SET_FILE = "set.safetensors"
-LABELS_FILE = "labels.safetensors"
 #: Tables of in-betweens, which follow from a set and are removed when it is replaced.
 TABLE_FILES = "between-*.safetensors"
 _BASIS_FIELDS = tuple(field.name for field in fields(ModalBasis))

@@ -1,7 +1,7 @@
 """Elastic energy of small steps in the latent space of a decoder."""
 
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -23,12 +23,10 @@ class LatentElasticity(nn.Module):
     With the Jacobian ``J`` of the decoder and the Hessian ``H`` of :class:`ShellLoss` about the decoded shape, a step
     ``u`` costs :math:`u^T G u` with :math:`G = \tfrac12 J^T H J`. Its eigenvalues are zero where the latent only turns
     or shifts the shape. The loss is the mean of their square roots, as in ARAPReg (Huang et al. 2021), which takes
-    the Hessian of an as-rigid-as-possible energy, or of the eigenvalues themselves. ``H`` is the Gauss-Newton Hessian,
-    and is never summand.
+    the Hessian of an as-rigid-as-possible energy. ``H`` is the Gauss-Newton Hessian, and is never assembled.
 
     Args:
         faces: Vertex indices. *Shape:* ``(F, 3)``.
-        spectrum: ``"roots"``, or ``"mean"``, which one random direction estimates without bias.
         directions: Number of random orthonormal directions of the latent at each call; all by default. Each costs about
             two passes of the decoder.
         step: Size of the steps in the latent by which the Jacobian is taken in central differences. None: by forward
@@ -42,21 +40,18 @@ class LatentElasticity(nn.Module):
     def __init__(
         self,
         faces: Tensor,
-        spectrum: Literal["roots", "mean"] = "roots",
         directions: int | None = None,
         *,
         step: float | None = None,
         **stiffness: float | Tensor,
     ) -> None:
         super().__init__()
-        if spectrum not in ("roots", "mean"):
-            raise ValueError(f"spectrum is 'roots' or 'mean'; got {spectrum!r}")
         if directions is not None and directions < 1:
             raise ValueError(f"directions is 1 or more, or None for all; got {directions}")
         if step is not None and not 0 < step < torch.inf:
             raise ValueError(f"step is above 0, or None for forward mode; got {step}")
         self.shell = ShellLoss(faces, **stiffness)
-        self.spectrum, self.directions, self.step = spectrum, directions, step
+        self.directions, self.step = directions, step
 
     def forward(self, decoder: Decoder, z: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """The loss at each latent; gradients reach the latents and the parameters of the decoder, through ``J``.
@@ -79,8 +74,6 @@ class LatentElasticity(nn.Module):
         flat = z.reshape(-1, z.shape[-1])
         x, along = self._tangents(decoder, flat, generator)
         gram = self._gram(x.detach(), along)
-        if self.spectrum == "mean":
-            return gram.diagonal(dim1=-2, dim2=-1).mean(-1).reshape(z.shape[:-1])
         values = torch.linalg.eigvalsh(gram).clamp_min(0)
         floor = FLOOR * values.mean(-1, keepdim=True) + torch.finfo(values.dtype).tiny
         return (values + floor).sqrt().mean(-1).reshape(z.shape[:-1])

@@ -25,8 +25,8 @@ class BendingCoordinates:
     rotation-strain coordinates of Huang et al. 2011 with finite instead of infinitesimal rotations.
 
     After the columns of the triangles there is one for each piece but the largest, the offset of its centre from the
-    motion of the vertices that it follows, and one for each vertex of no face, its displacement; in sizes of the mean.
-    E is the number of all columns. The mean is float64 on the CPU. *Shape:* ``(V, 3), (F, 3)``.
+    motion of the vertices that it follows, in sizes of the mean. E is the number of all columns. Vertices of no face
+    stay where the mean has them. The mean is float64 on the CPU. *Shape:* ``(V, 3), (F, 3)``.
     """
 
     def __init__(self, mean: Tensor, faces: Tensor) -> None:
@@ -38,17 +38,14 @@ class BendingCoordinates:
         self._has_area = areas > SMALLEST_AREA * areas.mean()
         self.size = size(mean.numpy(), faces.numpy())
         loose = self.reconstruction.loose
-        used = torch.zeros(len(mean), dtype=torch.bool).index_fill(0, faces.flatten(), True)
-        self._unused = torch.nonzero(~used).flatten()
         #: Weights of the vertices in the centre of each piece but the largest. *Shape:* ``(L, V)``.
         self.centres = mean.new_zeros(len(loose), len(mean))
         for row, (piece, _) in zip(self.centres, loose, strict=True):
             row[piece] = self.reconstruction.poisson.shares[piece]
         total = self.reconstruction.areas.sum()
         pieces = mean.new_tensor([float(self.reconstruction.areas[piece].sum() / total) for piece, _ in loose])
-        parts = torch.cat([areas / areas.sum(), pieces, mean.new_zeros(len(self._unused))])
         #: Weights of squared coordinates: parts of the area, twice off the diagonal of strains. *Shape:* ``(6, E)``.
-        self.shares = parts * areas.new_tensor([1, 1, 1, 1, 2, 1])[:, None]
+        self.shares = torch.cat([areas / areas.sum(), pieces]) * areas.new_tensor([1, 1, 1, 1, 2, 1])[:, None]
 
     def of(self, shapes: Tensor) -> Tensor:
         """Coordinates of shapes, in the pose in which they fit the mean best. *Shape:* ``(B, V, 3) -> (B, 6, E)``.
@@ -69,13 +66,11 @@ class BendingCoordinates:
                 turn, flat = torch.where(flat, turn[:, above], turn), flat & flat[above]
             columns.append(torch.cat([torch.where(flat, 0, turn), strain]))
         on_faces = torch.stack(columns) if columns else placed.new_zeros(0, 6, len(self.faces))
-        beyond = [
-            (torch.einsum("v,bvi->bi", row, placed)[:, None] - centre) @ motion.rotation
-            for row, (centre, motion) in zip(self.centres, self._follow_anchors(placed), strict=True)
-        ]
-        beyond.append(placed[:, self._unused] - self.mean[self._unused])
-        offsets = (torch.cat(beyond, 1) / self.size).mT
-        return torch.cat([on_faces, torch.cat([offsets, torch.zeros_like(offsets)], 1)], 2)
+        offsets = placed.new_zeros(len(placed), 6, len(self.centres))
+        for i, (row, (centre, motion)) in enumerate(zip(self.centres, self._follow_anchors(placed), strict=True)):
+            offset = (torch.einsum("v,bvi->bi", row, placed)[:, None] - centre) @ motion.rotation
+            offsets[:, :3, i] = offset[:, 0] / self.size
+        return torch.cat([on_faces, offsets], 2)
 
     def _follow_anchors(self, shapes: Tensor) -> list[tuple[Tensor, RigidMotion]]:
         """Centre and motion of each loose piece, by the vertices that it follows. *Shape:* ``(B, V, 3)``."""
@@ -88,11 +83,7 @@ class BendingCoordinates:
 
     def spread(self, fields: Tensor) -> Tensor:
         """Means of fields on the vertices, for each column. *Shape:* ``(..., V) -> (..., E)``."""
-        return torch.cat([fields[..., self.faces].mean(-1), fields @ self.centres.mT, fields[..., self._unused]], -1)
-
-    def carries(self, vertices: Tensor) -> Tensor:
-        """Mask of the columns after the triangles' that move each vertex. *Shape:* ``(n,) -> (n, E - F)``."""
-        return torch.cat([self.centres[:, vertices].mT > 0, vertices[:, None] == self._unused], 1)
+        return torch.cat([fields[..., self.faces].mean(-1), fields @ self.centres.mT], -1)
 
     def align(self, shapes: Tensor) -> Tensor:
         """The shapes in the pose in which they fit the mean best. *Shape:* ``(B, V, 3)``."""
@@ -107,11 +98,9 @@ class BendingCoordinates:
         """The shapes of coordinates, in the pose of the mean. *Shape:* ``(B, 6, E) -> (B, V, 3)``."""
         rest = self.mean.mT[:, None].expand(-1, len(coordinates), -1).contiguous()
         shapes = self.reconstruction(self.sides(coordinates), rest).movedim(0, -1)
-        offsets = self.size * coordinates[:, :3, len(self.faces) :].mT
-        moves = offsets[:, : len(self.centres)].unbind(1)
+        moves = (self.size * coordinates[:, :3, len(self.faces) :]).unbind(2)
         for (piece, _), (_, motion), move in zip(
             self.reconstruction.loose, self._follow_anchors(shapes), moves, strict=True
         ):
             shapes = shapes.index_add(1, piece, (motion.rotation @ move[..., None]).mT.expand(-1, len(piece), -1))
-        unused = self.mean[self._unused] + offsets[:, len(moves) :]
-        return self.align(shapes).index_copy(1, self._unused, unused)
+        return self.align(shapes)

@@ -2,9 +2,9 @@
 
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import one_hot
 
 from torch_modal.autograd import is_transformed
 from torch_modal.contact.active import Pull
@@ -106,12 +106,11 @@ def _fit_one(variation: Variation, every: Observations, about: Tensor, robust: b
             x = variation.relax(x, mixed, *NEXT_ROUND, springs)
         step = x - assembled
         missed = [to.distances_after_fit(shape) for shape in variation.shapes]
-        *errors, error = [float((to.weights * each.square()).sum()) for each in (*missed, to.distances(pose.apply(x)))]
-        k = min(range(len(errors)), key=lambda k: errors[k])
-        is_given = error > errors[k] + float(to.weights.sum()) * (SLACK * variation.size) ** 2
-    if is_given:
+        *errors, error = ((to.weights * each.square()).sum() for each in (*missed, to.distances(pose.apply(x))))
+        least, k = torch.stack(errors).min(0)
+    if error > least + to.weights.sum() * (SLACK * variation.size) ** 2:
         shape = to.pose(variation.shapes[k]).apply(variation.shapes[k])
-        mixed = torch.eye(len(errors)).to(x)[k, :, None].expand_as(mixed)
+        mixed = one_hot(k, len(errors)).to(x)[:, None].expand_as(mixed)
     else:
         shape = pose.apply(assembled + step)
     misses, trust = every.distances(shape).detach(), torch.zeros_like(every.weights)
@@ -123,26 +122,22 @@ def _check_points(points: Tensor, vertices: Tensor, weights: Tensor | None, n_ve
     """All sets, with vertices and weights on the CPU, *shape* ``(..., n)``; raises for what does not fit."""
     check_tensor("points", points, "...", "n", 3)
     numbers = torch.as_tensor(vertices).cpu()
-    if numbers.shape != points.shape[-2:-1] or numbers.is_floating_point() or numbers.dtype == torch.bool:
-        raise ValueError(
-            f"vertices hold one vertex index for each of {points.shape[-2]} points; got {tuple(numbers.shape)} of "
-            f"{numbers.dtype}"
-        )
-    if not bool(((numbers >= 0) & (numbers < n_vertices)).all()):
-        raise ValueError(f"vertices lie in 0 to {n_vertices - 1}; got {int(numbers.min())} to {int(numbers.max())}")
-    trust = torch.as_tensor(torch.ones(len(numbers)) if weights is None else weights).detach().cpu().double()
-    check_tensor("weights", trust, "...", len(numbers))
-    lead = (*broadcast_leading(points=points.shape[:-2], weights=trust.shape[:-1]), len(numbers))
+    n = points.shape[-2]
+    fits = numbers.shape == (n,) and numbers.dtype in (torch.int32, torch.int64)
+    if not fits or not bool(((numbers >= 0) & (numbers < n_vertices)).all()):
+        raise ValueError(f"vertices hold an index from 0 to {n_vertices - 1} for each of {n} points; got {numbers}")
+    trust = torch.as_tensor(torch.ones(n) if weights is None else weights).detach().cpu().double()
+    check_tensor("weights", trust, "...", n)
+    lead = (*broadcast_leading(points=points.shape[:-2], weights=trust.shape[:-1]), n)
     if not bool(((trust >= 0) & trust.isfinite()).all()):
         raise ValueError(f"weights are finite and none below zero; got {float(trust.min())} to {float(trust.max())}")
     every = Observations(points.expand(*lead, 3), numbers.long(), trust.expand(lead).clone())
     seen = every.weights > 0
     if not bool(every.points.detach()[seen.to(points.device)].isfinite().all()):
         raise ValueError("points hold numbers that are not finite; give those that were not observed a weight of zero")
-    for index in np.ndindex(lead[:-1]):
-        if (n := len(numbers[seen[index]].unique())) < 3:
-            whose = f"in set {', '.join(map(str, index))} of the points, " if index else ""
-            raise ValueError(f"a pose follows from three vertices or more with weights above zero; {whose}got {n}")
+    fewest = min((len(numbers[row].unique()) for row in seen.view(-1, n)), default=3)
+    if fewest < 3:
+        raise ValueError(f"a pose follows from three vertices or more with weights above zero; a set has {fewest}")
     return every
 
 
@@ -150,11 +145,9 @@ def _check_near(near: int | Tensor | None, n: int) -> Tensor:
     """Weights of n shapes; raises unless they add up to one. *Shape:* ``(n,)``, float64."""
     if near is None:
         return torch.full((n,), 1 / n, dtype=torch.float64)
-    if isinstance(near, int):
-        if not -n <= near < n:
-            raise ValueError(f"near is one of {n} key-frames; got {near}")
+    if isinstance(near, int) and -n <= near < n:
         return torch.eye(n, dtype=torch.float64)[near]
     weights = torch.as_tensor(near).detach().to("cpu", torch.float64)
     if weights.shape != (n,) or not bool(((weights >= 0).all()) & ((weights.sum() - 1).abs() < 1e-5)):
-        raise ValueError(f"near holds {n} weights, none below zero, that add up to one; got {near}")
+        raise ValueError(f"near is one of {n} key-frames, or {n} weights that add up to one; got {near}")
     return weights

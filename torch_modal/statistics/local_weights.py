@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 import torch
 from scipy.optimize import least_squares
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
-from torch_modal.autograd import is_double_backward
 from torch_modal.elastic.steps import conjugate_gradients
 from torch_modal.geometry.rigid import RigidMotion, best_fit, centroid, infinitesimal_motions
 from torch_modal.statistics.variation import Variation
@@ -138,7 +138,7 @@ class LocalWeights:
         one, other = slopes[..., : len(variation.faces)].split(3)  # (3, 6, F) each
         fields = variation.coordinates.spread(variation.fields)
         moves = variation.coordinates.size * torch.eye(3, 6).to(bending)[..., None]
-        carries = variation.coordinates.carries(self.to.vertices).to(bending)
+        carries = (variation.coordinates.centres[:, self.to.vertices].mT > 0).to(bending)
         rows = []
         for first, second, carried in zip(*(column.split(CHUNK) for column in (*self.influence, carries)), strict=True):
             at_faces = first[:, None, None] * one + second[:, None, None] * other
@@ -191,12 +191,8 @@ class _FactorsOfPoints(torch.autograd.Function):
         return factors.clone()
 
     @staticmethod
+    @once_differentiable  # second derivatives lack the elastic steps, which are constants of the graph
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        if is_double_backward(grad):
-            raise RuntimeError(
-                "fits have first derivatives only: second ones would lack the elastic steps, which are constants of "
-                "the graph; take the gradient without create_graph"
-            )
         factors, points = ctx.saved_tensors
         adjoint = ctx.problem.newton(factors, ctx.to, grad)
         with torch.enable_grad():

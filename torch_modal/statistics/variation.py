@@ -1,7 +1,5 @@
 """Variation of a set of shapes, with weights of its own for each part of the surface."""
 
-from functools import cached_property
-
 import numpy as np
 import torch
 from scipy import sparse
@@ -85,6 +83,8 @@ class Variation:
         #: Measures of the given shapes, at a size of 100.
         energy = self.fine.energy
         self.rest = energy.rest(energy.extend((self.scale * self.shapes).movedim(-1, 0).contiguous()))
+        #: Most folds of a given shape.
+        self.most_folds = max(self.folds(x) for x in self.shapes)
         #: Stiffnesses of the three terms of Eq. 5. *Shape of each:* ``(1, 1)``.
         self.stiffness = [mean.new_full((1, 1), value) for value in (ALPHA, BETA, GAMMA if closed else 0.0)]
 
@@ -151,15 +151,10 @@ class Variation:
             locality = 0 if i == ROUNDS else SMOOTHER**i
             local = torch.softmax(logarithms + locality * factors @ self.fields[1:], 0)
             x = self.relax(self.assemble(local), local, STEPS, PRODUCTS)
-            if self.folds(x) <= self._most_folds:
+            if self.folds(x) <= self.most_folds:
                 return x, local
         first = int(weights.argmax())
         return self.shapes[first].clone(), one_hot(weights.argmax(), len(self)).to(local)[:, None].expand_as(local)
-
-    @cached_property
-    def _most_folds(self) -> int:
-        """Most folds of a given shape."""
-        return max(self.folds(x) for x in self.shapes)
 
     def folds(self, x: Tensor) -> int:
         """Number of pairs of neighbouring triangles that lie on each other. *Shape:* ``(V, 3)``."""
@@ -243,13 +238,9 @@ def bound_weights(weights: Tensor) -> Tensor:
 
 def _graph(mean: Tensor, reconstruction: Reconstruction) -> sparse.csr_matrix:
     """Lengths of edges, and of gaps between loose pieces and the largest."""
-    first, second = reconstruction.edges.unbind(1)
-    parts: list[tuple[Tensor, Tensor, Tensor]] = [(first, second, (mean[first] - mean[second]).norm(dim=-1))]
-    for piece, anchors in reconstruction.loose:
-        gaps = torch.cdist(mean[piece], mean[anchors])
-        i, j = divmod(int(gaps.argmin()), len(anchors))
-        parts.append((piece[i : i + 1], anchors[j : j + 1], gaps[i, j : j + 1]))
-    starts, ends, lengths = (torch.cat(column).numpy() for column in zip(*parts, strict=True))
+    gaps = [torch.stack([piece[0], anchors[0]]) for piece, anchors in reconstruction.loose]
+    starts, ends = torch.cat([reconstruction.edges, *(gap[None] for gap in gaps)]).T
+    lengths = (mean[starts] - mean[ends]).norm(dim=-1).numpy()
     # Zeros would be no edges.
     lengths = np.maximum(lengths, 1e-9 * lengths.mean())
     upper = sparse.coo_matrix((lengths, (starts, ends)), shape=(len(mean), len(mean)))
