@@ -164,7 +164,7 @@ def label_poses(stored: tm.StoredSet) -> dict[str, torch.Tensor]:
 
 def test_labels_from_a_function(root: Path) -> None:
     transform = tm.RandomInBetween(p=1.0, blend_labels=True)
-    with pytest.raises(ValueError, match="vertex_labels must be floating-point"):
+    with pytest.raises(ValueError, match="blended labels must be floating-point"):
         tm.ShapeDataset(root, transform, labels=label_poses)[0]
     hard = tm.ShapeDataset(root, tm.RandomInBetween(p=1.0), labels=label_poses, samples_per_set=PER_SET)
     for sample in hard.__getitems__(list(range(len(hard)))):
