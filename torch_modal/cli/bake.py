@@ -63,5 +63,4 @@ def run(args: argparse.Namespace) -> None:
     tm.save_animation(frames, faces, args.out, fps, bones=skin, asset=asset, **options)
     args.report(f"animation: {args.out}, {args.out.stat().st_size / 1e6:.2f} MB")
     if skin:
-        at, between = 100 * skin.error_at_frames, 100 * skin.error_between_frames
-        args.report(f"{skin.weights.shape[1]} bones, error: {at:.3f} % at the frames, {between:.3f} % between them")
+        args.report(f"{skin.weights.shape[1]} bones, error: {100 * skin.error:.3f} % of the diagonal")

@@ -16,7 +16,7 @@ from typing import NamedTuple, TypeVar
 import torch
 from torch import Tensor
 
-from torch_modal.autograd import in_use, is_vmapped
+from torch_modal.autograd import in_use, is_traced, is_vmapped
 
 # Velocities are cut from this many times the slower one of the steps before and after on, and never reach three times:
 # what stops, stops, and no quantity that grows overshoots (Fritsch and Carlson 1980).
@@ -101,18 +101,19 @@ def offset(first: Tensor, last: Tensor, u: Tensor) -> Tensor:
 
 
 def evaluate_by_interval(
-    segment: Tensor, n: int, shapes: Callable[[int, Tensor | slice], Part], everywhere: bool = False
+    segment: Tensor, n: int, shapes: Callable[[int, Tensor | slice], Part]
 ) -> tuple[list[Part], Tensor]:
     """Evaluate shapes interval by interval; also the place of each shape in the concatenated results.
+
+    Where ``vmap`` maps the intervals, or tracing does not know them, all rows are computed in each interval.
 
     Args:
         segment: The interval of each shape. *Shape:* ``(B,)``.
         n: Number of intervals.
         shapes: Computes some rows of the batch, which are in one interval.
-        everywhere: True to compute all rows of each interval, as where ``vmap`` maps the intervals.
     """
     intervals = in_use(segment, n) or [0]  # of nothing, nothing
-    if everywhere or is_vmapped(segment):
+    if is_traced(segment) or is_vmapped(segment):
         place, size = sum((segment == i) * place for place, i in enumerate(intervals)), segment.shape[0]
         order = place * size + torch.arange(size, device=segment.device)
         return [shapes(i, slice(None)) for i in intervals], order

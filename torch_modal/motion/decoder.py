@@ -12,10 +12,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from torch_modal.autograd import disable_compile, full_precision, is_traced, outside_inference_mode, require_numbers
+from torch_modal.autograd import disable_compile, full_precision, outside_inference_mode, require_numbers
 from torch_modal.elastic.backend import TorchBackend
 from torch_modal.geometry.connectivity import Connectivity
-from torch_modal.geometry.local_rotations import Trajectory
 from torch_modal.geometry.rotations import exp
 from torch_modal.geometry.triangle_frames import Frames, bend, frames_of, sides
 from torch_modal.keyframes.arrays import broadcast_leading, check_tensor
@@ -32,9 +31,6 @@ LEAST = 1e-4
 
 MOST = 30.0
 """A triangle turns and strains by at most this many times the mode's mean over the area; only slivers do more."""
-
-CHUNK = 40_000
-"""Vertices of all shapes that are decoded at a time: more would not fit into caches."""
 
 
 class ModalDecoder(nn.Module):
@@ -158,28 +154,22 @@ class ModalDecoder(nn.Module):
         lead = broadcast_leading(amplitudes=amplitudes.shape[:-1], t=t.shape)
         a = amplitudes.expand(*lead, -1).reshape(-1, self.n_modes)
         segment, u = self.locate(t.expand(lead).reshape(-1))
-        size = max(1, CHUNK // self.keyframes.shape[1])
-
-        def shapes(i: int, rows: Tensor | slice) -> Tensor:
-            trajectory = self.spline.trajectory(knots, i)
-            if isinstance(rows, slice):
-                return self._shapes(knots, i, trajectory, a, u)
-            return torch.cat([self._shapes(knots, i, trajectory, a[chunk], u[chunk]) for chunk in rows.split(size)])
-
-        parts, order = evaluate_by_interval(segment, len(self.times) - 1, shapes, is_traced(segment))
-        x = torch.cat(parts)[order]
+        shapes, order = evaluate_by_interval(
+            segment, len(self.times) - 1, lambda i, rows: self._shapes(knots, i, a[rows], u[rows])
+        )
+        x = torch.cat(shapes)[order]
         if motions is not None:
             x = apply_motions(x, motions.expand(*lead, 6).reshape(-1, 6), self.size)
         return x.reshape(*lead, *x.shape[1:])
 
-    def _shapes(self, knots: Knots, i: int, trajectory: Trajectory, a: Tensor, u: Tensor) -> Tensor:
+    def _shapes(self, knots: Knots, i: int, a: Tensor, u: Tensor) -> Tensor:
         """Shapes of one interval. *Shape:* ``(B, k), (B,)``."""
         which = torch.zeros_like(u, dtype=torch.int64)
         straight = self.spline.straight(knots, i, which, u)
         if self.moves.shape[1]:
             straight = straight + (a @ self.moves).unflatten(1, (-1, 3))
         bending = (a @ self.columns.flatten(1)).unflatten(1, (6, -1)).movedim(1, 0)
-        x = self.spline(knots, i, which, u, trajectory, straight, bending)
+        x = self.spline(knots, i, which, u, straight, bending)
         return self.spline.alignment.to_caller(x, self.spline.pose(knots, i, which, u))
 
     def locate(self, t: Tensor) -> tuple[Tensor, Tensor]:

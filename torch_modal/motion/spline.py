@@ -173,7 +173,6 @@ class Spline(nn.Module):
         i: int,
         which: Tensor,
         u: Tensor,
-        trajectory: Trajectory | None = None,
         straight: Tensor | None = None,
         bending: Tensor | None = None,
     ) -> Tensor:
@@ -184,7 +183,6 @@ class Spline(nn.Module):
             i: The interval.
             which: The motion of each shape. *Shape:* ``(B,)``.
             u: Times, 0 to 1. *Shape:* ``(B,)``.
-            trajectory: From :meth:`trajectory`, where it is known.
             straight: Shapes that give the centres of the pieces. Default: from :meth:`straight`.
                 *Shape:* ``(B, V, 3)``.
             bending: Turns and strains of the triangles beforehand, of one motion. *Shape:* ``(6, B, F)``.
@@ -193,15 +191,14 @@ class Spline(nn.Module):
             *Shape:* ``(B, V, 3)``.
         """
         rotations = self.rotations[i]
-        trajectory = self.trajectory(knots, i) if trajectory is None else trajectory
         straight = self.straight(knots, i, which, u) if straight is None else straight
         if bending is not None:
-            edges = rotations.bent_edges_along(trajectory, u, bending)
+            edges = rotations.bent_edges_along(self.trajectory(knots, i), u, bending)
         elif rotations.clusters is not None:
             ends = knots.shapes[i : i + 2, which].movedim(0, 1)
             edges = rotations(ends, torch.stack([1 - u, u], -1))
         else:
-            edges = rotations.edges_along(trajectory, which, u)
+            edges = rotations.edges_along(self.trajectory(knots, i), which, u)
         return self.poisson.forward_or_near(self.poisson.right_hand_side(edges), straight)
 
     def explain(self, knots: Knots) -> tuple[Tensor, Tensor]:

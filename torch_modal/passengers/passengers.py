@@ -4,7 +4,6 @@ import math
 import warnings
 from functools import partial
 
-import numpy as np
 import torch
 from scipy import sparse
 from torch import Tensor, nn
@@ -40,6 +39,7 @@ class Passengers(nn.Module):
         points: In the coordinates of the reference. *Shape:* ``(P, 3)``.
         anchors: A vertex of the carrier that each point belongs to, or -1 where it is not known: the point follows the
             triangles there, even if others are nearer. *Shape:* ``(P,)``.
+        weights: :attr:`weights` of passengers in another pose. Default: bound here. *Shape:* ``(P, V)``.
 
     Raises:
         ValueError: Shapes of the arguments do not fit, or numbers are not finite.
@@ -50,6 +50,7 @@ class Passengers(nn.Module):
     points: Tensor
     inverses: Tensor
     areas: Tensor
+    per_area: Tensor
     starts: Tensor
     columns: Tensor
     values: Tensor
@@ -58,7 +59,15 @@ class Passengers(nn.Module):
     transposed_values: Tensor
 
     @outside_inference_mode
-    def __init__(self, reference: Tensor, faces: Tensor, points: Tensor, anchors: Tensor | None = None) -> None:
+    def __init__(
+        self,
+        reference: Tensor,
+        faces: Tensor,
+        points: Tensor,
+        anchors: Tensor | None = None,
+        *,
+        weights: sparse.csr_matrix | None = None,
+    ) -> None:
         super().__init__()
         corners = torch.from_numpy(as_faces(faces))
         for name, x in (("reference", reference), ("points", points)):
@@ -75,38 +84,30 @@ class Passengers(nn.Module):
         rest, bound = (x.detach().double().cpu() for x in (reference, points))
         if not bool(cross(*sides(rest.mT, corners)).any()):
             raise ValueError("no face of the reference has an area: there is no surface to follow")
-        known = None if anchors is None else anchors.detach().cpu().numpy()
-        self._bind(rest, bound, corners, bind_points(bound.numpy(), rest.numpy(), corners.numpy(), known))
-        self.to(reference)
-
-    def _bind(self, reference: Tensor, points: Tensor, faces: Tensor, weights: sparse.csr_matrix) -> None:
-        for name, buffer in (("faces", faces), ("reference", reference), ("points", points)):
-            self.register_buffer(name, buffer, persistent=False)
-        frame = _frames(reference.mT, faces).movedim(-1, 0)  # (F, 3, 3)
-        area = 0.5 * norm(cross(*sides(reference.mT, faces)))
+        if weights is None:
+            known = None if anchors is None else anchors.detach().cpu().numpy()
+            weights = bind_points(bound.numpy(), rest.numpy(), corners.numpy(), known)
+        frame = _frames(rest.mT, corners).movedim(-1, 0)  # (F, 3, 3)
+        area = 0.5 * norm(cross(*sides(rest.mT, corners)))
         flat = area <= 1e-12 * area.mean()
-        frame = torch.where(flat[:, None, None], torch.eye(3).to(frame), frame)
-        self.register_buffer("inverses", torch.linalg.inv(frame), persistent=False)
-        self.register_buffer("areas", torch.where(flat, 0, area), persistent=False)
+        area = torch.where(flat, 0, area)
+        total = area.new_zeros(len(rest)).index_add(0, corners.flatten(), area.repeat_interleave(3))
+        inverses = torch.linalg.inv(torch.where(flat[:, None, None], torch.eye(3).to(frame), frame))
+        buffers = {"reference": rest, "faces": corners, "points": bound}
+        buffers |= {"inverses": inverses, "areas": area, "per_area": inverse(total, total <= 0)}
         # Weights by rows, and their transpose: torch would make it anew at each backward pass.
         for prefix, matrix in (("", weights), ("transposed_", weights.T.tocsr())):
             for name, array in (("starts", matrix.indptr), ("columns", matrix.indices), ("values", matrix.data)):
-                self.register_buffer(prefix + name, torch.from_numpy(array), persistent=False)
+                buffers[prefix + name] = torch.from_numpy(array)
+        for name, buffer in buffers.items():
+            self.register_buffer(name, buffer, persistent=False)
+        self.to(reference)
 
     @property
     def weights(self) -> sparse.csr_matrix:
         """Weights of the carrier's vertices for each point. *Shape:* ``(P, V)``."""
         arrays = (tensor.cpu().numpy() for tensor in (self.values, self.columns, self.starts))
         return sparse.csr_matrix(tuple(arrays), shape=(len(self), len(self.reference)))
-
-    @outside_inference_mode
-    def rebind(self, reference: Tensor, points: Tensor) -> "Passengers":
-        """Passengers with these weights for another pose of carrier and points. *Shape:* ``(V, 3), (P, 3)``."""
-        passengers = Passengers.__new__(Passengers)
-        nn.Module.__init__(passengers)
-        reference, points = (x.detach().double().cpu() for x in (reference, points))
-        passengers._bind(reference, points, self.faces.cpu(), self.weights.astype(np.float64))
-        return passengers.to(self.points)
 
     def __len__(self) -> int:
         return len(self.points)
@@ -159,12 +160,10 @@ class Passengers(nn.Module):
         """Mean deformation gradient around each vertex. *Shape:* ``(B, V, 3) -> (B, V, 3, 3)``."""
         frame = _frames(x.movedim(-1, 0).contiguous(), self.faces).movedim((0, 1), (-2, -1))  # (B, F, 3, 3)
         each = ((frame @ self.inverses) * self.areas[:, None, None]).flatten(2)
-        total = x.new_zeros(x.shape[1], 1)
         summed = x.new_zeros(*x.shape[:2], 9)
         for corner in self.faces.T:
             summed = summed.index_add(1, corner, each)
-            total = total.index_add(0, corner, self.areas[:, None])
-        return (summed * inverse(total, total <= 0)).unflatten(-1, (3, 3))
+        return (summed * self.per_area[:, None]).unflatten(-1, (3, 3))
 
     def _mix(self, values: Tensor) -> Tensor:
         """Weighted sums over the vertices that points follow. *Shape:* ``(B, V, n) -> (B, P, n)``."""

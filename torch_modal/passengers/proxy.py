@@ -40,7 +40,8 @@ class Proxy:
         self.faces = torch.from_numpy(coarse.faces)
         carriers = torch.from_numpy(coarse.restrict(fine.numpy()))
         first = Passengers(carriers[0], self.faces, fine[0], torch.from_numpy(coarse.clusters))
-        passengers = [first, *(first.rebind(x, y) for x, y in zip(carriers[1:], fine[1:], strict=True))]
+        others = zip(carriers[1:], fine[1:], strict=True)
+        passengers = [first, *(Passengers(x, self.faces, y, weights=first.weights) for x, y in others)]
         self.passengers = [each.to(keyframes) for each in passengers]
         self.keyframes = carriers.to(keyframes)
 

@@ -110,38 +110,32 @@ def _sheet(
     n_rows, n_columns, height, width = images.shape[:4]
     dpi, gap = 200, 12
     text = min(11.0, 0.13 * width * 72 / dpi)  # points; the longest column label has about twelve letters
-    line = text * dpi / 72
+    line = round(text * dpi / 72)
     font = FontProperties(size=text + 1)
     lines = [words for row in rows for words in row.split("\n") if words.strip()]  # TextPath fails on blanks
     widest = max((TextPath((0, 0), words, prop=font).get_extents().width for words in lines), default=0.0)
-    left = widest * dpi / 72 + 2 * line
-    right = 7 * line if color_bar else line
-    top, bottom = 2.6 * line, line
-    total = np.array([left + n_columns * (width + gap) + right, top + n_rows * (height + gap) + bottom])
-    figure = Figure(figsize=tuple(total / dpi), dpi=dpi, facecolor="white")
+    left, top, right = round(widest * dpi / 72) + 2 * line, round(2.6 * line), 7 * line if color_bar else line
+    cells = np.pad(images, [(0, 0), (0, 0), (0, gap), (0, gap), (0, 0)], constant_values=255)
+    cells = cells.transpose(0, 2, 1, 3, 4).reshape(n_rows * (height + gap), n_columns * (width + gap), 3)
+    sheet = np.pad(cells, [(top, line), (left, right), (0, 0)], constant_values=255)
+    total_height, total_width = sheet.shape[:2]
+    figure = Figure(figsize=(total_width / dpi, total_height / dpi), dpi=dpi, facecolor="white")
     FigureCanvasAgg(figure)
-
-    def cell(x: float, y: float, w: float, h: float) -> tuple[float, float, float, float]:
-        """Convert pixels, y down, to fractions of the figure."""
-        return x / total[0], 1 - (y + h) / total[1], w / total[0], h / total[1]
-
+    axes = figure.add_axes((0, 0, 1, 1))
+    axes.set_axis_off()
+    axes.imshow(sheet, aspect="auto", interpolation="none", extent=(0, total_width, total_height, 0))
     for r, row in enumerate(rows):
-        y = top + r * (height + gap)
-        figure.text(*cell(line, y + height / 2, 0, 0)[:2], row, fontproperties=font, va="center", ha="left")
-        for c in range(n_columns):
-            axes = figure.add_axes(cell(left + c * (width + gap), y, width, height))
-            axes.imshow(images[r, c], aspect="auto", interpolation="none")
-            axes.set_axis_off()
+        axes.text(line, top + r * (height + gap) + height / 2, row, fontproperties=font, va="center", ha="left")
     for c, (label, color) in enumerate(column_labels):
-        x, y = cell(left + c * (width + gap) + width / 2, 1.6 * line, 0, 0)[:2]
-        figure.text(x, y, label, fontsize=text, color=color, ha="center", va="center")
+        x = left + c * (width + gap) + width / 2
+        axes.text(x, 1.6 * line, label, fontsize=text, color=color, ha="center", va="center")
     if color_bar:
         mappable, label = color_bar
-        tall = min(n_rows * (height + gap) - gap, 2 * height)
-        x, y = left + n_columns * (width + gap) + line, top + (n_rows * (height + gap) - gap - tall) / 2
+        tall = min(len(cells) - gap, 2 * height)
+        box = (total_width - right + line, top + (len(cells) - gap - tall) / 2, 0.8 * line, tall)
         beyond = "max" if mappable.get_array().max() > mappable.norm.vmax else "neither"
-        cax = figure.add_axes(cell(x, y, 0.8 * line, tall))
-        bar = figure.colorbar(mappable, cax=cax, extend=beyond, extendfrac=0.03)
+        bar_axes = axes.inset_axes(box, transform=axes.transData)
+        bar = figure.colorbar(mappable, cax=bar_axes, extend=beyond, extendfrac=0.03)
         bar.ax.tick_params(labelsize=0.8 * text)
         bar.set_label(label, fontsize=0.9 * text)
         bar.outline.set_visible(False)
