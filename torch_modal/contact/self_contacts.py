@@ -65,8 +65,8 @@ def self_contacts(x: Any, faces: Any, ignore: Any = None) -> SelfContacts:
     shapes, corners = check_arrays(positions.reshape(-1, *positions.shape[-2:]), faces)[1:]
     known = shapes[:0]
     if ignore is not None:
-        known = as_positions(ignore)
-        known = check_arrays(known.reshape(-1, *known.shape[-2:]), faces)[1]
+        ignored = as_positions(ignore)
+        known = check_arrays(ignored.reshape(-1, *ignored.shape[-2:]), faces)[1]
     if known.shape[1:] != shapes.shape[1:]:
         raise MeshError(f"ignore has {known.shape[1]} vertices, the shapes have {shapes.shape[1]}; they must be equal")
     crossings = Crossings(Connectivity(corners, shapes.shape[1]), known, known[0] if len(known) else shapes[0])
