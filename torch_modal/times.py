@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -43,19 +44,13 @@ def check_times(
     )
 
 
-def fill_times(times: Tensor, counts: Sequence[int]) -> Tensor:
-    """Even times in each interval, its start included and its end left out.
+def fill_times(times: Tensor, places: Sequence[int]) -> Tensor:
+    """Times of all frames up to the last place, even within each interval, of which the places have the given times.
 
-    Args:
-        times: *Shape:* ``(N + 1,)``.
-        counts: Number of times in each of the N intervals.
-
-    Returns:
-        *Shape:* ``(sum(counts),)``.
+    *Shape:* ``(N,), (N,) -> (T,)``.
     """
-    knots = times.tolist()
-    ends = zip(knots[:-1], knots[1:], counts, strict=True)
-    return torch.cat([torch.linspace(a, b, n + 1, dtype=times.dtype)[:-1] for a, b, n in ends]).to(times.device)
+    at = np.interp(np.arange(places[-1] + 1), places, times.cpu().numpy())
+    return torch.from_numpy(at).to(times.device)
 
 
 def wrap_times(t: Tensor, times: Tensor) -> Tensor:
@@ -87,14 +82,14 @@ def locate_times(
         differences = times - t.detach()[:, None]
         to_nearest = differences.gather(1, differences.abs().argmin(1, keepdim=True))[:, 0]
         t = t + torch.where(to_nearest.abs() <= 2 * rounding * scale, to_nearest, 0.0)
+
+    def require_within(t: Tensor, times: Tensor) -> None:
+        outside = t[~((t >= times[0]) & (t <= times[-1]))].tolist()
+        if outside:
+            ends = f"{float(times[0]):g} and {float(times[-1]):g}"
+            raise ValueError(f"t lies between the times of the first and the last {of}, {ends}; got {outside[0]:g}")
+
     if not is_traced(t):
-        run_outside_transforms(lambda t, times: _require_within(t, times, of), t, times)
+        run_outside_transforms(require_within, t, times)
     interval = (torch.searchsorted(times, t.detach().contiguous(), right=True) - 1).clamp(0, len(times) - 2)
     return interval, (t - times[interval]) / (times[interval + 1] - times[interval])
-
-
-def _require_within(t: Tensor, times: Tensor, of: str) -> None:
-    outside = t[~((t >= times[0]) & (t <= times[-1]))].tolist()
-    if outside:
-        ends = f"{float(times[0]):g} and {float(times[-1]):g}"
-        raise ValueError(f"t lies between the times of the first and the last {of}, {ends}; got {outside[0]:g}")

@@ -34,8 +34,8 @@ def test_times_are_given_even_or_those_of_a_cycle() -> None:
     assert check_times(range(4), 3, None).dtype == F64 and len(check_times([5], 1)) == 1
 
 
-def test_even_times_of_intervals_leave_out_the_end() -> None:
-    assert fill_times(CYCLE, [2, 4]).tolist() == [1, 1.5, 2, 2.5, 3, 3.5]
+def test_times_are_even_within_intervals() -> None:
+    assert fill_times(CYCLE, [0, 2, 6]).tolist() == [1, 1.5, 2, 2.5, 3, 3.5, 4]
 
 
 @pytest.mark.parametrize(

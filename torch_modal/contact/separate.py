@@ -72,11 +72,11 @@ def separate(
     Returns:
         The shapes, and the number of far pairs of triangles that are left in each. *Shape:* ``(T, V, 3), (T,)``.
     """
-    n, device = len(start), start.device
-    every, nothing = torch.arange(n, device=device), torch.zeros(n, dtype=torch.int64, device=device)
+    n, areas = len(start), search.areas
+    every = torch.arange(n, device=start.device)
     stride = -(-n // LOOKED_AT)
     if not bool(search.count(start[stride - 1 :: stride]).any()):
-        return start, nothing
+        return start, torch.zeros_like(every)
     active, n_before = search(start, every)
     if not len(active.shapes):
         return start, n_before
@@ -84,57 +84,29 @@ def separate(
     chosen = every if timeline is None else _choose_shapes(timeline.t, search)
     x = start
     if timeline is not None and timeline.in_modes is not None:
-        contact = ContactEnergy(active.rows(chosen), search.areas, start)
         spline = spline_weights(timeline.t[chosen], timeline.t)
         bend = (timeline.limit.differences[:n] @ spline.double()).to(start)
-        x = start + torch.tensordot(spline, timeline.in_modes(chosen, contact, bend), 1)
-    x, n_crossing = _settle(start, x, relax, search, timeline, active, chosen, n_before)
-    if timeline is not None and x is not start:
-        x, n_crossing = _never_worse(start, x - start, search, timeline, n_before)
-    return x, n_crossing
-
-
-def _choose_shapes(t: Tensor, search: ContactSearch) -> Tensor:
-    """Shapes of a trajectory that take steps. *Shape:* ``(T,) -> (S,)``."""
-    # End frames are always solved: they are cheap, and neighbours would bend them.
-    stride = max(1, (len(t) + 1) // SOLVED)
-    chosen = torch.zeros(len(t), dtype=torch.bool, device=t.device)
-    chosen[stride - 1 :: stride] = chosen[0] = chosen[-1] = True
-    if len(search.search.crossings.known_pairs):
-        chosen |= (t < BESIDE) | (t > 1 - BESIDE)
-    return torch.nonzero(chosen).flatten()
-
-
-def _settle(
-    start: Tensor,
-    x: Tensor,
-    relax: Callable[[Tensor, Tensor, ExtraEnergies], Tensor],
-    search: ContactSearch,
-    timeline: Timeline | None,
-    active: Contacts,
-    chosen: Tensor,
-    n_before: Tensor,
-) -> tuple[Tensor, Tensor]:
-    """Shapes and their far pairs in the best round of steps of the chosen shapes, from ``x`` on, or at the start."""
-    every, n_far, best, n_best = torch.arange(len(x), device=x.device), n_before, start, n_before
+        first = timeline.in_modes(chosen, ContactEnergy(active.rows(chosen), areas, start), bend)
+        x = start + torch.tensordot(spline, first, 1)
+    n_far, best, n_best = n_before, start, n_before
     most = MOST_MOVED * search.depth(start[0]) if timeline is None else math.inf
     # Shapes that relax on their own, what the bound took from them so far, and springs of the vertices it limits.
     alone, dual, springs = x, torch.zeros_like(x), torch.zeros_like(x[0, :, 0])
     for k in range(1, ROUNDS[1] + 1):
         # In a trajectory, wider gaps where it cannot be separated would disturb neighbouring shapes.
         gap = GAP if timeline is not None else GAP + WIDER * max(0, k - ROUNDS[0])
-        energies = _energies(active.rows(chosen), Pull((x - dual)[chosen].detach(), springs), search.areas, gap)
+        energies = _energies(active.rows(chosen), Pull((x - dual)[chosen].detach(), springs), areas, gap)
         alone = x.index_copy(0, chosen, relax(alone[chosen], chosen, energies))
         if timeline is None:
             x = alone
         else:
             wanted = (alone + dual - start)[chosen]
-            if len(chosen) < len(x):
+            if len(chosen) < n:
                 wanted = torch.tensordot(spline_weights(timeline.t[chosen], timeline.t), wanted, 1)
             field, limited = timeline.limit.nearest(wanted)
             x = start + field
             dual = dual.index_add(0, chosen, (alone - x)[chosen])
-            springs[limited] = PULL * search.areas[limited]
+            springs[limited] = PULL * areas[limited]
         some = every if k == ROUNDS[0] else torch.unique(torch.cat([active.shapes, torch.nonzero(n_far).flatten()]))
         contacts, counts = search(x, some)
         active, n_far = contacts.with_former(active), n_far.index_copy(0, some, counts)
@@ -146,7 +118,20 @@ def _settle(
         if not bool(n_far.any()):
             break
         chosen = torch.unique(torch.cat([chosen, torch.nonzero(n_far).flatten()]))
-    return best, n_best
+    if timeline is None or best is start:
+        return best, n_best
+    return _never_worse(start, best - start, search, timeline, n_before)
+
+
+def _choose_shapes(t: Tensor, search: ContactSearch) -> Tensor:
+    """Shapes of a trajectory that take steps. *Shape:* ``(T,) -> (S,)``."""
+    # End frames are always solved: they are cheap, and neighbours would bend them.
+    stride = max(1, (len(t) + 1) // SOLVED)
+    chosen = torch.zeros(len(t), dtype=torch.bool, device=t.device)
+    chosen[stride - 1 :: stride] = chosen[0] = chosen[-1] = True
+    if len(search.search.crossings.known_pairs):
+        chosen |= (t < BESIDE) | (t > 1 - BESIDE)
+    return torch.nonzero(chosen).flatten()
 
 
 def _energies(active: Contacts, pull: Pull, areas: Tensor, gap: float = GAP) -> ExtraEnergies:

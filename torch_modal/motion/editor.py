@@ -74,8 +74,8 @@ class PathEditor:
     def times(self) -> Tensor:
         """Times of the shapes. *Shape:* ``(T,)``, float64."""
         times = self.path.times
-        inner = fill_times(times, [self.steps] * len(self._made))
-        return inner if self.path.cyclic else torch.cat([inner, times[-1:]])
+        at = fill_times(times, range(0, self.steps * len(times), self.steps))
+        return at[:-1] if self.path.cyclic else at
 
     def shapes(self) -> Tensor:
         """All shapes; intervals that no change has touched are not computed again. *Shape:* ``(T, V, 3)``."""

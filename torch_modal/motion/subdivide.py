@@ -238,8 +238,8 @@ def frame_times(
     """
     when = check_times(times, n_keyframes, cyclic)
     places = keyframe_places(n_keyframes, levels, cyclic=cyclic, n_frames=n_frames, times=times)
-    inner = fill_times(when, [b - a for a, b in pairwise(places)])
-    return inner if cyclic else torch.cat([inner, when[-1:]])
+    at = fill_times(when, places)
+    return at[:-1] if cyclic else at
 
 
 def linear_sequence(keyframes: Tensor, places: Sequence[int]) -> Tensor:
@@ -249,12 +249,10 @@ def linear_sequence(keyframes: Tensor, places: Sequence[int]) -> Tensor:
         keyframes: *Shape:* ``(K, V, 3)``.
         places: From :func:`keyframe_places`; one more than key-frames closes the cycle.
     """
-    cyclic = len(places) > len(keyframes)
-    parts = []
-    for i, n in enumerate(b - a for a, b in pairwise(places)):
-        t = torch.arange(n, dtype=keyframes.dtype, device=keyframes.device) / n
-        parts.append(torch.lerp(keyframes[i], keyframes[(i + 1) % len(keyframes)], t[:, None, None]))
-    return torch.cat(parts if cyclic else [*parts, keyframes[-1:]])
+    cyclic, n = len(places) > len(keyframes), len(keyframes)
+    at = fill_times(torch.arange(len(places)).to(keyframes), places)[: places[-1] + (not cyclic)]
+    left, t = at.long(), at.frac().to(keyframes)
+    return torch.lerp(keyframes[left % n], keyframes[(left + 1) % n], t[:, None, None])
 
 
 def _report_contacts(keyframes: Tensor, faces: Tensor, left: int, total: int) -> None:
