@@ -587,14 +587,20 @@ def test_shapes_rest_as_far_as_accelerations_allow(generator: torch.Generator, m
     """Shapes on springs of different stiffness, held below the limit: SciPy finds the same rest."""
     n, places = 7, 2 * torch.randn(7, 3, 3, dtype=DOUBLE, generator=generator)
     springs = torch.tensor([1.0, 30, 1, 5, 1, 0.2, 3], dtype=DOUBLE)[:, None, None]
-    nothing = Contacts(torch.zeros(0, dtype=torch.int64), torch.zeros(0, 4, dtype=torch.int64))
 
     class Fake:
         areas, n_far = torch.ones(3, dtype=DOUBLE), 99
+        search = SimpleNamespace(crossings=SimpleNamespace(known_pairs=[]))
 
         def __call__(self, x: Tensor, some: Tensor) -> tuple[Contacts, Tensor]:
             self.n_far -= 1  # the last is the best
-            return nothing, torch.full((len(some),), self.n_far)
+            return Contacts(some[:1], torch.tensor([[0, 1, 2, 0]])), torch.full((len(some),), self.n_far)
+
+        def count(self, x: Tensor) -> Tensor:
+            return 1 * (x == 0).all(2).all(1)
+
+        def watch(self, *_: Any) -> None:
+            """Nothing."""
 
     def relax(x: Tensor, some: Tensor, beside: Any) -> Tensor:
         pulls = [energy for energy in beside(slice(None), x) if isinstance(energy, Pull)]
@@ -603,9 +609,9 @@ def test_shapes_rest_as_far_as_accelerations_allow(generator: torch.Generator, m
 
     monkeypatch.setattr(separate, "ROUNDS", (4, 90))
     monkeypatch.setattr(separate, "PULL", 3.0)
-    start, fake, trajectory = torch.zeros_like(places), Fake(), unlimited(n, 3, 1.0)
-    given: Any = start, start, relax, fake, trajectory, nothing, torch.arange(n), torch.full((n,), 99)
-    x, _ = separate._settle(*given)
+    fake, trajectory = Fake(), unlimited(n, 3, 1.0)
+    given: Any = torch.zeros_like(places), relax, fake, trajectory
+    x, _ = separate.separate(*given)
     differences = trajectory.limit.differences.numpy()
     for v in range(3):
         best = minimize(
