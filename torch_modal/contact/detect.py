@@ -28,8 +28,8 @@ _STRAIGHT = 0.7
 """Least part of the distance that lies along the face's normal; with less, the vertex lies to the side of the face."""
 _BEHIND = 0.02
 """Part of the mean edge length: how far behind a face a vertex outside may lie, which is rounding of a fold."""
-_TIE = 1e-6
-"""Lengths that differ by less than this part are equal but for rounding."""
+_TIE = 1e-9
+"""Lengths that differ by less than this are equal but for rounding."""
 _NEAREST = 64
 """Number of faces, by their centres, among which the nearest is searched; four times as many from inside."""
 
@@ -100,7 +100,8 @@ class Search:
             behind = _heights(known, v, f) <= -1e-3 * self._edge
             behind[behind] = _distances(known, v[behind], f[behind]) <= 1.5 * reach
             v, f, distance = _select(~behind | stuck[v], v, f, distance)
-        first = _nearest_faces(v, f, distance, _heights(surface, v, f))
+        unit = _TIE * crossings.diagonal
+        first = _nearest_faces(v, f, distance / unit, _heights(surface, v, f) / unit)
         v, f = v[first], f[first]
         # Folds are inside, too, where they are in a key-frame.
         keep = np.ones(len(v), dtype=bool)
@@ -148,16 +149,11 @@ def _distances(surface: Surface, v: IntArray, f: IntArray) -> FloatArray:
 
 
 def _nearest_faces(v: IntArray, f: IntArray, distance: FloatArray, height: FloatArray) -> IntArray:
-    """Indices of the pairs of each vertex with its nearest face; of equally near ones, with the farthest plane."""
-    # Faces share nearest points, and rounding would choose among them; of those in one plane, the first is taken.
-    chosen = np.arange(len(v))
-    for lengths, sign in ((distance, 1), (np.abs(height), -1)):
-        least = np.full(v.max(initial=0) + 1, np.inf)
-        values = sign * lengths[chosen]
-        np.minimum.at(least, v[chosen], values)
-        near = least[v[chosen]]
-        chosen = chosen[values <= near + _TIE * np.abs(near)]
-    order = chosen[np.lexsort((f[chosen], v[chosen]))]
+    """Indices of the pairs of each vertex with its nearest face; of equally near ones, with the farthest plane.
+
+    Lengths are in units in which rounding does not count: faces share nearest points.
+    """
+    order = np.lexsort((f, -np.abs(height).round(), distance.round(), v))
     return order[np.flatnonzero(np.diff(v[order], prepend=-1))]
 
 

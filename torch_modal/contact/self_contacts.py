@@ -66,9 +66,10 @@ def self_contacts(x: Any, faces: Any, ignore: Any = None) -> SelfContacts:
     known = shapes[:0]
     if ignore is not None:
         ignored = as_positions(ignore)
+        if ignored.shape[-2:] != positions.shape[-2:]:
+            message = f"ignore has {ignored.shape[-2]} vertices, the shapes have {shapes.shape[1]}; they must be equal"
+            raise MeshError(message)
         known = check_arrays(ignored.reshape(-1, *ignored.shape[-2:]), faces)[1]
-    if known.shape[1:] != shapes.shape[1:]:
-        raise MeshError(f"ignore has {known.shape[1]} vertices, the shapes have {shapes.shape[1]}; they must be equal")
     crossings = Crossings(Connectivity(corners, shapes.shape[1]), known, known[0] if len(known) else shapes[0])
     if not crossings.diagonal > 0:
         raise MeshError("all vertices of a shape lie at one place: it has no size")
