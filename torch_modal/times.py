@@ -9,10 +9,11 @@ from torch import Tensor
 from torch_modal.arrays import FloatArray
 from torch_modal.autograd import is_traced, run_outside_transforms
 
+Times = Tensor | Sequence[float] | FloatArray | None
+"""Times of key-frames or frames, ascending; None: 0, 1, 2 and so on."""
 
-def check_times(
-    times: Tensor | Sequence[float] | FloatArray | None, n: int, cyclic: bool | None = False, of: str = "key-frame"
-) -> Tensor:
+
+def check_times(times: Times, n: int, cyclic: bool | None = False, of: str = "key-frame") -> Tensor:
     """Ascending times of key-frames or frames; of a cycle, also the time when the first comes again.
 
     Args:

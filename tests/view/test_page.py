@@ -24,6 +24,7 @@ from torch_modal.registration.landmarks import read_landmarks
 from torch_modal.registration.load import load_keyframes
 from torch_modal.view.page_data import GRID_STEPS, pack_faces, pack_group
 
+Ball = tuple[np.ndarray, np.ndarray]
 NASTY = "</script><script>document.title='broken'</script><img src=x onerror=\"document.title='broken'\">&amp;'"
 
 
@@ -36,7 +37,7 @@ def ball() -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.fixture(scope="module")
-def growing(ball: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+def growing(ball: Ball) -> np.ndarray:
     """Seven frames of the ball: from its size to 1.6 times that, a tenth a frame."""
     vertices, _ = ball
     centre = np.array([1.0, 2.0, 3.0])
@@ -73,18 +74,17 @@ def test_frames_come_back_within_half_a_step(generator: torch.Generator) -> None
     assert group["step"] == pytest.approx(np.ptp(frames, axis=(0, 1)).max() / GRID_STEPS)
 
 
-def test_faces_come_back(ball: tuple[np.ndarray, np.ndarray]) -> None:
+def test_faces_come_back(ball: Ball) -> None:
     many = np.concatenate([ball[1], ball[1] + 70_000])  # more than 16 bits
     np.testing.assert_array_equal(np.cumsum(unpacked(pack_faces(many), 4)), many.reshape(-1))
 
 
-def test_one_shape_and_points_at_one_place() -> None:
-    corners, faces = np.eye(4, 3)[None], np.array([[0, 1, 2]])
-    assert data_of(tm.show(corners, faces))["keyframes"] == [0]
-    assert data_of(tm.show(0 * corners + 5, faces))["groups"][0]["step"] == 1.0
+def test_points_at_one_place_are_one_key_frame() -> None:
+    data = data_of(tm.show(np.full((1, 4, 3), 5.0), np.array([[0, 1, 2]])))
+    assert data["keyframes"] == [0] and data["groups"][0]["step"] == 1.0
 
 
-def test_what_the_page_is_told(ball: tuple[np.ndarray, np.ndarray], growing: np.ndarray) -> None:
+def test_what_the_page_is_told(ball: Ball, growing: np.ndarray) -> None:
     faces = ball[1]
     page = tm.show({"a": torch.from_numpy(growing).float(), "b": growing}, torch.from_numpy(faces), cyclic=True)
     data = data_of(page)
@@ -99,7 +99,7 @@ def test_what_the_page_is_told(ball: tuple[np.ndarray, np.ndarray], growing: np.
     assert group["view"]["world_up"] == [0, 0, 1]
 
 
-def test_page_needs_nothing_else(ball: tuple[np.ndarray, np.ndarray], growing: np.ndarray) -> None:
+def test_page_needs_nothing_else(ball: Ball, growing: np.ndarray) -> None:
     page = tm.show({NASTY: growing}, ball[1], title=NASTY)
     references, titles = [], []
 
@@ -122,7 +122,7 @@ def test_page_needs_nothing_else(ball: tuple[np.ndarray, np.ndarray], growing: n
     assert page.html.count("<script") == 3
 
 
-def test_save_and_notebook(tmp_path: Path, ball: tuple[np.ndarray, np.ndarray], growing: np.ndarray) -> None:
+def test_save_and_notebook(tmp_path: Path, ball: Ball, growing: np.ndarray) -> None:
     page = tm.show(growing, ball[1], height=321)
     path = page.save(tmp_path / "new" / "page.html")
     assert path.read_text(encoding="utf-8") == page.html
@@ -154,7 +154,7 @@ def test_what_cannot_be_shown(changes: dict[str, Any], message: str) -> None:
 
 
 # -------------------------------------------------------------------------------------------------------- its input
-def test_animation_is_read_back(tmp_path: Path, ball: tuple[np.ndarray, np.ndarray], growing: np.ndarray) -> None:
+def test_animation_is_read_back(tmp_path: Path, ball: Ball, growing: np.ndarray) -> None:
     path = tm.save_animation(growing, ball[1], tmp_path / "a.glb", fps=12, keyframe_indices=[0, 4], cyclic=True)
     frames, faces, options = read_shapes([path])
     np.testing.assert_allclose(frames, growing, atol=1e-6)
@@ -164,7 +164,7 @@ def test_animation_is_read_back(tmp_path: Path, ball: tuple[np.ndarray, np.ndarr
     assert read_shapes([path])[0].shape == (1, *growing[0].shape)
 
 
-def test_folder_is_read_in_its_numbers_order(tmp_path: Path, ball: tuple[np.ndarray, np.ndarray]) -> None:
+def test_folder_is_read_in_its_numbers_order(tmp_path: Path, ball: Ball) -> None:
     vertices, faces = ball
     for n in (10, 2, 1):
         trimesh.Trimesh(vertices + n, faces, process=False).export(tmp_path / f"f{n}.ply")
@@ -181,9 +181,7 @@ def test_folder_is_read_in_its_numbers_order(tmp_path: Path, ball: tuple[np.ndar
         read_shapes([tmp_path / "empty"])
 
 
-def test_damaged_animations_are_refused(
-    tmp_path: Path, ball: tuple[np.ndarray, np.ndarray], growing: np.ndarray
-) -> None:
+def test_damaged_animations_are_refused(tmp_path: Path, ball: Ball, growing: np.ndarray) -> None:
     path = tm.save_animation(growing, ball[1], tmp_path / "a.glb")
     written = path.read_bytes()
     path.write_bytes(written.replace(b'"keyframes":[]', b'"keyfrmaes":[]'))
@@ -195,11 +193,7 @@ def test_damaged_animations_are_refused(
 
 
 def test_view_command_writes_a_page(
-    tmp_path: Path,
-    ball: tuple[np.ndarray, np.ndarray],
-    growing: np.ndarray,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path, ball: Ball, growing: np.ndarray, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     glb = tm.save_animation(growing, ball[1], tmp_path / "grow.glb", keyframe_indices=[0, 6])
     tm.save_frames(growing, ball[1], tmp_path / "frames")
@@ -240,7 +234,7 @@ def test_command_says_what_is_wrong(
     arguments: list[str],
     message: str,
     tmp_path: Path,
-    ball: tuple[np.ndarray, np.ndarray],
+    ball: Ball,
     growing: np.ndarray,
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
@@ -347,7 +341,7 @@ class Opened:
 
 
 @pytest.fixture
-def page(chrome: Any, tmp_path: Path, ball: tuple[np.ndarray, np.ndarray], growing: np.ndarray) -> Iterator[Opened]:
+def page(chrome: Any, tmp_path: Path, ball: Ball, growing: np.ndarray) -> Iterator[Opened]:
     """Two sequences, the second standing still; nothing may appear on the console, and nothing may be asked for."""
     rows = {"growing": growing, "still": growing[:1].repeat(7, axis=0)}
     shown = tm.show(rows, ball[1], keyframe_indices=[0, 2, 6], view=(0, 0), fps=6)
@@ -469,9 +463,7 @@ def test_sequences_are_shown_side_by_side_and_overlaid(page: Opened) -> None:
     assert page.pixels().sum() < alone.sum(), "the lines are dark"
 
 
-def test_user_texts_are_texts(
-    chrome: Any, tmp_path: Path, ball: tuple[np.ndarray, np.ndarray], growing: np.ndarray
-) -> None:
+def test_user_texts_are_texts(chrome: Any, tmp_path: Path, ball: Ball, growing: np.ndarray) -> None:
     shown = tm.show({NASTY: growing, "b": growing}, ball[1], title=NASTY)
     page = Opened(chrome, shown.save(tmp_path / "page.html"))
     assert chrome.title == NASTY
@@ -479,9 +471,7 @@ def test_user_texts_are_texts(
     assert not console(chrome)
 
 
-def test_cyclic_times_and_notebook(
-    chrome: Any, tmp_path: Path, ball: tuple[np.ndarray, np.ndarray], growing: np.ndarray
-) -> None:
+def test_cyclic_times_and_notebook(chrome: Any, tmp_path: Path, ball: Ball, growing: np.ndarray) -> None:
     """A closed sequence in the frame that a notebook makes."""
     times = [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 10.0]
     shown = tm.show(growing, ball[1], cyclic=True, times=times)
@@ -501,7 +491,7 @@ def test_cyclic_times_and_notebook(
     assert not console(chrome)
 
 
-def test_without_webgl(tmp_path: Path, ball: tuple[np.ndarray, np.ndarray], growing: np.ndarray) -> None:
+def test_without_webgl(tmp_path: Path, ball: Ball, growing: np.ndarray) -> None:
     path = tm.show(growing, ball[1]).save(tmp_path / "page.html")
     try:
         with open_browser(800, 600, "--disable-3d-apis") as browser, pytest.raises(AssertionError, match="needs WebGL"):
@@ -512,7 +502,7 @@ def test_without_webgl(tmp_path: Path, ball: tuple[np.ndarray, np.ndarray], grow
 
 # ------------------------------------------------------------------------------------------------------- landmarks
 @pytest.fixture
-def two(ball: tuple[np.ndarray, np.ndarray], tmp_path: Path) -> list[Path]:
+def two(ball: Ball, tmp_path: Path) -> list[Path]:
     """A ball, and a box of another connectivity elsewhere."""
     box = trimesh.creation.box(extents=(4, 2, 3)).subdivide().subdivide().subdivide()
     meshes = [tmp_path / "ball.obj", tmp_path / "box.ply"]
@@ -579,7 +569,7 @@ def test_landmarks_as_points_become_vertices(two: list[Path], tmp_path: Path) ->
 
 
 def test_landmarks_that_cannot_be_shown(
-    two: list[Path], ball: tuple[np.ndarray, np.ndarray], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    two: list[Path], ball: Ball, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = tmp_path / "wrong.txt"
     file.write_text("3 99999")

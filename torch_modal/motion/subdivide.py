@@ -23,7 +23,7 @@ from torch_modal.modes.extract import bases_of_checked
 from torch_modal.motion.path import Path
 from torch_modal.passengers.proxy import Proxy, proxy_size
 from torch_modal.progress import Progress, ProgressReport
-from torch_modal.times import check_times, fill_times
+from torch_modal.times import Times, check_times, fill_times
 
 MAX_LEVELS = 12
 
@@ -37,7 +37,7 @@ def subdivide(
     n_modes: int = 30,
     cyclic: bool = False,
     n_frames: int | None = None,
-    times: Tensor | Sequence[float] | None = None,
+    times: Times = None,
     smooth: bool | None = None,
     preset: Preset = "accurate",
     objective: Objective | None = None,
@@ -187,12 +187,7 @@ def _nearest_ends(shapes: Tensor, edges: Tensor) -> list[int]:
 
 
 def keyframe_places(
-    n_keyframes: int,
-    levels: int = 3,
-    *,
-    cyclic: bool = False,
-    n_frames: int | None = None,
-    times: Tensor | Sequence[float] | None = None,
+    n_keyframes: int, levels: int = 3, *, cyclic: bool = False, n_frames: int | None = None, times: Times = None
 ) -> list[int]:
     """Places of the key-frames in the result of :func:`subdivide`.
 
@@ -204,32 +199,25 @@ def keyframe_places(
     """
     if not isinstance(levels, int) or not 0 <= levels <= MAX_LEVELS:
         raise ValueError(f"levels is a whole number from 0 to {MAX_LEVELS} (each doubles the frames), got {levels!r}")
-    intervals = n_keyframes if cyclic else n_keyframes - 1
     when = check_times(times, n_keyframes, cyclic)
+    intervals = len(when) - 1
     if n_frames is None:
-        return [i * 2**levels for i in range(intervals + 1)]
+        return [i * 2**levels for i in range(len(when))]
     if n_frames < n_keyframes:
         raise ValueError(
             f"n_frames={n_frames} leaves no room for {n_keyframes} key-frames; ask for {n_keyframes} or more"
         )
     total = n_frames if cyclic else n_frames - 1
     share = (when - when[0]) / (when[-1] - when[0])
-    places = torch.floor(share * total + 0.5).long().tolist()
+    places = torch.floor(share * total + 0.5).long()
     # No two key-frames share a frame, however near in time.
-    for i in range(1, intervals + 1):
-        places[i] = max(places[i], places[i - 1] + 1)
-    for i in range(intervals, 0, -1):
-        places[i] = min(places[i], total - (intervals - i))
-    return places
+    order = torch.arange(intervals + 1)
+    places = (places - order).cummax(0).values.clamp_max(total - intervals) + order
+    return places.tolist()
 
 
 def frame_times(
-    n_keyframes: int,
-    levels: int = 3,
-    *,
-    cyclic: bool = False,
-    n_frames: int | None = None,
-    times: Tensor | Sequence[float] | None = None,
+    n_keyframes: int, levels: int = 3, *, cyclic: bool = False, n_frames: int | None = None, times: Times = None
 ) -> Tensor:
     """Times of the frames of :func:`subdivide`, even within each interval of key-frames. Arguments as there.
 
