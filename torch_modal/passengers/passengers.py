@@ -12,7 +12,8 @@ from torch_modal.autograd import full_precision, is_traced, linear_map, outside_
 from torch_modal.geometry.rigid import best_rotation
 from torch_modal.geometry.triangle_frames import sides
 from torch_modal.geometry.vectors import cross, inverse, norm
-from torch_modal.keyframes.arrays import as_faces, check_tensor
+from torch_modal.keyframes.arrays import check_tensor
+from torch_modal.keyframes.check import check_arrays
 from torch_modal.passengers.binding import bind_points
 
 
@@ -69,26 +70,22 @@ class Passengers(nn.Module):
         weights: sparse.csr_matrix | None = None,
     ) -> None:
         super().__init__()
-        corners = torch.from_numpy(as_faces(faces))
         for name, x in (("reference", reference), ("points", points)):
             check_tensor(name, x, "n", 3, finite=True)
-        if corners.dim() != 2 or corners.shape[1] != 3 or not len(corners):
-            raise ValueError(f"faces have the shape (F, 3), with one or more; got {tuple(corners.shape)}")
-        for number in (int(corners.min()), int(corners.max())):
-            if not 0 <= number < len(reference):
-                raise ValueError(f"the faces name vertex {number}; the reference has {len(reference)}, from 0 on")
+        corners = torch.from_numpy(check_arrays(reference[None], faces)[2])
         if anchors is not None and (
             anchors.shape != points.shape[:1] or bool(((anchors < -1) | (anchors >= len(reference))).any())
         ):
             raise ValueError(f"anchors hold a vertex of {len(reference)} for each of {len(points)} points, or -1")
         rest, bound = (x.detach().double().cpu() for x in (reference, points))
-        if not bool(cross(*sides(rest.mT, corners)).any()):
+        doubled = cross(*sides(rest.mT, corners))
+        if not bool(doubled.any()):
             raise ValueError("no face of the reference has an area: there is no surface to follow")
         if weights is None:
             known = None if anchors is None else anchors.detach().cpu().numpy()
             weights = bind_points(bound.numpy(), rest.numpy(), corners.numpy(), known)
         frame = _frames(rest.mT, corners).movedim(-1, 0)  # (F, 3, 3)
-        area = 0.5 * norm(cross(*sides(rest.mT, corners)))
+        area = 0.5 * norm(doubled)
         flat = area <= 1e-12 * area.mean()
         area = torch.where(flat, 0, area)
         total = area.new_zeros(len(rest)).index_add(0, corners.flatten(), area.repeat_interleave(3))
