@@ -12,7 +12,7 @@ from torch_modal.keyframes.check import check_keyframes
 from torch_modal.modes.extract import extract_modes
 from torch_modal.motion.decoder import ModalDecoder
 from torch_modal.progress import Progress, ProgressReport
-from torch_modal.times import check_times
+from torch_modal.times import Times, check_times
 
 LARGEST_ERROR = 0.002  # default for the largest mean distance of a frame's vertices, over the diagonal
 N_SAMPLES = 5  # frames of an interval that are fitted to estimate its error
@@ -25,7 +25,7 @@ def select_keyframes(
     *,
     error: float = LARGEST_ERROR,
     n_modes: int = 60,
-    times: Tensor | Sequence[float] | None = None,
+    times: Times = None,
     cyclic: bool = False,
     cache_dir: str | None = None,
     cache: bool = True,

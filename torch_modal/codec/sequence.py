@@ -18,7 +18,7 @@ from torch_modal.keyframes.check import check_keyframes
 from torch_modal.modes.extract import extract_modes
 from torch_modal.motion.decoder import ModalDecoder
 from torch_modal.progress import Progress, ProgressReport
-from torch_modal.times import check_times, locate_times
+from torch_modal.times import Times, check_times, locate_times
 
 FORMAT = "torch_modal.sequence"
 VERSION = "3"
@@ -182,7 +182,7 @@ def encode(
     n_modes: int = 60,
     *,
     error: float = LARGEST_ERROR,
-    times: Tensor | Sequence[float] | None = None,
+    times: Times = None,
     cyclic: bool = False,
     cache_dir: str | None = None,
     cache: bool = True,

@@ -30,7 +30,7 @@ from torch_modal.inbetween.settings import Objective
 from torch_modal.keyframes.check import check_arrays
 from torch_modal.motion.path import Path
 from torch_modal.progress import Progress, ProgressReport
-from torch_modal.times import check_times
+from torch_modal.times import Times, check_times
 
 
 class Completion(NamedTuple):
@@ -71,7 +71,7 @@ def complete(
     faces: Tensor,
     observations: Sequence[Observation],
     *,
-    times: Tensor | Sequence[float] | None = None,
+    times: Times = None,
     estimate_times: bool = False,
     objective: Objective | None = None,
     contact: bool | None = None,
@@ -131,7 +131,7 @@ class _Completer:
         whole: Tensor,
         faces: Tensor,
         observations: Sequence[Observation],
-        times: Tensor | Sequence[float] | None,
+        times: Times,
         objective: Objective,
     ) -> None:
         is_template = whole.dim() == 2

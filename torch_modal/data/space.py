@@ -24,6 +24,7 @@ from torch_modal.modes.basis import ModalBasis, check_bases
 from torch_modal.statistics.components import Components
 from torch_modal.statistics.fit import Fitted, fit
 from torch_modal.statistics.variation import Variation
+from torch_modal.times import Times
 
 # Range of sizes for which squares of lengths and of areas are normal numbers in float32.
 _FLOAT32_SIZES = 1e-3, 1e6
@@ -72,7 +73,7 @@ class ShapeSpace:
         times: int | None = 17,
         dtype: torch.dtype = torch.float32,
         folder: str | os.PathLike[str] | None = None,
-        keyframe_times: Tensor | Sequence[float] | None = None,
+        keyframe_times: Times = None,
         cyclic: bool = False,
         contact: bool | None = None,
     ) -> None:

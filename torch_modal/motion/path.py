@@ -28,7 +28,7 @@ from torch_modal.layers.blend import Blend
 from torch_modal.layers.in_between import InBetween
 from torch_modal.motion.cubics import Scheme, evaluate_by_interval
 from torch_modal.motion.spline import Explanation, Knots, Spline
-from torch_modal.times import check_times, locate_times, wrap_times
+from torch_modal.times import Times, check_times, locate_times, wrap_times
 
 # Even times between two key-frames at which a path looks for contacts.
 N_SEARCHED = 31
@@ -78,7 +78,7 @@ class Path(PreciseModule):
         self,
         bases: Bases,
         faces: Tensor,
-        times: Tensor | Sequence[float] | None = None,
+        times: Times = None,
         cyclic: bool = False,
         smooth: bool | Scheme = True,
         preset: Preset = "accurate",

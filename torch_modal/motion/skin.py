@@ -8,7 +8,6 @@ The squared error needs few sums. With :math:`p = (x, 1)` at rest and bones :mat
 import bisect
 import functools
 import warnings
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -22,7 +21,7 @@ from torch_modal.geometry.inspect import diagonals
 from torch_modal.geometry.rigid import best_rotation
 from torch_modal.geometry.skin import STEPS, Skin
 from torch_modal.io.write import check_frames
-from torch_modal.times import check_times
+from torch_modal.times import Times, check_times
 
 ROUNDS = 30  # at most; fewer where one lowers the squared error by less than half a hundredth
 SWEEPS = 2  # over the bones in a round
@@ -38,7 +37,7 @@ def bake(
     faces: Array,
     bones: int = 40,
     influences: int = 4,
-    times: Sequence[float] | Tensor | None = None,
+    times: Times = None,
     tolerance: float | None = None,
 ) -> Skin:
     """A motion as linear blend skinning: bones that move rigidly, and their weights at each vertex.
