@@ -16,7 +16,7 @@ from torch import Tensor
 from torch_modal.autograd import outside_inference_mode
 from torch_modal.io.tensors import TensorFile, write_tensors
 from torch_modal.modes.basis import ModalBasis
-from torch_modal.times import check_times
+from torch_modal.times import Times, check_times
 
 FORMAT = "torch_modal.set"
 VERSION = "2"
@@ -150,7 +150,7 @@ def find_sets(root: str | os.PathLike[str]) -> list[Path]:
     return sorted(folders)
 
 
-def motion_times(times: Tensor | Sequence[float] | None, n_keyframes: int, cyclic: bool) -> Tensor | None:
+def motion_times(times: Times, n_keyframes: int, cyclic: bool) -> Tensor | None:
     """Times of key-frames, if they are a motion; of a cycle even ones by default. Raises as :func:`check_times`."""
     return None if times is None and not cyclic else check_times(times, n_keyframes, cyclic)
 
