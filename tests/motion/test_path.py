@@ -183,13 +183,6 @@ def test_no_modes_are_needed(bars: Shapes, monkeypatch: pytest.MonkeyPatch) -> N
         torch.testing.assert_close(Path(x, faces, smooth=False)(x, i + 0.5), truth, rtol=0, atol=1e-9)
 
 
-def test_what_rests_between_equal_keyframes_does_not_move(bars: Shapes) -> None:
-    still = bars.pick(0, 1, 1, 2)
-    path = Path(still.keyframes, still.faces)
-    found = path(still.keyframes, torch.linspace(1, 2, 9, dtype=DOUBLE))
-    assert largest(found - still.keyframes[1]) < 1e-9
-
-
 def unlimited(speeds: Tensor, durations: Tensor, cyclic: bool, squared: Squared) -> Tensor:
     """The path scheme without a limit, of scipy."""
     steps = speeds * durations.view(-1, *[1] * (speeds.dim() - 1))
@@ -289,18 +282,12 @@ def test_what_a_call_refuses(call: Any, message: str, path: Path, motion: Shapes
         ({"times": [0.0, 1.0, 2.0, 3.0, 4.0], "cyclic": True}, "must be 6 ascending numbers"),
         ({"times": [0.0, 1.0, 1.0, 3.0, 4.0]}, "got 1 at place 2, after 1"),
         ({"preset": "paper"}, "middle of a pair only"),
+        ({"bases": slice(1)}, "two key-frames or more, got 1"),
     ],
 )
 def test_what_a_path_refuses(options: Any, message: str, motion: Shapes) -> None:
     with pytest.raises(ValueError, match=message):
-        Path(motion.bases, motion.faces, **options)
-
-
-def test_too_few_key_frames_and_pairs_alone(motion: Shapes) -> None:
-    with pytest.raises(ValueError, match="two key-frames or more, got 1"):
-        Path(motion.bases[:1], motion.faces)
-    with pytest.raises(ValueError, match="the middle of a pair only"):
-        tm.subdivide(motion.keyframes, motion.faces, bases=motion.bases, smooth=True, preset="paper")
+        Path(motion.bases[options.pop("bases", slice(None))], motion.faces, **options)
 
 
 # ----------------------------------------------------------------------------------------------------- known motions

@@ -215,6 +215,8 @@ def test_linear_sequence(scattered: Shapes) -> None:
         ({"bases": []}, "got 0 bases for 3 key-frames"),
         ({"mu": 0.5}, "mu weighs the similarity of the two shapes"),
         ({"regions": 2}, "the joint space has one"),
+        ({"preset": "paper", "smooth": True}, "the middle of a pair only"),
+        ({"preset": "paper", "n_frames": 9}, "the middle of a pair only"),
     ],
 )
 def test_what_subdivide_refuses(options: dict[str, Any], message: str, scattered: Shapes) -> None:

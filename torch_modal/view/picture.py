@@ -225,12 +225,10 @@ def render_sequence(
     if colors:
         color_bar = _paint(paint, colors, rows, shapes[0].shape[:2], chosen), color_label
     pixels = np.maximum((CELL_PIXELS * half / half.max()).round(), 1).astype(np.int64)
-    images = np.stack(
-        [
-            [draw_shape(x, colors, triangles, half, pixels) for x, colors in zip(*row, strict=True)]
-            for row in zip(placed, paint, strict=True)
-        ]
-    )
+    each = (-1, *shown.shape[2:])
+    painted = zip(placed.reshape(each), paint.reshape(each), strict=True)
+    images = np.stack([draw_shape(x, color, triangles, half, pixels) for x, color in painted])
+    images = images.reshape(*shown.shape[:2], *images.shape[1:])
     moved = placed[0, :, 0] - shown[0, :, 0] @ rotation.T  # of the first row, into the cells
     for label, row in reversed(clouds.items()):
         seen = [row[n] @ rotation.T + move for n, move in zip(chosen, moved, strict=True)]
