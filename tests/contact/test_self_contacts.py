@@ -221,7 +221,7 @@ def test_linear_hand_goes_through_itself_and_its_keyframes_do_not() -> None:
         (lambda x, f: (x * float("nan"), f, None), "NaN or infinite"),
         (lambda x, f: (x, f + 1, None), "do not exist"),
         (lambda x, f: (x[:, :2], f, None), "V, 3"),
-        (lambda x, f: (x, f[:0], None), "there are no faces"),
+        (lambda x, f: (x, f[:0], None), "triangles, at least one"),
         (lambda x, f: (x, f, x[:-1]), "must be equal"),
         (lambda x, f: (x * 0, f, None), "no size"),
     ],
