@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torch_modal.autograd import is_eager
 from torch_modal.elastic.kernels.function import run_operation
-from torch_modal.elastic.kernels.launch import Constants, kernels, launch
+from torch_modal.elastic.kernels.launch import kernels, launch
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.local_rotations import LocalRotations, Trajectory
 from torch_modal.geometry.poisson import Poisson
@@ -23,6 +23,12 @@ class WarpRotations(LocalRotations):
     """
 
     shares: Tensor
+    triangles: Tensor
+    triangle_sides: Tensor
+    triangle_signs: Tensor
+    order: Tensor
+    parents: Tensor
+    pieces: Tensor
 
     def __init__(self, mesh: Connectivity, references: Tensor) -> None:
         super().__init__(mesh, references)
@@ -34,20 +40,16 @@ class WarpRotations(LocalRotations):
         total = areas.new_zeros(self.n_edges).index_add(0, around, areas)
         #: Parts of the sides of each triangle in their edges. *Shape:* ``(3F,)``.
         self.register_buffer("shares", areas / total[around].clamp_min(torch.finfo(total.dtype).tiny), persistent=False)
-        #: The surface as the first argument of kernels.
-        self.constants = Constants(
-            "rotations",
-            "FaceTables",
-            faces=self.faces.int(),
-            sides=around.int().view(-1, 3),
-            order=torch.argsort(depth, stable=True).int(),
-            parent=parent.int(),
-            piece=self.piece.int(),
-            signs=self.side_signs.view(3, -1).T.double().contiguous(),
-            n_vertices=references.shape[1],
-            n_edges=self.n_edges,
-            n_pieces=self.n_pieces,
-        )
+        tables = {
+            "triangles": self.faces,
+            "triangle_sides": around.view(-1, 3),
+            "triangle_signs": self.side_signs.view(3, -1).T.contiguous(),
+            "order": torch.argsort(depth, stable=True),
+            "parents": parent,
+            "pieces": self.piece,
+        }
+        for name, table in tables.items():
+            self.register_buffer(name, table.int(), persistent=False)
 
     def right_hand_side(self, shapes: Tensor, weights: Tensor, poisson: Poisson) -> Tensor:
         """Overrides the base class."""
@@ -58,7 +60,7 @@ class WarpRotations(LocalRotations):
     def signed_quaternions(self, shapes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Quaternions between two shapes, their signs, frames and stretches, ``(B, F, 4), (B, F), (B, F, 12)``."""
         quaternions, areas, frames = (shapes.new_empty(len(shapes), len(self.faces), n) for n in (4, 1, 12))
-        args = [self.constants, shapes, quaternions, areas, frames]
+        args = [self.triangles, shapes.shape[2], shapes, quaternions, areas, frames]
         launch(kernels("rotations").turns, (len(shapes), len(self.faces)), args)
         return quaternions, self.sign(quaternions, areas[..., 0]), frames
 
@@ -68,7 +70,8 @@ class WarpRotations(LocalRotations):
             return super().sign(quaternions, areas)
         rows, weights = quaternions.double().contiguous(), areas.double().contiguous()
         sign, vote = torch.ones_like(weights), weights.new_zeros(len(weights), self.n_pieces)
-        launch(kernels("rotations").sign_votes, (len(weights),), [self.constants, rows, weights, sign, vote])
+        args = [self.order, self.parents, self.pieces, self.n_pieces, rows, weights, sign, vote]
+        launch(kernels("rotations").sign_votes, (len(weights),), args)
         return sign.to(areas)
 
     def edges_along(self, trajectory: Trajectory, which: Tensor, t: Tensor) -> Tensor:
@@ -88,7 +91,7 @@ class _RightHandSide:
     def run(self, kept: list[Any] | None, shapes: Tensor, weights: Tensor) -> tuple[Tensor, ...]:
         rotations, right = self.rotations, torch.zeros_like(shapes[:, 0])
         quaternions, sign, frames = rotations.signed_quaternions(shapes)
-        args = [rotations.constants, quaternions, sign, frames, weights, *self._stiffness(), right]
+        args = [rotations.triangles, shapes.shape[2], quaternions, sign, frames, weights, self._stiffness(), right]
         launch(kernels("rotations").right_hand_side, (len(shapes), len(rotations.faces)), args)
         if kept is not None:
             kept.append(sign)
@@ -97,15 +100,17 @@ class _RightHandSide:
     def back(self, kept: list[Any], grads: Sequence[Tensor], shapes: Tensor, weights: Tensor) -> tuple[Tensor, ...]:
         rotations, gradients = self.rotations, (torch.zeros_like(shapes), torch.zeros_like(weights))
         sign = kept[0] if kept else rotations.signed_quaternions(shapes)[1]
-        args = [rotations.constants, shapes, weights, sign, *self._stiffness(), grads[0], *gradients]
+        args = [rotations.triangles, shapes.shape[2], shapes, weights, sign, self._stiffness(), grads[0], *gradients]
         launch(kernels("rotations_adjoint").right_hand_side, (len(shapes), len(rotations.faces)), args)
         return gradients
 
     def by_torch(self, shapes: Tensor, weights: Tensor) -> tuple[Tensor, ...]:
         return (LocalRotations.right_hand_side(self.rotations, shapes, weights, self.poisson),)
 
-    def _stiffness(self) -> tuple[Tensor, Tensor]:
-        return self.rotations.shares.double(), self.poisson.weights.double()
+    def _stiffness(self) -> Tensor:
+        """Stiffnesses of the sides of each triangle: its parts of the stiffnesses of edges. *Shape:* ``(F, 3)``."""
+        weights = self.poisson.weights.double()[self.rotations.triangle_sides.flatten()]
+        return self.rotations.shares.double() * weights
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +124,7 @@ class _OnTrajectory:
 
     def run(self, kept: list[Any] | None, packed: Tensor, which: Tensor, t: Tensor) -> tuple[Tensor, ...]:
         rotations, total = self.rotations, t.new_zeros(len(t), self.rotations.n_edges, 4)
-        args = [rotations.constants, packed, self._index(packed, which), t, total]
+        args = [*self._tables(), packed, self._index(packed, which), t, total]
         launch(kernels("rotations").trajectory_edges, (len(t), len(rotations.faces)), args)
         sums, areas = total[..., :3], total[..., 3:].clamp_min(torch.finfo(total.dtype).tiny)
         if kept is not None:
@@ -134,14 +139,17 @@ class _OnTrajectory:
         to_sums = grads[0] / areas
         to_total = torch.cat([to_sums, -(sums * to_sums).sum(-1, keepdim=True) / areas], -1)
         to_packed, to_t = torch.zeros_like(packed), torch.zeros_like(t)
-        values = [self.rotations.constants, packed, self._index(packed, which), t, torch.empty_like(to_total)]
-        adjoints = [None, to_packed, None, to_t, to_total]
+        values = [*self._tables(), packed, self._index(packed, which), t, torch.empty_like(to_total)]
+        adjoints = [None, None, None, to_packed, None, to_t, to_total]
         launch(kernels("rotations_adjoint").trajectory_edges, (len(t), packed.shape[1]), values, adjoints)
         return to_packed, None, to_t
 
     def by_torch(self, packed: Tensor, which: Tensor, t: Tensor) -> tuple[Tensor, ...]:
         trajectory = Trajectory._make(packed.movedim(-1, 0).split([3, 3, 3, 3, 6, 6, 6]))
         return (LocalRotations.edges_along(self.rotations, trajectory, which.long(), t).movedim(0, -1),)
+
+    def _tables(self) -> tuple[Any, ...]:
+        return self.rotations.triangle_sides, self.rotations.triangle_signs, self.rotations.n_edges
 
     def _index(self, packed: Tensor, which: Tensor) -> Tensor:
         first = torch.arange(0, len(packed), max(self.n_pairs, 1), device=which.device)

@@ -23,21 +23,6 @@ COSINE = wp.constant(ten(*[(-1) ** k / factorial(2 * k) for k in range(10)]))
 ARC = wp.constant(five(*[(-1) ** k / (2 * k + 1) for k in range(5)]))
 
 
-@wp.struct
-class FaceTables:
-    faces: wp.array[wp.vec3i]
-    sides: wp.array[wp.vec3i]
-    """Edges of the sides of each triangle."""
-    signs: wp.array[vec3]
-    order: wp.array[wp.int32]
-    """Triangles, parents before children."""
-    parent: wp.array[wp.int32]
-    piece: wp.array[wp.int32]
-    n_vertices: int
-    n_edges: int
-    n_pieces: int
-
-
 @wp.func
 def half_rotation(q: vec4):
     """Axis times half the angle: rotations.arc. The axis of a triangle that is a point is zero, of either sign."""
@@ -89,8 +74,8 @@ def quaternion(r: wp.mat33d):
 
 
 @wp.func
-def corners(surface: FaceTables, x: wp.array[vec3], at: int, k: int):
-    f = surface.faces[place(k, 0)]
+def corners(faces: wp.array[wp.vec3i], x: wp.array[vec3], at: int, k: int):
+    f = faces[place(k, 0)]
     return wp.matrix_from_rows(x[place(at, f[0])], x[place(at, f[1])], x[place(at, f[2])])
 
 
@@ -146,17 +131,17 @@ def sides(e1: vec3, e2: vec3, stretch: vec3):
 
 @wp.kernel(enable_backward=False)
 def turns(
-    surface: FaceTables, x: wp.array[vec3], quaternions: wp.array[vec4], areas: wp.array[real],
+    faces: wp.array[wp.vec3i], n_vertices: int, x: wp.array[vec3], quaternions: wp.array[vec4], areas: wp.array[real],
     packed: wp.array[packed_rotation], threads: int,
 ):  # fmt: skip
     """Quaternions between the frames of two shapes, twice both areas, and inputs of :func:`right_hand_side`."""
     i = wp.tid()
     s = i // threads
-    v = 2 * s * surface.n_vertices
-    for k in range(i - s * threads, surface.faces.shape[0], threads):
-        a, here = triangle(corners(surface, x, v, k))
-        b, there = triangle(corners(surface, x, v + surface.n_vertices, k))
-        at = place(s * surface.faces.shape[0], k)
+    v = 2 * s * n_vertices
+    for k in range(i - s * threads, faces.shape[0], threads):
+        a, here = triangle(corners(faces, x, v, k))
+        b, there = triangle(corners(faces, x, v + n_vertices, k))
+        at = place(s * faces.shape[0], k)
         quaternions[at] = quaternion(wp.transpose(b) @ a)
         areas[at] = doubled_area(here) + doubled_area(there)
         packed[at] = wp.matrix_from_rows(a[0], a[1], here, there)
@@ -164,22 +149,25 @@ def turns(
 
 @wp.kernel(enable_backward=False)
 def sign_votes(
-    surface: FaceTables, quaternions: wp.array[vec4], areas: wp.array[real], sign: wp.array[real],
-    vote: wp.array[real],
+    order: wp.array[wp.int32], parents: wp.array[wp.int32], pieces: wp.array[wp.int32], n_pieces: int,
+    quaternions: wp.array[vec4], areas: wp.array[real], sign: wp.array[real], vote: wp.array[real],
 ):  # fmt: skip
-    """Signs passed down the tree, parents before children; then each piece votes. One thread for a sample."""
+    """Signs passed down the tree, in an order of parents before children; then each piece votes.
+
+    One thread for a sample.
+    """
     s = wp.tid()
-    n = surface.order.shape[0]
+    n = order.shape[0]
     for j in range(n):
-        k = surface.order[place(j, 0)]
+        k = order[place(j, 0)]
         at = place(s * n, k)
-        above = place(s * n, surface.parent[place(k, 0)])
+        above = place(s * n, parents[place(k, 0)])
         sign_here = wp.where(wp.dot(quaternions[at], quaternions[above]) < real(0.0), -sign[above], sign[above])
         sign[at] = sign_here
-        p = place(s * surface.n_pieces, surface.piece[place(k, 0)])
+        p = place(s * n_pieces, pieces[place(k, 0)])
         wp.atomic_add(vote, p, areas[at] * sign_here * quaternions[at][0])
     for k in range(n):
-        if vote[place(s * surface.n_pieces, surface.piece[place(k, 0)])] < real(0.0):
+        if vote[place(s * n_pieces, pieces[place(k, 0)])] < real(0.0):
             sign[place(s * n, k)] = -sign[place(s * n, k)]
 
 
@@ -192,53 +180,47 @@ def corner_values(at: packed_rotation, half: vec3, w: wp.vec2d, c: vec3):
 
 
 @wp.func
-def at_sides(surface: FaceTables, shares: wp.array[vec3], stiffness: wp.array[real], k: int):
-    """Parts of the stiffnesses of edges that the sides of a triangle have."""
-    e = surface.sides[place(k, 0)]
-    return wp.cw_mul(shares[place(k, 0)], vec3(stiffness[e[0]], stiffness[e[1]], stiffness[e[2]]))
-
-
-@wp.func
 def work_of(at: packed_rotation, half: vec3, w: wp.vec2d, stiffness: vec3, to: wp.mat33d):
     return wp.ddot(corner_values(at, half, w, stiffness), to)
 
 
 @wp.kernel(enable_backward=False)
 def right_hand_side(
-    surface: FaceTables, quaternions: wp.array[vec4], sign: wp.array[real], between: wp.array[packed_rotation],
-    weights: wp.array[wp.vec2d], shares: wp.array[vec3], stiffness: wp.array[real], right: wp.array[vec3],
-    threads: int,
+    faces: wp.array[wp.vec3i], n_vertices: int, quaternions: wp.array[vec4], sign: wp.array[real],
+    between: wp.array[packed_rotation], weights: wp.array[wp.vec2d], stiffness: wp.array[vec3],
+    right: wp.array[vec3], threads: int,
 ):  # fmt: skip
     """Right-hand side of the Poisson system of the edge vectors between two shapes, from rotations with signs."""
     i = wp.tid()
     s = i // threads
-    for k in range(i - s * threads, surface.faces.shape[0], threads):
-        at = place(s * surface.faces.shape[0], k)
+    for k in range(i - s * threads, faces.shape[0], threads):
+        at = place(s * faces.shape[0], k)
         half = half_rotation(sign[at] * quaternions[at])
-        values = corner_values(between[at], half, weights[s], at_sides(surface, shares, stiffness, k))
+        values = corner_values(between[at], half, weights[s], stiffness[place(k, 0)])
         for j in range(3):
-            wp.atomic_add(right, place(s * surface.n_vertices, surface.faces[place(k, 0)][j]), values[j])
+            wp.atomic_add(right, place(s * n_vertices, faces[place(k, 0)][j]), values[j])
 
 
 @wp.kernel(enable_backward=False)
 def trajectory_edges(
-    surface: FaceTables, trajectory: wp.array[packed_trajectory], which: wp.array[wp.int32], time: wp.array[real],
-    total: wp.array[vec4], threads: int,
+    triangle_sides: wp.array[wp.vec3i], signs: wp.array[wp.vec3i], n_edges: int,
+    trajectory: wp.array[packed_trajectory], which: wp.array[wp.int32], time: wp.array[real], total: wp.array[vec4],
+    threads: int,
 ):  # fmt: skip
     """Sides of triangles on a smooth trajectory, summed on the edges by area, and the areas."""
     i = wp.tid()
     s = i // threads
-    e = s * surface.n_edges
+    e = s * n_edges
     u = time[s]
     a = u * (real(1.0) - u) * (real(1.0) - u)
     b = -u * (real(1.0) - u) * u
-    for k in range(i - s * threads, surface.faces.shape[0], threads):
-        c = trajectory[place(which[s] * surface.faces.shape[0], k)]
+    for k in range(i - s * threads, triangle_sides.shape[0], threads):
+        c = trajectory[place(which[s] * triangle_sides.shape[0], k)]
         size = c[3]
         rotation = wp.quat_to_matrix(about((HALF * u) * c[4]) * about(HALF * (a * c[6] + b * c[8])))
         axes = wp.transpose(rotation) @ wp.matrix_from_rows(c[0], c[1], c[2])
         edge_sides = sides(axes[0], axes[1], size + u * c[5] + a * c[7] + b * c[9])
         area = (real(1.0) - u) * doubled_area(size) + u * doubled_area(size + c[5])
         for j in range(3):
-            x = (area * surface.signs[place(k, 0)][j]) * edge_sides[j]
-            wp.atomic_add(total, place(e, surface.sides[place(k, 0)][j]), vec4(x[0], x[1], x[2], area))
+            x = (area * real(signs[place(k, 0)][j])) * edge_sides[j]
+            wp.atomic_add(total, place(e, triangle_sides[place(k, 0)][j]), vec4(x[0], x[1], x[2], area))

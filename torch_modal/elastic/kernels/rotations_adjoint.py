@@ -7,16 +7,7 @@ Warp warns of its own adjoint, which is not used.
 import warp as wp
 
 from torch_modal.elastic.kernels import procrustes, rotations
-from torch_modal.elastic.kernels.rotations import (
-    FaceTables,
-    at_sides,
-    corners,
-    half_rotation,
-    quaternion,
-    to_corners,
-    triangle,
-    work_of,
-)
+from torch_modal.elastic.kernels.rotations import corners, half_rotation, quaternion, to_corners, triangle, work_of
 from torch_modal.elastic.kernels.types import HALF, TINIEST, place, real, vec3
 
 mean_pose = wp.kernel(procrustes.mean_pose.func, module=__name__)
@@ -47,25 +38,24 @@ def gradients(first: wp.mat33d, second: wp.mat33d, sign: real, w: wp.vec2d, stif
 
 @wp.kernel
 def right_hand_side(
-    surface: FaceTables, shapes: wp.array[vec3], weights: wp.array[wp.vec2d], sign: wp.array[real],
-    shares: wp.array[vec3], stiffness: wp.array[real], to_right: wp.array[vec3], to_shapes: wp.array[vec3],
+    faces: wp.array[wp.vec3i], n_vertices: int, shapes: wp.array[vec3], weights: wp.array[wp.vec2d],
+    sign: wp.array[real], stiffness: wp.array[vec3], to_right: wp.array[vec3], to_shapes: wp.array[vec3],
     to_weights: wp.array[wp.vec2d], threads: int,
 ):  # fmt: skip
     """Adjoint of ``rotations.right_hand_side``: adds the gradients of both shapes and the weights."""
     i = wp.tid()
     s = i // threads
-    v = 2 * s * surface.n_vertices
+    v = 2 * s * n_vertices
     to_w = wp.vec2d()
-    for k in range(i - s * threads, surface.faces.shape[0], threads):
-        a = corners(surface, shapes, v, k)
-        b = corners(surface, shapes, v + surface.n_vertices, k)
-        to = corners(surface, to_right, s * surface.n_vertices, k)
-        sign_here = sign[place(s * surface.faces.shape[0], k)]
-        sides = at_sides(surface, shares, stiffness, k)
-        first, second, to_own = gradients(a, b, sign_here, weights[s], sides, to)
-        to_w += to_own
+    for k in range(i - s * threads, faces.shape[0], threads):
+        a = corners(faces, shapes, v, k)
+        b = corners(faces, shapes, v + n_vertices, k)
+        to = corners(faces, to_right, s * n_vertices, k)
+        sign_here = sign[place(s * faces.shape[0], k)]
+        first, second, to_weights_here = gradients(a, b, sign_here, weights[s], stiffness[place(k, 0)], to)
+        to_w += to_weights_here
         for j in range(3):
-            f = place(v, surface.faces[place(k, 0)][j])
+            f = place(v, faces[place(k, 0)][j])
             wp.atomic_add(to_shapes, f, first[j])
-            wp.atomic_add(to_shapes, f + surface.n_vertices, second[j])
+            wp.atomic_add(to_shapes, f + n_vertices, second[j])
     wp.atomic_add(to_weights, s, to_w)
