@@ -4,7 +4,7 @@ The torch code is the reference of the tests, runs where Warp is not installed, 
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -24,13 +24,13 @@ class KernelPoint(NamedTuple):
 
     value: Tensor
     """But for the constant. *Shape:* ``(B,)``."""
-    gradient: Tensor
+    gradient: Any
     """But for the volume. *Shape:* ``(B, V, 3)``."""
     diagonal: Any
     """Blocks of the convex Hessian's diagonal, packed, if wanted. *Shape:* ``(B, V, 6)``."""
     factors: list[Any]
     """Factors of the term and of the term that rides on it, for each pass. *Shape of each:* ``(B, M, f)``."""
-    normal: Tensor
+    normal: Any
     """Gradient of the volume. *Shape:* ``(B, V, 3)``."""
     moment: Tensor
     """First derivative of the energy in the volume. *Shape:* ``(B,)``."""
@@ -49,37 +49,29 @@ class KernelTerm(nn.Module):
 
     Args:
         part: The term.
-        functions: What the kernels are made from.
-        elements: Those of the term, unless others are given. *Shape:* ``(M, n)``.
+        elements: The elements of the kernels; by default the elements of the term. *Shape:* ``(M, n)``.
     """
 
     elements: Tensor
-    functions: Any
 
-    def __init__(self, summand: AssembledTerm, functions: KernelFunctions, elements: Tensor | None = None) -> None:
+    def __init__(self, part: AssembledTerm, elements: Tensor | None = None) -> None:
         super().__init__()
-        self.part, self.functions = summand, functions
-        self.forward_kernels = self.backward_kernels = None
-        corners = summand.corners.T if elements is None else elements
-        self.register_buffer("elements", corners.int().contiguous(), persistent=False)
-        self.n_elements = len(self.elements)
-        #: Numbers of elements, and of the factors of each.
-        self.size_of_factors = self.n_elements, 3 * functions.n + 1 + (functions.across is not None)
+        self.part, self.n = part, len(part.corners) - 1
+        elements = part.corners.T if elements is None else elements
+        self.register_buffer("elements", elements.int().contiguous(), persistent=False)
+        self.n_elements = len(elements)
 
-    def __getstate__(self) -> dict[str, Any]:  # Warp's functions and kernels are no data
-        return {**self.__dict__, "functions": None, "forward_kernels": None, "backward_kernels": None}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        super().__setstate__(state)
-        self.functions = self.part.term.kernel_functions(len(self.part.corners) - 1)
+    @property
+    def functions(self) -> KernelFunctions:
+        """The functions that kernels are made from; they are no data, and are not stored."""
+        functions = self.part.term.kernel_functions(self.n)
+        assert functions is not None
+        return functions
 
     def launch(self, name: str, dim: int, *arguments: Any, back: bool = False) -> None:
         """Run a kernel over the elements of so many samples."""
-        which: Literal["forward", "backward"] = "backward" if back else "forward"
-        kernels = self.__dict__[f"{which}_kernels"]
-        if kernels is None:
-            kernels = self.__dict__[f"{which}_kernels"] = of_elements(which, self.functions)
-        launch(getattr(kernels, name), (dim, self.n_elements), [self.elements, *arguments])
+        kernel = getattr(of_elements("backward" if back else "forward", self.functions), name)
+        launch(kernel, (dim, self.n_elements), [self.elements, *arguments])
 
     def shapes_to_merge(self, shapes: Tensor) -> tuple[Tensor, Tensor | None]:
         """The shapes that elements are merged of, and all measures together, where their mean counts.
@@ -96,6 +88,8 @@ class KernelTerm(nn.Module):
 class KernelVolume(KernelTerm):
     """The volume of a mesh, by kernels; rest shapes are merged as elements of volume and area.
 
+    Shapes of an open surface are extended by their centre, which cones join to the boundary.
+
     Args:
         part: The term.
         mesh: The mesh.
@@ -106,72 +100,65 @@ class KernelVolume(KernelTerm):
     used: Tensor
 
     def __init__(self, part: AssembledTerm, mesh: Mesh, used: Tensor) -> None:
-        super().__init__(part, volume.kernel_functions(), torch.tensor([[0, 1]]))
+        super().__init__(part, torch.tensor([[0, 1]]))
         chain = torch.tensor(mesh.connectivity.boundary_chain)
-        self.closed = len(chain) == 0
-        #: With those that close the surface, whose last corner is the centre, -1.
-        cones = torch.cat([chain.flip(1), torch.full_like(chain[:, :1], -1)], 1)
+        self.closed, self.n_faces = len(chain) == 0, len(mesh.faces)
+        cones = torch.cat([chain.flip(1), torch.full_like(chain[:, :1], mesh.centre)], 1)
         self.register_buffer("faces", torch.cat([mesh.faces, cones]).int(), persistent=False)
         self.register_buffer("used", used, persistent=False)
 
-    def mean(self, x: Tensor) -> Tensor:
-        """Mean of the vertices of faces. *Shape:* ``(B, V, 3) -> (B, 3)``."""
-        return (x if len(self.used) == x.shape[1] else x[:, self.used]).mean(1)
+    def extend(self, x: Tensor) -> Tensor:
+        """The vertices, and of an open surface the mean of the vertices of faces. *Shape:* ``(B, V, 3)``."""
+        return x if self.closed else torch.cat([x, x[:, self.used].mean(1, keepdim=True)], 1)
 
-    def _spread(self, to_centre: Tensor, to_x: Tensor) -> None:
-        share = (to_centre / len(self.used))[:, None].expand(-1, len(self.used), -1)
-        to_x.index_add_(1, self.used, share)
+    def fold(self, extended: Tensor) -> Tensor:
+        """The adjoint of :meth:`extend`."""
+        if self.closed:
+            return extended
+        share = extended[:, -1:] / len(self.used)
+        return extended[:, :-1].index_add(1, self.used, share.expand(-1, len(self.used), -1))
 
-    def centre(self, x: Tensor) -> Tensor | None:
-        """The origin of volumes: the mean; None, for any vertex, where the surface is closed. *Shape:* ``(B, 3)``."""
-        return None if self.closed else self.mean(x)
-
-    def through_centre(self, normal: Tensor) -> None:
-        """Adds to gradients with a fixed centre those through it; on a closed surface they vanish."""
-        if not self.closed:
-            self._spread(-normal.sum(1), normal)
-
-    def of_faces(self, name: str, x: Tensor, *arguments: Any) -> None:
+    def of_faces(self, name: str, extended: Tensor, *arguments: Any) -> None:
         """Run a kernel over the faces of so many samples."""
         kernel = getattr(make_once(volume.kernels), name)
-        launch(kernel, (len(x), len(self.faces)), [self.faces, x.shape[1], x, self.centre(x), *arguments])
+        launch(kernel, (len(extended), len(self.faces)), [self.faces, extended.shape[1], extended, *arguments])
 
-    def at(self, x: Tensor, normal: Tensor | None = None, area: bool = False) -> Tensor:
+    def at(self, x: Tensor, gradient: bool = False, area: bool = False) -> tuple[Tensor, Tensor | None]:
         """Volumes, and areas if wanted, as the first two components of the second vertex of an element.
 
-        Gradients are added where they are wanted. *Shape:* ``(B, V, 3) -> (B, 2, 3)``.
+        Returns:
+            *Shape:* ``(B, 2, 3)``; the gradients of the volumes if wanted, *shape* ``(B, V, 3)``.
         """
-        sizes = x.new_zeros(len(x), 2, 3)
-        self.of_faces("sizes", x, sizes, int(area), normal)
-        if normal is not None:
-            self.through_centre(normal)
-        return sizes
+        extended, sizes = self.extend(x), x.new_zeros(len(x), 2, 3)
+        normal = torch.zeros_like(extended) if gradient else None
+        self.of_faces("sizes", extended, sizes, self.n_faces if area else 0, normal)
+        return sizes, None if normal is None else self.fold(normal)
 
     def shapes_to_merge(self, shapes: Tensor) -> tuple[Tensor, Tensor | None]:
         """Overrides the base class."""
-        return self.at(shapes, area=True), None
+        return self.at(shapes, area=True)
 
     def back(self, x: Tensor, to_sizes: Tensor, to_normal: Tensor | None, to_x: Tensor) -> None:
         """Adjoint of :meth:`at`: adds the gradient."""
-        if to_normal is not None and not self.closed:
-            to_normal = (to_normal - self.mean(to_normal)[:, None]).contiguous()
-        to_centre = None if self.closed else x.new_zeros(len(x), 3)
-        self.of_faces("sizes_back", x, to_sizes, to_normal, to_x, to_centre)
-        if to_centre is not None:
-            self._spread(to_centre, to_x)
+        extended = self.extend(x)
+        to_extended = to_x if self.closed else torch.zeros_like(extended)
+        to_normal = None if to_normal is None else self.extend(to_normal)
+        self.of_faces("sizes_back", extended, to_sizes, self.n_faces, to_normal, to_extended)
+        if not self.closed:
+            to_x.add_(self.fold(to_extended))
 
 
 def by_kernels(energy: Energy, mesh: Mesh) -> list[KernelTerm | None]:
     """The terms of an energy by kernels; None for one that torch computes: all but one volume, for example."""
-    terms: list[Any] = []
+    terms: list[KernelTerm | None] = []
     for summand in energy.parts:
-        term, n = summand.term, len(summand.corners) - 1
-        if type(term) is Volume and not any(isinstance(each, KernelVolume) for each in terms):
+        n = len(summand.corners) - 1
+        if type(summand.term) is Volume and not any(isinstance(each, KernelVolume) for each in terms):
             terms.append(KernelVolume(summand, mesh, energy.used))
             continue
-        fits = term.anchors is None and 1 <= n <= 3 and bool((summand.corners < mesh.n_vertices).all())
-        functions = term.kernel_functions(n) if fits and not energy.sampled else None
-        terms.append(None if functions is None else KernelTerm(summand, functions))
+        fits = summand.term.anchors is None and 1 <= n <= 3 and bool((summand.corners < mesh.n_vertices).all())
+        serves = fits and not energy.sampled and summand.term.kernel_functions(n) is not None
+        terms.append(KernelTerm(summand) if serves else None)
     return terms
 
 
@@ -181,58 +168,38 @@ class Pass(nn.Module):
     Args:
         term: The number of the term, and the term.
         rider: The same of the other; None where there is none.
-        own: For each edge of that the element that begins with it, or -1. *Shape:* ``(E,)``.
+        own: For each edge the element that begins with it, or -1. *Shape:* ``(E,)``.
     """
 
     elements: Tensor
     own: Tensor | None
 
     def __init__(
-        self, term: tuple[int, KernelTerm], rider: tuple[int, KernelTerm] | None = None, ridden: Tensor | None = None
+        self, term: tuple[int, KernelTerm], rider: tuple[int, KernelTerm] | None = None, own: Tensor | None = None
     ) -> None:
         super().__init__()
         self.number, self.term = term
-        both: Any = (None, None) if rider is None else rider
-        self.other, self.rider = both
+        self.other, self.rider = (None, None) if rider is None else rider
         elements = self.term.elements
-        if self.rider is not None and ridden is not None:
+        if self.rider is not None and own is not None:
             # Where there is no element, all further vertices are the first.
             edges, n = self.rider.elements, elements.shape[1]
             alone = torch.cat([edges, edges[:, :1].expand(-1, n - 2)], 1)
-            elements = torch.where((ridden < 0)[:, None], alone, elements[ridden.clamp_min(0)]).contiguous()
-        self.kernels = None
-        #: Of the factors.
-        self.sizes = [None if part is None else part.size_of_factors for part in (self.term, self.rider)]
+            elements = torch.where((own < 0)[:, None], alone, elements[own.clamp_min(0)]).contiguous()
+        #: Numbers of elements of the term and the rider, and of the factors of each: gradient, and two stiffnesses.
+        self.sizes = [part and (part.n_elements, 3 * part.functions.n + 2) for part in (self.term, self.rider)]
         self.n_elements, self.n_own = len(elements), self.term.n_elements
         self.register_buffer("elements", elements, persistent=False)
-        self.register_buffer("own", None if ridden is None else ridden.int(), persistent=False)
+        self.register_buffer("own", None if own is None else own.int(), persistent=False)
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "kernels": None}
-
-    def _launch(self, name: str, dim: int, *arguments: Any) -> None:
-        if self.kernels is None:
-            rider = None if self.rider is None else self.rider.functions
-            self.kernels = of_elements("convex", self.term.functions, rider)
-        kernel = getattr(self.kernels, name)
-        launch(kernel, (dim, self.n_elements), [self.elements, self.own, self.n_own, *arguments])
-
-    def linearise(
-        self, x: Tensor, records: Sequence[Tensor], arguments: tuple[Any, ...], hessian: bool, volume: tuple[Any, ...]
-    ) -> list[Tensor | None]:
-        """Energy and derivatives are added; arguments of the kernel. The factors, if wanted."""
-        factors = [x.new_empty(len(x), *size) if hessian and size else None for size in self.sizes]
-        others = None if self.other is None else records[self.other]
-        arguments = x.shape[1], x, records[self.number], others, *arguments, *factors, *volume
-        self._launch("linearise", len(x), *arguments)
-        return factors
-
-    def product(self, dim: tuple[int, int], *arguments: Any) -> None:
-        """Products with the convex Hessian are added; arguments of the kernel."""
-        self._launch("product", dim[0], dim[1], *arguments)
+    def launch(self, name: str, dim: int, *arguments: Any) -> None:
+        """Run a kernel over the elements of so many samples."""
+        kernels = of_elements("convex", self.term.functions, self.rider and self.rider.functions)
+        first = self.elements, self.own, self.n_own
+        launch(getattr(kernels, name), (dim, self.n_elements), [*first, *arguments])
 
 
-def _passes(parts: Sequence[Any], n_vertices: int) -> list[Pass]:
+def _passes(parts: Sequence[KernelTerm], n_vertices: int) -> list[Pass]:
     """The terms but the volume in as few passes as may be: edges ride on elements that begin with them."""
     terms = [(i, part) for i, part in enumerate(parts) if not isinstance(part, KernelVolume)]
     ends = torch.tensor([n_vertices, 1])
@@ -257,14 +224,9 @@ class KernelEnergy(nn.Module):
         parts: Its terms.
     """
 
-    parts: list[Any]
-    volume: KernelVolume | None
-    in_passes: list[Pass]
-
     def __init__(self, energy: Energy, parts: Sequence[KernelTerm]) -> None:
         super().__init__()
-        self.energy = energy
-        self.modules_of_parts = nn.ModuleList(parts)
+        self.energy, self.parts = energy, nn.ModuleList(parts)
         #: Numbers of the volume, and of the other terms.
         self.volumes = [i for i, term in enumerate(parts) if isinstance(term, KernelVolume)]
         self.terms = [i for i in range(len(parts)) if i not in self.volumes]
@@ -273,11 +235,7 @@ class KernelEnergy(nn.Module):
         self.unweighed = [i for i in range(len(parts)) if i not in self.weighed]
         #: The terms in passes over elements, each alone or with another that rides on it.
         self.passes: Any = nn.ModuleList(_passes(parts, energy.n_vertices))
-        # Lists of modules are slow to index, and this is done at every evaluation.
-        self.__dict__["parts"] = [*parts]
-        self.__dict__["volume"] = parts[self.volumes[0]] if self.volumes else None
-        self.__dict__["in_passes"] = [*self.passes]
-        #: Whether kernels know the adjoints of all terms.
+        #: True if kernels know the adjoints of all terms.
         self.exact = all(term.functions.exact for term in parts)
 
     @classmethod
@@ -301,46 +259,35 @@ class KernelEnergy(nn.Module):
                 constant = constant + left
         return Reference(tuple(records[i] for i in range(len(self.parts))), constant)
 
-    def _evaluate(
-        self, x: Tensor, to: Reference, gradient: Tensor | None, normal: Tensor | None, diagonal: Tensor | None = None
-    ) -> tuple[Tensor, Tensor, Tensor, list[Any]]:
-        """The energy but for its constant; the volume's moment and stiffness; factors. Derivatives are added."""
-        (energy, inside), factors = x.new_zeros(2, len(x)), []
-        n_references, volume = len(to.constant), self.volume
-        # The volume comes with the first pass.
-        more: tuple[Any, ...] = (None,) * 4 if volume is None else (volume.faces, volume.centre(x), inside, normal)
-        for one in self.in_passes:
-            sums = n_references, energy, gradient, diagonal
-            factors.append(one.linearise(x, to.records, sums, diagonal is not None, more))
-            more = (None,) * 4
-        if volume is None:
-            return energy, inside, inside, factors
-        if normal is not None:
-            volume.through_centre(normal)
-        weight, value = to.records[self.volumes[0]][:, 0].unbind(1)
-        stiffness = 2 * weight
-        if len(x) != n_references:
-            energy, inside = energy.view(-1, n_references), inside.view(-1, n_references)
-        off = inside - value
-        moment = stiffness * off
-        return torch.addcmul(energy, moment, off, value=0.5), moment, stiffness, factors
+    def at(self, x: Tensor, to: Reference, order: int = 2) -> KernelPoint:
+        """Value, gradient from the order of 1 on, and convex Hessian from 2 on. *Shape:* ``(B, V, 3)``.
 
-    def at(self, x: Tensor, to: Reference, hessian: bool = True) -> KernelPoint:
-        """Value and derivatives, of which the Hessian's may be left out. *Shape:* ``(B, V, 3)``."""
-        gradient, normal = x.new_zeros(2, *x.shape).unbind()
-        diagonal = x.new_zeros(*x.shape[:2], 6) if hessian else None
-        energy, moment, stiffness, factors = self._evaluate(x, to, gradient, normal, diagonal)
-        return KernelPoint(energy, gradient, diagonal, factors, normal, moment, stiffness)
+        For the value, there may be several shapes for each reference, which comes round. *Shape:* ``(D * B, V, 3)``.
+        """
+        n, energy, factors = len(to.constant), x.new_zeros(len(x)), []
+        gradient = torch.zeros_like(x) if order > 0 else None
+        diagonal = x.new_zeros(*x.shape[:2], 6) if order > 1 else None
+        for one in self.passes:
+            pass_factors = [x.new_empty(len(x), *size) if order > 1 and size else None for size in one.sizes]
+            records = to.records[one.number], None if one.other is None else to.records[one.other]
+            one.launch("linearise", len(x), x.shape[1], x, *records, n, energy, gradient, diagonal, *pass_factors)
+            factors.append(pass_factors)
+        if not self.volumes:
+            zeros = torch.zeros_like(energy)
+            return KernelPoint(energy, gradient, diagonal, factors, torch.zeros_like(x), zeros, zeros)
+        number = self.volumes[0]
+        sizes, normal = self.parts[number].at(x, order > 0)
+        weight, value = to.records[number][:, 0].unbind(1)
+        stiffness = 2 * weight
+        off = sizes[:, 1, 0].view(len(x) // max(n, 1), n) - value
+        moment = stiffness * off
+        energy = torch.addcmul(energy.view_as(off), moment, off, value=0.5).flatten()
+        return KernelPoint(energy, gradient, diagonal, factors, normal, moment.flatten(), stiffness)
 
     def value_and_gradient(self, x: Tensor, to: Reference) -> tuple[Tensor, Tensor]:
         """The energy but for its constant, and its gradient. *Shape:* ``(B, V, 3) -> (B,), (B, V, 3)``."""
-        gradient, normal = x.new_zeros(2, *x.shape).unbind()
-        energy, moment, *_ = self._evaluate(x, to, gradient, normal)
-        return energy, gradient.addcmul_(moment[:, None, None], normal) if self.volumes else gradient
-
-    def value(self, x: Tensor, to: Reference) -> Tensor:
-        """The energy but for its constant, of one shape or more for each reference. *Shape:* ``(D * B, V, 3)``."""
-        return self._evaluate(x, to, None, None)[0].flatten()
+        at = self.at(x, to, 1)
+        return at.value, at.gradient.addcmul_(at.moment[:, None, None], at.normal)
 
     def product(
         self, factors: Sequence[Any], dim: tuple[int, int], fields: Tensor, start: int, out: Tensor, out_start: int,
@@ -350,8 +297,8 @@ class KernelEnergy(nn.Module):
 
         Fields, results and scalars begin at the given places of their arrays.
         """
-        for one, pass_factors in zip(self.in_passes, factors, strict=True):
-            one.product(dim, fields, start, *pass_factors, out, out_start, scalars, first)
+        for one, pass_factors in zip(self.passes, factors, strict=True):
+            one.launch("product", *dim, fields, start, *pass_factors, out, out_start, scalars, first)
 
     def back(
         self,

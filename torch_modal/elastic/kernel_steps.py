@@ -82,7 +82,7 @@ class KernelProblem:
 
     def value(self, x: Tensor) -> Tensor:
         """*Shape:* ``(B, V, 3) -> (B,)``."""
-        return sum((other.value(x) for other in self.extra), start=self.kernels.value(x, self.to))
+        return sum((other.value(x) for other in self.extra), start=self.kernels.at(x, self.to, 0).value)
 
     def at(self, x: Tensor) -> KernelPoint:
         """*Shape:* ``(B, V, 3)``."""
@@ -209,7 +209,7 @@ class _Relaxation:
         end of the step, and in the records. *Shape:* ``(B, V, 3), (B,), (B,)``.
         """
         to_reached, at, whole = to_x.clone(), step.at, step.x + step.solution
-        there = self.kernels.at(whole, to, hessian=False)
+        there = self.kernels.at(whole, to, 1)
         with torch.enable_grad():
             values = step.solution, at.value, there.value, at.slope(step.solution)
             solution, before, after, slope = leaves = [value.detach().requires_grad_() for value in values]

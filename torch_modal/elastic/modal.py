@@ -283,9 +283,8 @@ class KernelModalEnergy(ModalEnergy):
             term.launch("jacobian", b, *arguments)
         stiffness, value = totals.unbind(1)
         for i in kernels.volumes:
-            normal = torch.zeros_like(x)
-            off = kernels.parts[i].at(x, normal)[:, 1, 0] - to.records[i][:, 0, 1]
-            weight = to.records[i][:, 0, 0]
+            sizes, normal = kernels.parts[i].at(x, gradient=True)
+            weight, off = to.records[i][:, 0, 0], sizes[:, 1, 0] - to.records[i][:, 0, 1]
             last = jacobian[:, -1]
             last[:, :n], last[:, n] = normal.flatten(1) @ self.flat.double().mT, off
             last *= (2 * weight).sqrt()[:, None]
@@ -304,7 +303,8 @@ class KernelModalEnergy(ModalEnergy):
                 curve, local = of_elements("curving", term.functions.n).curved, (term.elements, hessians)
                 launch(curve, (b, len(term.elements)), [*local, n_vertices + 1, blocks, n_blocks, pushed])
             for i in kernels.volumes:
-                kernels.parts[i].of_faces("curved", x, moment, blocks, n_blocks, pushed)
+                extended = kernels.parts[i].extend(x)
+                kernels.parts[i].of_faces("curved", extended, moment, blocks, n_vertices + 1, n_blocks, pushed)
             curved = (blocks.mT @ pushed)[:, :n, :n]
         value = value + to.constant
         return Derivatives(value, gradient, inner, curved, rounding * (stiffest * stiffness).sqrt())
@@ -334,7 +334,7 @@ class _GradientAndValue:
         modal, to = self.modal, _without_constant(records)
         x, moved = modal.shapes(a, base), modal.shapes(grads[0], torch.zeros_like(base))
         to_base, to_records = torch.zeros_like(x), [torch.zeros_like(record) for record in records]
-        modal.kernels.back(x, modal.kernels.at(x, to, hessian=False), to, moved, to_base, to_records)
+        modal.kernels.back(x, modal.kernels.at(x, to, 1), to, moved, to_base, to_records)
         return to_base.flatten(1) @ modal.flat.double().mT, to_base, *to_records
 
     def by_torch(self, a: Tensor, base: Tensor, *records: Tensor) -> tuple[Tensor, ...]:

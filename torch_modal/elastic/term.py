@@ -10,6 +10,7 @@ Kernels of NVIDIA Warp are made from the same functions of one element, written 
 """
 
 import math
+from dataclasses import dataclass
 from functools import cache
 from typing import Any, NamedTuple, no_type_check
 
@@ -78,7 +79,8 @@ class Potential(NamedTuple):
     """From the record to that."""
 
 
-class KernelFunctions(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class KernelFunctions:
     """Functions of Warp that kernels of a term are made from, of one element: a matrix of its edge vectors, by row.
 
     A term of your own has them by :attr:`Term.kernel_measure`.

@@ -109,56 +109,32 @@ def kernels() -> SimpleNamespace:
     real, vec3, module = wp.float64, wp.vec3d, wp.get_module("torch_modal.elastic.kernels.volume")
     half, sixth = wp.constant(real(0.5)), wp.constant(real(1 / 6))
 
-    @wp.func
-    def middle_of(x: wp.array[vec3], v: int, centre: wp.array[vec3], s: int, first: int):
-        """The centre; any vertex where the surface is closed."""
-        result = x[place(v, first)]
-        if centre:
-            result = centre[s]
-        return result
-
-    @wp.func
-    def corner(x: wp.array[vec3], middle: vec3, v: int, last: int):
-        """The last corner of a face: a vertex, or the middle."""
-        result = middle
-        if last >= 0:
-            result = x[place(v, last)]
-        return result
-
-    @wp.func
-    def enclosed(face: wp.vec3i, v: int, x: wp.array[vec3], middle: vec3, normal: wp.array[vec3]):
-        """The volume between a face and the middle; its gradient, with a fixed middle, is added if wanted.
-
-        The faces around a vertex close, so that each gives a sixth of its normal to its corners.
-        """
-        p = x[place(v, face[0])]
-        result = sixth * wp.cross(x[place(v, face[1])] - p, corner(x, middle, v, face[2]) - p)
-        if normal:
-            wp.atomic_add(normal, place(v, face[0]), result)
-            wp.atomic_add(normal, place(v, face[1]), result)
-            if face[2] >= 0:
-                wp.atomic_add(normal, place(v, face[2]), result)
-        return wp.dot(p - middle, result)
-
     @wp.kernel(module=module, enable_backward=False)
     def sizes(
-        faces: wp.array[wp.vec3i], n_vertices: int, x: wp.array[vec3], centre: wp.array[vec3],
-        result: wp.array[vec3], area: int, normal: wp.array[vec3], threads: int,
+        faces: wp.array[wp.vec3i], n_vertices: int, x: wp.array[vec3], result: wp.array[vec3], n_areas: int,
+        normal: wp.array[vec3], threads: int,
     ):  # fmt: skip
-        """The volume, and the area if wanted, of each shape in the second of two; and the volume's gradient."""
+        """The volume, and the area of the first faces, of each shape in the second of two; and the volume's gradient.
+
+        Volumes lie between the faces and a vertex, the centre of an extended shape. The faces around a vertex close, so
+        that each gives a sixth of its normal to its corners.
+        """
         i = wp.tid()
         s = i // threads
         v = s * n_vertices
-        middle = middle_of(x, v, centre, s, faces[0][0])
+        middle = x[place(v, faces[faces.shape[0] - 1][2])]
         inside = real(0.0)
         surface = real(0.0)
         for k in range(i - s * threads, faces.shape[0], threads):
             face = faces[place(k, 0)]
-            inside += enclosed(face, v, x, middle, normal)
-            if area > 0 and face[2] >= 0:
-                p = x[place(v, face[0])]
-                q = x[place(v, face[1])]
-                surface += half * length_of(wp.cross(q - p, x[place(v, face[2])] - p))
+            p = x[place(v, face[0])]
+            doubled = wp.cross(x[place(v, face[1])] - p, x[place(v, face[2])] - p)
+            inside += sixth * wp.dot(p - middle, doubled)
+            if normal:
+                for j in range(3):
+                    wp.atomic_add(normal, place(v, face[j]), sixth * doubled)
+            if k < n_areas:
+                surface += half * length_of(doubled)
         wp.atomic_add(result, 2 * s + 1, vec3(inside, surface, real(0.0)))
 
     @wp.func
@@ -167,45 +143,36 @@ def kernels() -> SimpleNamespace:
 
     @wp.kernel(module=module)
     def sizes_back(
-        faces: wp.array[wp.vec3i], n_vertices: int, x: wp.array[vec3], centre: wp.array[vec3],
-        to_sizes: wp.array[vec3], to_normal: wp.array[vec3], to_x: wp.array[vec3], to_centre: wp.array[vec3],
-        threads: int,
+        faces: wp.array[wp.vec3i], n_vertices: int, x: wp.array[vec3], to_sizes: wp.array[vec3], n_areas: int,
+        to_normal: wp.array[vec3], to_x: wp.array[vec3], threads: int,
     ):  # fmt: skip
         """Adds the gradients; what the normals receive may be left out."""
         i = wp.tid()
         s = i // threads
         v = s * n_vertices
-        middle = middle_of(x, v, centre, s, faces[0][0])
+        middle = x[place(v, faces[faces.shape[0] - 1][2])]
         inside = sixth * to_sizes[2 * s + 1][0]
         surface = to_sizes[2 * s + 1][1]
         to_all = vec3()
-        received = vec3()
         for k in range(i - s * threads, faces.shape[0], threads):
             face = faces[place(k, 0)]
             p = x[place(v, face[0])] - middle
             q = x[place(v, face[1])] - middle
-            r = corner(x, middle, v, face[2]) - middle
+            r = x[place(v, face[2])] - middle
             if to_normal:
-                to_all = to_normal[place(v, face[0])] + to_normal[place(v, face[1])]
-                if face[2] >= 0:
-                    to_all += to_normal[place(v, face[2])]
+                to_all = to_normal[place(v, face[0])] + to_normal[place(v, face[1])] + to_normal[place(v, face[2])]
                 to_all = sixth * to_all
             of_p = inside * wp.cross(q, r) + wp.cross(q - r, to_all)
             of_q = inside * wp.cross(r, p) + wp.cross(r - p, to_all)
             of_r = inside * wp.cross(p, q) + wp.cross(p - q, to_all)
-            if surface != real(0.0) and face[2] >= 0:
+            if surface != real(0.0) and k < n_areas:
                 more_p, more_q, more_r, _0 = wp.grad(area_of)(p, q, r, surface)
                 of_p += more_p
                 of_q += more_q
                 of_r += more_r
             wp.atomic_add(to_x, place(v, face[0]), of_p)
             wp.atomic_add(to_x, place(v, face[1]), of_q)
-            received += of_p + of_q
-            if face[2] >= 0:
-                wp.atomic_add(to_x, place(v, face[2]), of_r)
-                received += of_r
-        if to_centre:
-            wp.atomic_add(to_centre, s, -received)
+            wp.atomic_add(to_x, place(v, face[2]), of_r)
 
     @wp.func
     def columns_of(columns: wp.array[wide], v: int, n_blocks: int, b: int):
@@ -214,30 +181,25 @@ def kernels() -> SimpleNamespace:
 
     @wp.kernel(module=module, enable_backward=False)
     def curved(
-        faces: wp.array[wp.vec3i], n_vertices: int, x: wp.array[vec3], centre: wp.array[vec3], moment: wp.array[real],
-        columns: wp.array[wide], n_blocks: int, out: wp.array[wide], threads: int,
+        faces: wp.array[wp.vec3i], n_vertices: int, x: wp.array[vec3], moment: wp.array[real],
+        columns: wp.array[wide], n_rows: int, n_blocks: int, out: wp.array[wide], threads: int,
     ):  # fmt: skip
         """The volume's Hessian times its moment on columns of vertices and the centre, added."""
         i = wp.tid()
         s = i // threads
         v = s * n_vertices
-        middle = middle_of(x, v, centre, s, faces[0][0])
         for k in range(i - s * threads, faces.shape[0], threads):
             face = faces[place(k, 0)]
-            if face[2] < 0:
-                face[2] = n_vertices
             p = sixth * moment[s] * x[place(v, face[0])]
             q = sixth * moment[s] * x[place(v, face[1])]
-            r = sixth * moment[s] * corner(x, middle, v, faces[place(k, 0)][2])
+            r = sixth * moment[s] * x[place(v, face[2])]
             for b in range(n_blocks):
                 result = wp.skew(r - q) @ columns_of(columns, face[0], n_blocks, b)
                 result += wp.skew(p - r) @ columns_of(columns, face[1], n_blocks, b)
                 result += wp.skew(q - p) @ columns_of(columns, face[2], n_blocks, b)
                 for j in range(3):
-                    to = place(3 * n_blocks * (s * (n_vertices + 1) + face[j]), b)
+                    to = place(3 * n_blocks * (s * n_rows + face[j]), b)
                     for a in range(3):
                         wp.atomic_add(out, place(to, a * n_blocks), result[a])
 
-    return SimpleNamespace(
-        module=module, sizes=sizes, sizes_back=sizes_back, curved=curved, middle_of=middle_of, enclosed=enclosed
-    )
+    return SimpleNamespace(module=module, sizes=sizes, sizes_back=sizes_back, curved=curved)

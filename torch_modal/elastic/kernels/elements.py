@@ -13,14 +13,21 @@ import warp as wp
 from torch_modal.elastic.bend import LEAST_FULLNESS
 from torch_modal.elastic.kernels.types import HALF, block, from_square, place, real, symmetric, vec3, wide
 from torch_modal.elastic.term import KernelFunctions
-from torch_modal.elastic.volume import kernels as volume_kernels
 
 
 @cache
 def _common(f: KernelFunctions) -> SimpleNamespace:
     """Types and functions of elements of as many vertices."""
-    n = f.n
+    n, kind, across_of = f.n, f.potential.kind, f.across
     vectors, corners = wp.types.matrix(shape=(n, 3), dtype=real), wp.types.vector(length=n + 1, dtype=wp.int32)
+
+    @wp.struct
+    class Factors:
+        """Factors of products with the convex Hessian."""
+
+        gradient: vectors
+        along: real
+        across: real
 
     @wp.func
     def edge_vectors(x: wp.array[vec3], at: int, q: corners):
@@ -46,86 +53,42 @@ def _common(f: KernelFunctions) -> SimpleNamespace:
             result += wp.dot(a[j], b[j])
         return result
 
-    @wp.func
-    def pushed(gradient: vectors, along: real, e: vectors):
-        """Forces of an element along its gradient, and their product with its change."""
-        rate = inner(gradient, e)
-        push = along * rate
-        return push * gradient, push * rate
-
-    kind = f.potential.kind
-    if f.across is None:
-
-        @wp.struct
-        class Factors:
-            """Factors of products with the convex Hessian."""
-
-            gradient: vectors
-            along: real
+    if across_of is None:
 
         @wp.func
-        def stiffness(q: kind, slope: real, along: real):
-            return along, real(0.0)
-
-        @wp.func
-        def factors(gradient: vectors, along: real, across: real):
-            h = Factors()
-            h.gradient = gradient
-            h.along = along
-            return h
-
-        @wp.func
-        def product(h: Factors, e: vectors):
-            return pushed(h.gradient, h.along, e)
-
-    else:
-
-        @wp.struct
-        class TenseFactors:
-            gradient: vectors
-            along: real
-            across: real
-
-        @wp.func
-        def stiffness(q: kind, slope: real, along: real):
-            across = f.across(q, slope, along)
-            return along - across, across
-
-        @wp.func
-        def factors(gradient: vectors, along: real, across: real):
-            h = TenseFactors()
-            h.gradient = gradient
-            h.along = along
-            h.across = across
-            return h
-
-        @wp.func
-        def product(h: TenseFactors, e: vectors):
-            forces, form = pushed(h.gradient, h.along, e)
-            return forces + h.across * e, form + h.across * inner(e, e)
-
-        Factors = TenseFactors
-
-    if f.weight is None:
-        return SimpleNamespace(**locals())
-    least, fullness, potential = wp.constant(real(LEAST_FULLNESS)), f.fullness, f.potential
-
-    @wp.func
-    def contribution(e: vectors, pull: real, mean: real):
-        m = f.measure(e)
-        return potential.moments(m, pull * f.weight(e, m, mean))
-
-    if f.uses_mean:
-
-        @wp.func
-        def mean_of(whole: wp.array[real], r: int, n_elements: int):
-            return whole[r] / real(n_elements)
-
-    else:
-
-        @wp.func
-        def mean_of(whole: wp.array[real], r: int, n_elements: int):
+        def across_of(q: kind, slope: real, along: real):
             return real(0.0)
+
+    @wp.func
+    def stiffness(q: kind, slope: real, along: real):
+        """Stiffness along the gradient, beyond what is across, and across."""
+        across = across_of(q, slope, along)
+        return along - across, across
+
+    @wp.func
+    def factors_of(gradient: vectors, along: real, across: real):
+        h = Factors()
+        h.gradient = gradient
+        h.along = along
+        h.across = across
+        return h
+
+    @wp.func
+    def product(h: Factors, e: vectors):
+        """Forces of an element, and their product with its change."""
+        rate = inner(h.gradient, e)
+        push = h.along * rate
+        return push * h.gradient + h.across * e, push * rate + h.across * inner(e, e)
+
+    return SimpleNamespace(**locals())
+
+
+@cache
+def _merging(f: KernelFunctions) -> SimpleNamespace:
+    """Functions that merge the rest shapes of an element."""
+    c, potential, fullness, weight = _common(f), f.potential, f.fullness, f.weight
+    vectors, corners, edge_vectors, sums = c.vectors, c.corners, c.edge_vectors, potential.sums
+    least = wp.constant(real(LEAST_FULLNESS))
 
     if fullness is None:
 
@@ -141,6 +104,29 @@ def _common(f: KernelFunctions) -> SimpleNamespace:
             ratio = wp.min(at_start / wp.max(usual, least), real(1.0))
             result = ratio * ratio * (real(3.0) - real(2.0) * ratio)
         return result
+
+    @wp.func
+    def mean_of(whole: wp.array[real], r: int, n_elements: int):
+        result = real(0.0)
+        if whole:
+            result = whole[r] / real(n_elements)
+        return result
+
+    @wp.func
+    def merge(
+        x: wp.array[vec3], n_vertices: int, q: corners, weights: wp.array[real], whole: wp.array[real],
+        n_elements: int, altitude: real, relative: int, first: int, last: int,
+    ):  # fmt: skip
+        """Sums over rest shapes, and their mean fullness if wanted."""
+        result = sums()
+        usual = real(0.0)
+        for r in range(first, last):
+            e = edge_vectors(x, r * n_vertices, q)
+            m = f.measure(e)
+            result += potential.moments(m, weights[r] * weight(e, m, mean_of(whole, r, n_elements)))
+            if relative > 0:
+                usual += weights[r] * fullness(e, altitude)
+        return result, usual
 
     return SimpleNamespace(**locals())
 
@@ -183,14 +169,14 @@ def _rider(f: KernelFunctions | None) -> SimpleNamespace:
     @wp.func
     def linearise(e: vec3, rests: wp.array[record], at: int, factors: wp.array[Factors], to: int):
         m, g = f.linearise(wp.matrix_from_rows(e))
-        record_of = rests[at]
-        slope = potential.slope(m, record_of)
+        rest = rests[at]
+        slope = potential.slope(m, rest)
         square = symmetric()
         if factors:
-            along, across = c.stiffness(m, slope, real(2.0) * record_of.weight)
-            factors[to] = c.factors(g, along, across)
+            along, across = c.stiffness(m, slope, real(2.0) * rest.weight)
+            factors[to] = c.factors_of(g, along, across)
             square = block(along, g[0], across)
-        return potential.energy(m, record_of), slope * g[0], square
+        return potential.energy(m, rest), slope * g[0], square
 
     @wp.func
     def product(factors: wp.array[Factors], at: int, e: vec3):
@@ -207,27 +193,20 @@ def convex(f: KernelFunctions, rider: KernelFunctions | None) -> SimpleNamespace
     Where both read and write the same vertices, one pass takes two thirds of the time of two. The elements are then
     those of the rider; ``own`` has the number of the term's element, or -1 where there is none.
     """
-    c, potential, module, n = (
-        _common(f),
-        f.potential,
-        _module(f, "convex" if rider is None else f"convex.{rider.name}"),
-        f.n,
-    )
-    corners, edge_vectors, add, Factors, record = c.corners, c.edge_vectors, c.add, c.Factors, potential.record
-    factors_of, stiffness, product_of, other = c.factors, c.stiffness, c.product, _rider(rider)
+    c, potential, other, n = _common(f), f.potential, _rider(rider), f.n
+    vectors, corners, edge_vectors, add = c.vectors, c.corners, c.edge_vectors, c.add
+    Factors, record = c.Factors, potential.record
+    module = _module(f, "convex" if rider is None else f"convex.{rider.name}")
     kernel = _kernel(f, module) if rider is None or rider.exact else _kernel(rider, module)
-    of_faces = volume_kernels()
-    middle_of, enclosed = of_faces.middle_of, of_faces.enclosed
 
     @kernel
     def linearise(
         elements: wp.array[corners], own: wp.array[wp.int32], n_own: int, n_vertices: int, x: wp.array[vec3],
         rests: wp.array[record], others: wp.array[other.record], n_references: int, total: wp.array[real],
         gradient: wp.array[vec3], diagonal: wp.array[symmetric], factors: wp.array[Factors],
-        other_factors: wp.array[other.Factors], faces: wp.array[wp.vec3i], centre: wp.array[vec3],
-        inside: wp.array[real], normal: wp.array[vec3], threads: int,
+        other_factors: wp.array[other.Factors], threads: int,
     ):  # fmt: skip
-        """Energy, gradient, and blocks and factors of the convex Hessian; volume and its gradient.
+        """Energy, gradient, and blocks and factors of the convex Hessian.
 
         What has no arrays is left out. References come round where there are fewer than shapes.
         """
@@ -247,40 +226,33 @@ def convex(f: KernelFunctions, rider: KernelFunctions | None) -> SimpleNamespace
                     e[0], others, place(r * elements.shape[0], k), other_factors, place(s * elements.shape[0], k)
                 )
                 summed += energy
+                received = vectors()
+                g = vectors()
+                along = real(0.0)
+                across = real(0.0)
                 if at >= 0:
                     m, g = f.linearise(e)
                     to = rests[place(r * n_own, at)]
                     summed += potential.energy(m, to)
                     slope = potential.slope(m, to)
                     received = slope * g
-                    received[0] = received[0] + ridden
-                    add(gradient, v, q, received)
                     if diagonal:
-                        along, across = stiffness(m, slope, real(2.0) * to.weight)
-                        whole = g[0]
-                        wp.atomic_add(diagonal, place(v, q[1]), square + block(along, g[0], across))
-                        for j in range(1, wp.static(n)):
-                            whole += g[j]
-                            wp.atomic_add(diagonal, place(v, q[j + 1]), block(along, g[j], across))
-                        wp.atomic_add(diagonal, place(v, q[0]), square + block(along, whole, across))
-                        factors[place(s * n_own, at)] = factors_of(g, along, across)
-                else:
-                    wp.atomic_add(gradient, place(v, q[1]), ridden)
-                    wp.atomic_add(gradient, place(v, q[0]), -ridden)
-                    if diagonal:
-                        wp.atomic_add(diagonal, place(v, q[1]), square)
-                        wp.atomic_add(diagonal, place(v, q[0]), square)
+                        along, across = c.stiffness(m, slope, real(2.0) * to.weight)
+                        factors[place(s * n_own, at)] = c.factors_of(g, along, across)
+                received[0] = received[0] + ridden
+                add(gradient, v, q, received)
+                if diagonal:
+                    whole = g[0]
+                    wp.atomic_add(diagonal, place(v, q[1]), square + block(along, g[0], across))
+                    for j in range(1, wp.static(n)):
+                        whole += g[j]
+                        wp.atomic_add(diagonal, place(v, q[j + 1]), block(along, g[j], across))
+                    wp.atomic_add(diagonal, place(v, q[0]), square + block(along, whole, across))
             else:
                 summed += other.energy(e[0], others, place(r * elements.shape[0], k))
                 if at >= 0:
                     summed += potential.energy(f.measure(e), rests[place(r * n_own, at)])
         wp.atomic_add(total, s, summed)
-        if faces:
-            middle = middle_of(x, v, centre, s, faces[0][0])
-            volume = real(0.0)
-            for k in range(i - s * threads, faces.shape[0], threads):
-                volume += enclosed(faces[place(k, 0)], v, x, middle, normal)
-            wp.atomic_add(inside, s, volume)
 
     @kernel
     def product(
@@ -303,14 +275,12 @@ def convex(f: KernelFunctions, rider: KernelFunctions | None) -> SimpleNamespace
             e = edge_vectors(fields, start + s * n_vertices, q)
             ridden, form = other.product(other_factors, place(s * elements.shape[0], k), e[0])
             total += form
+            received = vectors()
             if at >= 0:
-                received, own_form = product_of(factors[place(s * n_own, at)], e)
-                total += own_form
-                received[0] = received[0] + ridden
-                add(out, out_start + s * n_vertices, q, received)
-            else:
-                wp.atomic_add(out, place(out_start + s * n_vertices, q[1]), ridden)
-                wp.atomic_add(out, place(out_start + s * n_vertices, q[0]), -ridden)
+                received, form = c.product(factors[place(s * n_own, at)], e)
+                total += form
+            received[0] = received[0] + ridden
+            add(out, out_start + s * n_vertices, q, received)
         if scalars:
             wp.atomic_add(scalars, first + s, vec3(real(0.0), real(0.0), total))
 
@@ -375,9 +345,10 @@ def forward(f: KernelFunctions) -> SimpleNamespace:
 def _merge_kernel(f: KernelFunctions, module: "wp.Module") -> dict[str, "wp.Kernel"]:
     """Kernels that merge the rest shapes of a term into records (Eq. 8), where it has weights for them."""
     c, potential = _common(f), f.potential
-    corners, edge_vectors, record, sums = c.corners, c.edge_vectors, potential.record, potential.sums
+    corners, edge_vectors, record = c.corners, c.edge_vectors, potential.record
     kernel = _kernel(f, module)
-    fullness, softness, contribution, mean_of = c.fullness, c.softness, c.contribution, c.mean_of
+    merging = _merging(f)
+    fullness, softness, merge_rests = merging.fullness, merging.softness, merging.merge
 
     @kernel
     def merge(
@@ -391,18 +362,23 @@ def _merge_kernel(f: KernelFunctions, module: "wp.Module") -> dict[str, "wp.Kern
         left = real(0.0)
         for k in range(i - s * threads, elements.shape[0], threads):
             q = elements[place(k, 0)]
-            moments_sum = sums()
-            usual = real(0.0)
-            for r in range(s * n_shapes, (s + 1) * n_shapes):
-                e = edge_vectors(x, r * n_vertices, q)
-                moments_sum += contribution(e, weights[r], mean_of(whole, r, elements.shape[0]))
-                if relative > 0:
-                    usual += weights[r] * fullness(e, altitude)
+            moments, usual = merge_rests(
+                x,
+                n_vertices,
+                q,
+                weights,
+                whole,
+                elements.shape[0],
+                altitude,
+                relative,
+                s * n_shapes,
+                (s + 1) * n_shapes,
+            )
             factor = stiffness[place(s * n_stiffness, wp.min(k, n_stiffness - 1))]
             if start:
                 factor *= softness(fullness(edge_vectors(start, s * n_vertices, q), altitude), usual, relative)
-            to = potential.merge_rests(moments_sum, factor)
-            left += potential.left(moments_sum, factor, to)
+            to = potential.merge_rests(moments, factor)
+            left += potential.left(moments, factor, to)
             out[place(s * elements.shape[0], k)] = to
         wp.atomic_add(constant, s, left)
 
@@ -428,7 +404,8 @@ def _merge_back_kernel(f: KernelFunctions, module: "wp.Module") -> "wp.Kernel":
     """The adjoint of ``merge``."""
     c, potential = _common(f), f.potential
     corners, edge_vectors, add, sums = c.corners, c.edge_vectors, c.add, potential.sums
-    fullness, softness, contribution, mean_of = c.fullness, c.softness, c.contribution, c.mean_of
+    merging = _merging(f)
+    fullness, softness, mean_of, merge_rests = merging.fullness, merging.softness, merging.mean_of, merging.merge
     pack, row, weight_of = potential.pack, potential.row, f.weight
 
     @wp.func
@@ -451,13 +428,18 @@ def _merge_back_kernel(f: KernelFunctions, module: "wp.Module") -> "wp.Kernel":
         s = i // threads
         for k in range(i - s * threads, elements.shape[0], threads):
             q = elements[place(k, 0)]
-            moments_sum = sums()
-            usual = real(0.0)
-            for r in range(s * n_shapes, (s + 1) * n_shapes):
-                e = edge_vectors(x, r * n_vertices, q)
-                moments_sum += contribution(e, weights[r], mean_of(whole, r, elements.shape[0]))
-                if relative > 0:
-                    usual += weights[r] * fullness(e, altitude)
+            moments, usual = merge_rests(
+                x,
+                n_vertices,
+                q,
+                weights,
+                whole,
+                elements.shape[0],
+                altitude,
+                relative,
+                s * n_shapes,
+                (s + 1) * n_shapes,
+            )
             at = place(s * n_stiffness, wp.min(k, n_stiffness - 1))
             at_start = real(1.0)
             soft = real(1.0)
@@ -465,7 +447,7 @@ def _merge_back_kernel(f: KernelFunctions, module: "wp.Module") -> "wp.Kernel":
                 at_start = fullness(edge_vectors(start, s * n_vertices, q), altitude)
                 soft = softness(at_start, usual, relative)
             received = to_out[place(s * elements.shape[0], k)]
-            to_sums, to_factor, _0 = wp.grad(of_record)(moments_sum, soft * stiffness[at], received)
+            to_sums, to_factor, _0 = wp.grad(of_record)(moments, soft * stiffness[at], received)
             wp.atomic_add(to_stiffness, at, soft * to_factor)
             to_usual = real(0.0)
             if start:
