@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.func import jacfwd
 
 from torch_modal.elastic import minimise as minimisation
+from torch_modal.elastic.backend import WarpBackend
 from torch_modal.elastic.bend import Bend
 from torch_modal.elastic.gauss_newton import GaussNewtonStep
 from torch_modal.elastic.minimise import Solution, Status, minimise
@@ -31,6 +32,32 @@ def test_minimum_of_rosenbrock_is_found() -> None:
     assert solution.converged.all()
     assert solution.n_steps[2] == 0, "it started at the solution"
     assert (solution.gradient_norm[:2] <= 3e-7).all()
+
+
+def test_a_step_by_the_kernel_is_that_of_torch() -> None:
+    """Samples that converge, go uphill, have tried the shortest step, had converged before, and bend downwards."""
+    pytest.importorskip("warp")
+    generator, n = torch.Generator().manual_seed(0), 7
+
+    def random(*shape: int) -> Tensor:
+        return torch.randn(*shape, dtype=torch.float64, generator=generator)
+
+    half = random(5, n, n)
+    inverse = half @ half.mT + torch.eye(n, dtype=torch.float64)
+    length = torch.tensor([1, 1, minimisation.SHORTEST, 0, 1], dtype=torch.float64)
+    value = torch.tensor([0.5, 2.0, 2.0, 0.5, 0.5], dtype=torch.float64)
+    a, gradient = random(5, n, 1), random(5, n, 1)
+    there = a - length[:, None, None] * (inverse @ gradient)
+    slope = 0.1 * gradient + 0.1 * random(5, n, 1)
+    slope[4] = gradient[4] + 0.1 * (a - there)[4]
+    norm = gradient.norm(dim=(1, 2))
+    rest = norm, inverse, length, 0.5 * norm, torch.zeros(5).double(), torch.arange(5), None
+    state = minimisation.State(torch.arange(5), a, there, torch.ones(5).double(), gradient, *rest)
+    own = state._replace(**{k: x.clone() for k, x in state._asdict().items() if isinstance(x, Tensor)})
+    wanted = minimisation.bfgs_update(state, value, slope.squeeze(-1))
+    found = WarpBackend().quasi_newton(own, value, slope.squeeze(-1).clone())
+    for got, expected in zip(found[:-1], wanted[:-1], strict=True):
+        torch.testing.assert_close(got, expected, rtol=1e-10, atol=1e-10)
 
 
 class Waves(LeastSquares):

@@ -19,8 +19,10 @@ from torch_modal.elastic.energy import Energy
 from torch_modal.elastic.kernel_energy import KernelEnergy
 from torch_modal.elastic.kernel_steps import KernelFineEnergy
 from torch_modal.elastic.kernels.launch import kernels, launch, load_kernels
+from torch_modal.elastic.minimise import bfgs_update
 from torch_modal.elastic.modal import KernelModalEnergy, ModalEnergy
 from torch_modal.elastic.procrustes import mean_pose as mean_pose_by_kernel
+from torch_modal.elastic.quasi_newton import update
 from torch_modal.elastic.rotations import WarpRotations
 from torch_modal.elastic.steps import FineEnergy
 from torch_modal.elastic.term import Mesh, Term
@@ -37,7 +39,7 @@ class TorchBackend:
     that it is faster at, and returns to these where it cannot serve; both give the same numbers, up to rounding.
     """
 
-    mean_pose = staticmethod(mean_pose)
+    mean_pose, quasi_newton = staticmethod(mean_pose), staticmethod(bfgs_update)
 
     def load(self) -> None:
         """Load what takes long, so that the first call does not wait for it."""
@@ -70,7 +72,7 @@ class WarpBackend(TorchBackend):
         MissingPackageError: Warp is not installed.
     """
 
-    mean_pose = staticmethod(mean_pose_by_kernel)
+    mean_pose, quasi_newton = staticmethod(mean_pose_by_kernel), staticmethod(update)
 
     def __init__(self) -> None:
         if importlib.util.find_spec("warp") is None:

@@ -14,7 +14,7 @@ from torch_modal.elastic.bend import NEEDLE, NEEDLE_OF_STEPS
 from torch_modal.elastic.energy import AssembledTerm, Energy, Reference, RestShapes
 from torch_modal.elastic.kernels.function import run_by_torch, run_operation
 from torch_modal.elastic.kernels.launch import launch, make_once, of_elements
-from torch_modal.elastic.term import KernelFunctions, Mesh
+from torch_modal.elastic.term import Mesh
 from torch_modal.elastic.volume import Volume
 from torch_modal.geometry.vectors import inverse
 
@@ -53,20 +53,20 @@ class KernelTerm(nn.Module):
     """
 
     elements: Tensor
+    term: Any
 
     def __init__(self, part: AssembledTerm, elements: Tensor | None = None) -> None:
         super().__init__()
         self.part, self.n = part, len(part.corners) - 1
+        self.__dict__["term"] = part.term  # not registered here: the layer owns it
         elements = part.corners.T if elements is None else elements
         self.register_buffer("elements", elements.int().contiguous(), persistent=False)
         self.n_elements = len(elements)
 
     @property
-    def functions(self) -> KernelFunctions:
+    def functions(self) -> Any:
         """The functions that kernels are made from; they are no data, and are not stored."""
-        functions = self.part.term.kernel_functions(self.n)
-        assert functions is not None
-        return functions
+        return self.term.kernel_functions(self.n)
 
     def launch(self, name: str, dim: int, *arguments: Any, back: bool = False) -> None:
         """Run a kernel over the elements of so many samples."""

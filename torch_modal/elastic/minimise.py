@@ -138,7 +138,7 @@ def minimise(
     """
     best, norm, n_steps = a.clone(), a.new_zeros(len(a)), torch.zeros(len(a), dtype=torch.int64, device=a.device)
     reached, start, goal, below_rounding = norm, norm, norm, norm > 0
-    rows = torch.arange(len(a), device=a.device)
+    rows, update = torch.arange(len(a), device=a.device), getattr(energy, "quasi_newton", bfgs_update)
     for used in range(0, max(max_steps, 1), MOST_EVALUATIONS):
         some = placement if len(rows) == len(a) else trees.rows(placement, rows)
         derivatives = energy.derivatives(best[rows], some, second_order=False)
@@ -171,7 +171,7 @@ def minimise(
             if 2 * n_active <= len(state.row):
                 _put(whole, state)
                 state = trees.rows(state, torch.nonzero(state.length).flatten())
-            state = bfgs_update(state, *energy.value_and_gradient(state.there.squeeze(-1), state.placement))
+            state = update(state, *energy.value_and_gradient(state.there.squeeze(-1), state.placement))
         _put(whole, state)
         # A Hessian at the new place may help the others, if they have moved.
         rows = rows[(norm[rows] > goal[rows]) & ~below_rounding[rows] & (n_steps[rows] > before)]

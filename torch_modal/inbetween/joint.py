@@ -53,6 +53,8 @@ class JointSpace(nn.Module):
             parts.append(backend.modal_energy(energy, mesh, columns))
         self.parts: Any = nn.ModuleList(parts)
         self.coarse, self.basis, self.anchor = coarse, basis, anchor
+        #: Steps of the minimisation.
+        self.quasi_newton = backend.quasi_newton
         self.__dict__["fine"] = fine  # not registered here: it belongs to the solver
 
     # ----------------------------------------------------------------------------------------------- the affine space

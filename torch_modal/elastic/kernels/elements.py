@@ -18,7 +18,7 @@ from torch_modal.elastic.term import KernelFunctions
 @cache
 def _common(f: KernelFunctions) -> SimpleNamespace:
     """Types and functions of elements of as many vertices."""
-    n, kind, across_of = f.n, f.potential.kind, f.across
+    n, kind, across_of, tense = f.n, f.potential.kind, f.across, f.across is not None
     vectors, corners = wp.types.matrix(shape=(n, 3), dtype=real), wp.types.vector(length=n + 1, dtype=wp.int32)
 
     @wp.struct
@@ -53,7 +53,7 @@ def _common(f: KernelFunctions) -> SimpleNamespace:
             result += wp.dot(a[j], b[j])
         return result
 
-    if across_of is None:
+    if not tense:
 
         @wp.func
         def across_of(q: kind, slope: real, along: real):
@@ -78,7 +78,12 @@ def _common(f: KernelFunctions) -> SimpleNamespace:
         """Forces of an element, and their product with its change."""
         rate = inner(h.gradient, e)
         push = h.along * rate
-        return push * h.gradient + h.across * e, push * rate + h.across * inner(e, e)
+        forces = push * h.gradient
+        form = push * rate
+        if wp.static(tense):
+            forces += h.across * e
+            form += h.across * inner(e, e)
+        return forces, form
 
     return SimpleNamespace(**locals())
 

@@ -41,7 +41,7 @@ def of_elements(kind: Literal["convex", "forward", "backward", "curving"], *argu
 def load_kernels() -> None:
     """Load the kernels of in-betweens without gradients for the CPU, so that the first call does not wait for them."""
     with _LOADING:
-        elements, *_ = map(kernels, ("elements", "procrustes", "rotations", "steps"))
+        elements, *_ = map(kernels, ("elements", "procrustes", "rotations", "quasi_newton", "steps"))
         shell_functions = bend.kernel_functions(), stretch.kernel_functions()
         for functions in (*shell_functions, volume.kernel_functions()):
             elements.forward(functions)
