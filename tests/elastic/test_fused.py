@@ -26,7 +26,6 @@ from torch_modal.elastic.energy import Energy, Reference, RestShapes
 from torch_modal.elastic.kernel_energy import KernelEnergy, _MergeRests
 from torch_modal.elastic.kernel_steps import KernelFineEnergy, KernelProblem, _Relaxation
 from torch_modal.elastic.kernels import launch
-from torch_modal.elastic.kernels.function import run_operation as fused_operation
 from torch_modal.elastic.modal import KernelModalEnergy, ModalEnergy, Placement
 from torch_modal.elastic.procrustes import mean_pose
 from torch_modal.elastic.rotations import WarpRotations
@@ -80,7 +79,7 @@ class Case:
 
     def by_warp(self, x: Tensor, *rests: Tensor) -> Tensor:
         to = self.fused.reference(self.rests(*rests))
-        return fused_operation(_Relaxation(self.fused, 2, 4), x, *to.records)[0]
+        return _Relaxation(self.fused, 2, 4)(x, *to.records)[0]
 
 
 @pytest.fixture(params=["closed", "open", "flat"])
@@ -227,7 +226,7 @@ class TestModal:
             torch.testing.assert_close(as_stiff, operation.by_torch(rests.flip(1), alone, case.given[5])[0])
         hard, softened = (operation.by_torch(*given, *more)[0][..., 0] for more in ((), (start,)))
         assert float((softened / hard)[hard > 0].min()) < 0.1
-        run, truth = lambda *x: fused_operation(operation, *x)[0], lambda *x: operation.by_torch(*x)[0]
+        run, truth = lambda *x: operation(*x)[0], lambda *x: operation.by_torch(*x)[0]
         assert_kernels(run, truth, [*given, start], 1e-12 * float(hard.max()), 1e-11)
 
     @torch.no_grad()
@@ -479,13 +478,15 @@ class TestLayers:
 
 def test_what_a_kernel_would_read_wrongly_is_refused() -> None:
     """Indices have 32 bits: beyond, they would wrap."""
-    x, kernel = torch.zeros(4, 3, dtype=DOUBLE), launch.kernels("steps").inner
-    for wrong in (x.float(), torch.zeros(3, 2, 4, dtype=DOUBLE).mT):
-        with pytest.raises(RuntimeError, match=r"contiguous tensor of torch\.float64"):
-            launch.launch(kernel, (1, 2), [wrong, x, 4, torch.zeros(1, 3, dtype=DOUBLE)])
+    faces, x = torch.arange(3).int(), torch.zeros(6, 3, dtype=DOUBLE)
+    results = [torch.zeros(n, dtype=DOUBLE) for n in (4, 1, 12)]
     huge = torch.empty(2**31, 3, dtype=DOUBLE, device="meta")
-    with pytest.raises(ValueError, match=r"2147483648 entries.* fewer samples"):
-        launch.launch(kernel, (1, 2), [x, huge, 4, x[:1]])
+    cases = [
+        (each, RuntimeError, r"contiguous tensor of torch\.float64") for each in (x.float(), x[:, :1].expand(6, 3))
+    ]
+    for wrong, error, message in (*cases, (huge, ValueError, r"2147483648 entries.* fewer samples")):
+        with pytest.raises(error, match=message):
+            launch.launch(launch.kernels("rotations").turns, (1, 1), [faces, 3, wrong, *results])
 
 
 class TestBackend:
@@ -544,7 +545,7 @@ def test_what_warp_says_of_itself_is_left_alone() -> None:
         warnings.simplefilter("error")
         before = warp.config.log_level
         launch._load.cache_clear()
-        launch._load(launch.kernels("steps").inner.module, torch.device("cpu"))
+        launch._load(launch.kernels("steps").begin.module, torch.device("cpu"))
         assert warp.config.log_level == before
 
 
@@ -557,11 +558,11 @@ def test_kernels_are_loaded_for_the_device_of_their_launch_alone(monkeypatch: py
     monkeypatch.setattr(launch._COMMANDS, "known", {})
     launch._load.cache_clear()
     try:
-        module, x = launch.kernels("steps"), torch.ones(1, 3, dtype=DOUBLE)
+        module, x = launch.kernels("rotations"), torch.ones(6, 3, dtype=DOUBLE)
         launch.kernels("rotations_adjoint")
         assert not asked
         for _ in range(2):
-            launch.launch(module.inner, (1, 1), [x, x, 1, torch.zeros(1, 3, dtype=DOUBLE)])
-        assert asked == [("torch_modal.elastic.kernels.steps", "cpu")]
+            launch.launch(module.turns, (1, 1), [torch.arange(3).int(), 3, x, *torch.ones(3, 12, dtype=DOUBLE)])
+        assert asked == [("torch_modal.elastic.kernels.rotations", "cpu")]
     finally:
         launch._load.cache_clear()

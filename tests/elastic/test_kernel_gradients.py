@@ -18,7 +18,6 @@ from torch_modal.elastic.bend import Bend
 from torch_modal.elastic.energy import Energy, Reference, RestShapes
 from torch_modal.elastic.kernel_energy import KernelEnergy, _MergeRests
 from torch_modal.elastic.kernel_steps import _Relaxation
-from torch_modal.elastic.kernels.function import run_operation
 from torch_modal.elastic.modal import KernelModalEnergy, _GradientAndValue
 from torch_modal.elastic.procrustes import mean_pose
 from torch_modal.elastic.rotations import WarpRotations
@@ -154,13 +153,13 @@ def test_merged_rest_shapes(elastic: Elastic, relative: bool) -> None:
         start = [] if elastic.kernels.parts[i].functions.fullness is None else [elastic.start]
         given += [elastic.stiffness[i], *start]
         sizes = operation.by_torch(*given)[0].abs().amax((0, 1))
-        assert_differences(lambda *x, own=operation, sizes=sizes: run_operation(own, *x)[0] / sizes, given)
+        assert_differences(lambda *x, own=operation, sizes=sizes: own(*x)[0] / sizes, given)
 
 
 def test_gradients_in_amplitudes(elastic: Elastic) -> None:
     modal = KernelModalEnergy(elastic.kernels, noise(4, *elastic.start.shape[1:]))
     given = [0.1 * noise(2, 4), elastic.shapes.mean(1), *elastic.reference().records]
-    assert_differences(lambda *x: run_operation(_GradientAndValue(modal), *x)[0], given)
+    assert_differences(lambda *x: _GradientAndValue(modal)(*x)[0], given)
     placement, a, direction, h = modal.place(given[1], elastic.reference()), given[0], noise(2, 4, seed=5), 1e-4
     with torch.no_grad():
         derivatives = modal.derivatives(a, placement)
@@ -175,7 +174,7 @@ def test_gradients_of_steps_of_all_vertices(elastic: Elastic) -> None:
 
     def run(x: Tensor, *factors: Tensor) -> Tensor:
         own = [factor * record for factor, record in zip(factors, records, strict=True)]
-        return run_operation(_Relaxation(elastic.kernels, 2, 3), x, *own)[0]
+        return _Relaxation(elastic.kernels, 2, 3)(x, *own)[0]
 
     assert_differences(run, [x, *map(torch.ones_like, records)], to=1e-7)
 

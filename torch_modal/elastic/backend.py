@@ -85,10 +85,11 @@ class WarpBackend(TorchBackend):
         if importlib.util.find_spec("warp") is None:
             return False
         try:
-            one, total = torch.ones(1, 3, dtype=torch.float64), torch.zeros(1, 3, dtype=torch.float64)
-            launch(kernels("steps").inner, (1, 1), [one, one, 1, total])
-            if total[0, 0] != 3:
-                raise RuntimeError(f"a kernel gave {float(total[0, 0])} for 3")
+            shapes = torch.eye(3, dtype=torch.float64).expand(2, 3, 3).contiguous()
+            results = [shapes.new_empty(1, 1, n) for n in (4, 1, 12)]
+            launch(kernels("rotations").turns, (1, 1), [torch.arange(3).int(), 3, shapes, *results])
+            if abs(results[0][0, 0, 0] - 1) > 1e-6:
+                raise RuntimeError(f"a kernel gave a turn of {results[0].tolist()} for none")
         except Exception as error:  # whatever keeps Warp from compiling: torch does the same, only slower
             warnings.warn(f"Warp is installed, but its kernels cannot be used, so torch is: {error}", stacklevel=2)
             return False

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch_modal.elastic import volume
 from torch_modal.elastic.bend import NEEDLE, NEEDLE_OF_STEPS
 from torch_modal.elastic.energy import AssembledTerm, Energy, Reference, RestShapes
-from torch_modal.elastic.kernels.function import run_by_torch, run_operation
+from torch_modal.elastic.kernels.function import Operation
 from torch_modal.elastic.kernels.launch import launch, make_once, of_elements
 from torch_modal.elastic.term import Mesh
 from torch_modal.elastic.volume import Volume
@@ -250,11 +250,11 @@ class KernelEnergy(nn.Module):
         """Merge rest shapes into one reference (Eq. 8); arguments as :meth:`RestShapes.reference`."""
         records: dict[int, Tensor] = {}
         constant = rests.weights.new_zeros(len(rests.weights), dtype=torch.float64)
-        for numbers, run in ((self.weighed, run_operation), (self.unweighed, run_by_torch)):
+        for numbers, by_kernels in ((self.weighed, True), (self.unweighed, False)):
             if numbers:
                 tensors = [rests.shapes, rests.weights, *(rests.stiffness[i] for i in numbers)]
                 tensors += [] if start is None else [start]
-                *merged, left = run(_MergeRests(self, numbers, relative), *tensors)
+                *merged, left = _MergeRests(self, numbers, relative)(*tensors, kernels=by_kernels)
                 records.update(zip(numbers, merged, strict=True))
                 constant = constant + left
         return Reference(tuple(records[i] for i in range(len(self.parts))), constant)
@@ -347,7 +347,7 @@ class KernelEnergy(nn.Module):
         to_records[i].add_(torch.stack([to_weight, -to_volume], -1)[:, None])
 
 
-class _MergeRests:
+class _MergeRests(Operation):
     """Rest shapes, weights, the stiffnesses of some terms, and perhaps a start as records, and what remains."""
 
     def __init__(self, energy: KernelEnergy, numbers: Sequence[int], relative: bool) -> None:

@@ -1,7 +1,7 @@
 """Steps of all vertices by kernels, tested against those in torch."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -10,7 +10,7 @@ from torch_modal import trees
 from torch_modal.autograd import is_eager
 from torch_modal.elastic.energy import Energy, Reference, RestShapes
 from torch_modal.elastic.kernel_energy import KernelEnergy, KernelPoint, by_kernels
-from torch_modal.elastic.kernels.function import run_operation
+from torch_modal.elastic.kernels.function import Operation
 from torch_modal.elastic.kernels.launch import kernels, launch
 from torch_modal.elastic.steps import (
     FineEnergy,
@@ -31,9 +31,8 @@ class KernelFineEnergy(FineEnergy):
         super().__init__(mesh, terms)
         parts = by_kernels(self.energy, mesh)
         #: Numbers of the terms that kernels serve, and of the others.
-        self.own, self.others = (
-            [i for i, one in enumerate(parts) if (one is not None) is kind] for kind in (True, False)
-        )
+        self.own = [i for i, part in enumerate(parts) if part is not None]
+        self.others = [i for i, part in enumerate(parts) if part is None]
         shell = Energy(mesh, [terms[i] for i in self.own]) if self.others else self.energy
         self.further = Energy(mesh, [terms[i] for i in self.others]) if self.others else None
         self.kernels = KernelEnergy(shell, [term for term in parts if term is not None])
@@ -53,7 +52,7 @@ class KernelFineEnergy(FineEnergy):
             moved = x
             for n_steps, n_products in stages:
                 if n_steps:
-                    moved = run_operation(_Relaxation(self.kernels, n_steps, n_products), moved, *to.records)[0]
+                    moved = _Relaxation(self.kernels, n_steps, n_products)(moved, *to.records)[0]
             return moved.to(x)
         with torch.no_grad():
             return descend_in_stages(KernelProblem(self.kernels, to, others), x.double().contiguous(), stages).to(x)
@@ -126,27 +125,8 @@ class KernelProblem:
         return results[2], kept, scalars
 
 
-class Taken(NamedTuple):
-    """A step of :func:`torch_modal.elastic.steps.descend`."""
-
-    x: Tensor
-    """The shape before the step. *Shape:* ``(B, V, 3)``."""
-    at: KernelPoint
-    """The energy there, its diagonal inverted."""
-    solution: Tensor
-    """The whole step. *Shape:* ``(B, V, 3)``."""
-    length: Tensor
-    """*Shape:* ``(B,)``."""
-    kept: Tensor
-    """Fields of all iterations of :meth:`KernelProblem.newton_direction`."""
-    scalars: Tensor
-    """Scalars of all iterations."""
-
-
-class _Relaxation:
+class _Relaxation(Operation):
     """Steps of all vertices from shapes, towards the records of a reference."""
-
-    n_results = n_differentiable = 1
 
     def __init__(self, kernels: KernelEnergy, n_steps: int, n_products: int) -> None:
         self.kernels, self.n_steps, self.n_products = kernels, n_steps, n_products
@@ -164,26 +144,31 @@ class _Relaxation:
             self.run(kept, x, *records)
         to_x, to, to_records = grads[0], self._reference(records), [torch.zeros_like(record) for record in records]
         for step in reversed(kept):
-            to_x = self._step_back(Taken(*step), to, to_x, to_records)
+            to_x = self._step_back(step, to, to_x, to_records)
         return to_x, *to_records
 
     def by_torch(self, x: Tensor, *records: Tensor) -> tuple[Tensor, ...]:
         terms = TermsTowards(self.kernels.energy, self._reference(records).transpose())
         return (descend(SumOfEnergies([terms]), x, self.n_steps, self.n_products),)
 
-    def _step_back(self, step: Taken, to: Reference, to_reached: Tensor, to_records: Sequence[Tensor]) -> Tensor:
+    def _step_back(self, step: Any, to: Reference, to_reached: Tensor, to_records: Sequence[Tensor]) -> Tensor:
         """Gradient at the start of a step from the gradient at its end; gradients of the records are added.
 
-        *Shape:* ``(B, V, 3)``.
+        Args:
+            step: What :func:`descend` adds to its list: the start, the energy there, the whole step, its length, and
+                the fields and scalars of :meth:`KernelProblem.newton_direction`.
+            to: The reference.
+            to_reached: Gradient at the end. *Shape:* ``(B, V, 3)``.
+            to_records: Are added to.
         """
         x, at, solution, length, kept, scalars = step
         to_x, to_solution, to_energy, to_slope = to_reached.clone(), to_reached, None, None
         if bool((length < 1).any()):
-            to_solution, to_energy, to_slope = self._length_back(step, to, to_x, to_records)
+            to_solution, to_energy, to_slope = self._length_back(x, at, solution, to, to_x, to_records)
         module, (b, n), n_products = kernels("steps"), x.shape[:2], kept.shape[1]
         force, (residual, direction, to_normal) = torch.empty_like(kept[0]), x.new_zeros(3, *x.shape)
         to_diagonal, received = torch.zeros_like(at.diagonal), x.new_zeros(n_products, b, 3)
-        launch(module.inner, (b, n), [to_solution, kept[1, -1], n, received[-1]])
+        received[-1, :, 0] = (to_solution * kept[1, -1]).sum((1, 2))
         for k in reversed(range(n_products)):
             common = [at.normal, at.stiffness, k, n_products, n, kept, scalars]
             args = [*common, to_solution, residual, force, direction, received]
@@ -201,21 +186,26 @@ class _Relaxation:
         return to_x
 
     def _length_back(
-        self, step: Taken, to: Reference, to_x: Tensor, to_records: Sequence[Tensor]
+        self,
+        x: Tensor,
+        at: KernelPoint,
+        solution: Tensor,
+        to: Reference,
+        to_x: Tensor,
+        to_records: Sequence[Tensor],
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Gradients of the lengths of steps that were shortened: in the solution, the energy before, and the slope.
 
         Those through the energy after the whole step are added to the gradients in the shape, on entry those at the
         end of the step, and in the records. *Shape:* ``(B, V, 3), (B,), (B,)``.
         """
-        to_reached, at, whole = to_x.clone(), step.at, step.x + step.solution
+        to_reached, whole = to_x.clone(), x + solution
         there = self.kernels.at(whole, to, 1)
         with torch.enable_grad():
-            values = step.solution, at.value, there.value, at.slope(step.solution)
-            solution, before, after, slope = leaves = [value.detach().requires_grad_() for value in values]
-            along = slope + at.slope(solution - step.solution)
-            length = step_length(before, along, after, solution.abs().amax((1, 2)))
-            taken = length[:, None, None] * solution
+            values = solution, at.value, there.value, at.slope(solution)
+            step, before, after, slope = leaves = [value.detach().requires_grad_() for value in values]
+            along = slope + at.slope(step - solution)
+            taken = step_length(before, along, after, step.abs().amax((1, 2)))[:, None, None] * step
         to_solution, to_before, to_after, to_slope = torch.autograd.grad(taken, leaves, to_reached)
         self.kernels.back(whole, there, to, torch.zeros_like(to_x), to_x, to_records, to_energy=to_after)
         return to_solution + (to_x - to_reached), to_before, to_slope

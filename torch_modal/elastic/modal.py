@@ -17,7 +17,7 @@ from torch_modal import trees
 from torch_modal.autograd import is_eager
 from torch_modal.elastic.energy import Energy, EnergyAt, Linearised, Reference, RestShapes
 from torch_modal.elastic.kernel_energy import KernelEnergy
-from torch_modal.elastic.kernels.function import run_operation
+from torch_modal.elastic.kernels.function import Operation
 from torch_modal.elastic.kernels.launch import launch, of_elements
 from torch_modal.elastic.shell import ShellEnergy
 from torch_modal.elastic.term import Term
@@ -312,12 +312,12 @@ class KernelModalEnergy(ModalEnergy):
     def value_and_gradient(self, a: Tensor, placement: Placement) -> tuple[Tensor, Tensor]:
         """Overrides the base class; the value has no gradient."""
         base, (records, constant) = placement
-        gradient, value = run_operation(_GradientAndValue(self), a, base, *records)
+        gradient, value = _GradientAndValue(self)(a, base, *records)
         return value + constant, gradient
 
 
 @dataclass(frozen=True, eq=False)
-class _GradientAndValue:
+class _GradientAndValue(Operation):
     """Gradient in the amplitudes and energy but for the constant, from amplitudes, base, and records of a reference."""
 
     modal: KernelModalEnergy

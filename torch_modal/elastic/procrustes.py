@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torch_modal.elastic.kernels.function import run_operation
+from torch_modal.elastic.kernels.function import Operation
 from torch_modal.elastic.kernels.launch import kernels, launch
 from torch_modal.geometry import procrustes
 
@@ -15,11 +15,11 @@ def mean_pose(to_reference: Tensor, among: Tensor, weights: Tensor) -> tuple[Ten
     """:func:`torch_modal.geometry.procrustes.mean_pose`; of two shapes by a kernel, in float64."""
     if weights.shape[1] != 2:
         return procrustes.mean_pose(to_reference, among, weights)
-    rotations, pose = run_operation(_MeanPose(), to_reference, among, weights)
+    rotations, pose = _MeanPose()(to_reference, among, weights)
     return rotations.to(among), pose.to(among)
 
 
-class _MeanPose:
+class _MeanPose(Operation):
     """*Shape:* ``(B, 2, 3, 3), (B, 2, 2, 3, 3), (B, 2) -> (B, 2, 3, 3), (B, 3, 3)``."""
 
     n_results = n_differentiable = 2

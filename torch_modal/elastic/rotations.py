@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torch_modal.autograd import is_eager
-from torch_modal.elastic.kernels.function import run_operation
+from torch_modal.elastic.kernels.function import Operation
 from torch_modal.elastic.kernels.launch import kernels, launch
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.local_rotations import LocalRotations, Trajectory
@@ -55,7 +55,7 @@ class WarpRotations(LocalRotations):
         """Overrides the base class."""
         if self.clusters is not None or weights.shape[1] != 2:
             return super().right_hand_side(shapes, weights, poisson)
-        return run_operation(_RightHandSide(self, poisson), shapes, weights)[0].to(shapes)
+        return _RightHandSide(self, poisson)(shapes, weights)[0].to(shapes)
 
     def signed_quaternions(self, shapes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Quaternions between two shapes, their signs, frames and stretches, ``(B, F, 4), (B, F), (B, F, 12)``."""
@@ -77,16 +77,15 @@ class WarpRotations(LocalRotations):
     def edges_along(self, trajectory: Trajectory, which: Tensor, t: Tensor) -> Tensor:
         """Overrides the base class."""
         packed = torch.cat(list(trajectory)).movedim(0, -1)
-        return run_operation(_OnTrajectory(self, len(packed)), packed, which, t)[0].movedim(-1, 0).to(trajectory.size)
+        return _OnTrajectory(self, len(packed))(packed, which, t)[0].movedim(-1, 0).to(trajectory.size)
 
 
 @dataclass(frozen=True, eq=False)
-class _RightHandSide:
+class _RightHandSide(Operation):
     """Pulls of the edge vectors between two shapes. *Shape:* ``(B, 2, V, 3), (B, 2) -> (B, V, 3)``."""
 
     rotations: WarpRotations
     poisson: Poisson
-    n_results = n_differentiable = 1
 
     def run(self, kept: list[Any] | None, shapes: Tensor, weights: Tensor) -> tuple[Tensor, ...]:
         rotations, right = self.rotations, torch.zeros_like(shapes[:, 0])
@@ -114,13 +113,12 @@ class _RightHandSide:
 
 
 @dataclass(frozen=True, eq=False)
-class _OnTrajectory:
+class _OnTrajectory(Operation):
     """Edge vectors on packed trajectories. *Shape:* ``(P, F, 30), (B,), (B,) -> (B, E, 3)``."""
 
     rotations: WarpRotations
     n_pairs: int
     """Number of trajectories, P: ``vmap`` passes several batches as one."""
-    n_results = n_differentiable = 1
 
     def run(self, kept: list[Any] | None, packed: Tensor, which: Tensor, t: Tensor) -> tuple[Tensor, ...]:
         rotations, total = self.rotations, t.new_zeros(len(t), self.rotations.n_edges, 4)

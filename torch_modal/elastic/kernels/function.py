@@ -1,7 +1,7 @@
 """Functions of tensors by kernels, for all that autograd and ``torch.func`` do."""
 
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -9,38 +9,26 @@ from torch import Tensor
 from torch_modal.autograd import apply_function, is_double_backward, is_traced, jvp_by_transposing, merge_vmapped
 
 
-class Operation(Protocol):
+class Operation:
     """A function of float64 tensors by kernels. The first dimension of all tensors counts the samples."""
 
-    n_results: int
-    n_differentiable: int
+    n_results = 1
+    n_differentiable = 1
     """Number of results with gradients; they come first."""
+    run: Callable[..., tuple[Tensor, ...]]
+    """The results, of a list and the tensors; what :attr:`back` needs is added to the list, unless it is None."""
+    back: Callable[..., tuple[Tensor | None, ...]]
+    """Gradients in the tensors from the list, those in the results, and the tensors; the list may be empty."""
+    by_torch: Callable[..., tuple[Tensor, ...]]
+    """Results by torch instead of kernels: for forward mode, second derivatives, and tensors without data."""
 
-    @property
-    def run(self) -> Callable[..., tuple[Tensor, ...]]:
-        """The results, of a list and the tensors; what :attr:`back` needs is added to the list, unless it is None."""
-
-    @property
-    def back(self) -> Callable[..., tuple[Tensor | None, ...]]:
-        """Gradients in the tensors from the list, those in the results, and the tensors; the list may be empty."""
-
-    @property
-    def by_torch(self) -> Callable[..., tuple[Tensor, ...]]:
-        """Results by torch instead of kernels: for forward mode, second derivatives, and tensors without data."""
-
-
-def run_operation(operation: Operation, *tensors: Tensor) -> tuple[Tensor, ...]:
-    """The results of an operation, of tensors of any dtype."""
-    tensors = tuple(x.double() for x in tensors)
-    if any(map(is_traced, tensors)):
-        return operation.by_torch(*tensors)
-    keep = torch.is_grad_enabled() and any(x.requires_grad for x in tensors)
-    return tuple(apply_function(_Fused, operation, [] if keep else None, *tensors))
-
-
-def run_by_torch(operation: Operation, *tensors: Tensor) -> tuple[Tensor, ...]:
-    """The results of an operation by torch, without kernels."""
-    return operation.by_torch(*(x.double() for x in tensors))
+    def __call__(self, *tensors: Tensor, kernels: bool = True) -> tuple[Tensor, ...]:
+        """The results for tensors of any dtype, by kernels or torch."""
+        tensors = tuple(x.double() for x in tensors)
+        if not kernels or any(map(is_traced, tensors)):
+            return self.by_torch(*tensors)
+        keep = torch.is_grad_enabled() and any(x.requires_grad for x in tensors)
+        return tuple(apply_function(_Fused, self, [] if keep else None, *tensors))
 
 
 class _Fused(torch.autograd.Function):
@@ -57,8 +45,8 @@ class _Fused(torch.autograd.Function):
 
     @staticmethod
     def jvp(ctx: Any, *tangents: Tensor | None) -> tuple[Tensor | None, ...]:
-        n, run_by_torch = ctx.operation.n_differentiable, ctx.operation.by_torch
-        results = jvp_by_transposing(lambda *tensors: run_by_torch(*tensors)[:n], ctx.saved_tensors, tangents[2:])
+        n, by_torch = ctx.operation.n_differentiable, ctx.operation.by_torch
+        results = jvp_by_transposing(lambda *tensors: by_torch(*tensors)[:n], ctx.saved_tensors, tangents[2:])
         return *results, *[None] * (ctx.operation.n_results - n)
 
     @staticmethod

@@ -135,17 +135,6 @@ def turn(
 
 # ----------------------------------------------------------------------------------------------------- and back again
 @wp.kernel(enable_backward=False)
-def inner(a: wp.array[vec3], b: wp.array[vec3], n: int, out: wp.array[vec3], threads: int):
-    """Inner product of two fields, added to the first of three numbers."""
-    i = wp.tid()
-    s = i // threads
-    total = real(0.0)
-    for k in range(i - s * threads, n, threads):
-        total += wp.dot(a[place(s * n, k)], b[place(s * n, k)])
-    wp.atomic_add(out, s, vec3(total, real(0.0), real(0.0)))
-
-
-@wp.kernel(enable_backward=False)
 def back_to_direction(
     normal: wp.array[vec3], stiffness: wp.array[real], m: int, n_products: int, n: int, fields: wp.array[vec3],
     scalars: wp.array[vec3], to_solution: wp.array[vec3], to_residual: wp.array[vec3], pushed: wp.array[vec3],
