@@ -167,7 +167,7 @@ class Pass(nn.Module):
 
     Args:
         term: The number of the term, and the term.
-        rider: The same of the other; None where there is none.
+        rider: The number of the other, and the other.
         own: For each edge the element that begins with it, or -1. *Shape:* ``(E,)``.
     """
 
@@ -175,11 +175,11 @@ class Pass(nn.Module):
     own: Tensor | None
 
     def __init__(
-        self, term: tuple[int, KernelTerm], rider: tuple[int, KernelTerm] | None = None, own: Tensor | None = None
+        self, term: tuple[int, KernelTerm], rider: tuple[Any, Any] = (None, None), own: Tensor | None = None
     ) -> None:
         super().__init__()
         self.number, self.term = term
-        self.other, self.rider = (None, None) if rider is None else rider
+        self.other, self.rider = rider
         elements = self.term.elements
         if self.rider is not None and own is not None:
             # Where there is no element, all further vertices are the first.
@@ -226,7 +226,8 @@ class KernelEnergy(nn.Module):
 
     def __init__(self, energy: Energy, parts: Sequence[KernelTerm]) -> None:
         super().__init__()
-        self.energy, self.parts = energy, nn.ModuleList(parts)
+        self.energy = energy
+        self.parts: Any = nn.ModuleList(parts)
         #: Numbers of the volume, and of the other terms.
         self.volumes = [i for i, term in enumerate(parts) if isinstance(term, KernelVolume)]
         self.terms = [i for i in range(len(parts)) if i not in self.volumes]
@@ -260,17 +261,14 @@ class KernelEnergy(nn.Module):
         return Reference(tuple(records[i] for i in range(len(self.parts))), constant)
 
     def at(self, x: Tensor, to: Reference, order: int = 2) -> KernelPoint:
-        """Value, gradient from the order of 1 on, and convex Hessian from 2 on. *Shape:* ``(B, V, 3)``.
-
-        For the value, there may be several shapes for each reference, which comes round. *Shape:* ``(D * B, V, 3)``.
-        """
-        n, energy, factors = len(to.constant), x.new_zeros(len(x)), []
+        """Value, gradient from the order of 1 on, and convex Hessian from 2 on. *Shape:* ``(B, V, 3)``."""
+        energy, factors = x.new_zeros(len(x)), []
         gradient = torch.zeros_like(x) if order > 0 else None
         diagonal = x.new_zeros(*x.shape[:2], 6) if order > 1 else None
         for one in self.passes:
             pass_factors = [x.new_empty(len(x), *size) if order > 1 and size else None for size in one.sizes]
             records = to.records[one.number], None if one.other is None else to.records[one.other]
-            one.launch("linearise", len(x), x.shape[1], x, *records, n, energy, gradient, diagonal, *pass_factors)
+            one.launch("linearise", len(x), x.shape[1], x, *records, energy, gradient, diagonal, *pass_factors)
             factors.append(pass_factors)
         if not self.volumes:
             zeros = torch.zeros_like(energy)
@@ -279,10 +277,10 @@ class KernelEnergy(nn.Module):
         sizes, normal = self.parts[number].at(x, order > 0)
         weight, value = to.records[number][:, 0].unbind(1)
         stiffness = 2 * weight
-        off = sizes[:, 1, 0].view(len(x) // max(n, 1), n) - value
+        off = sizes[:, 1, 0] - value
         moment = stiffness * off
-        energy = torch.addcmul(energy.view_as(off), moment, off, value=0.5).flatten()
-        return KernelPoint(energy, gradient, diagonal, factors, normal, moment.flatten(), stiffness)
+        energy = torch.addcmul(energy, moment, off, value=0.5)
+        return KernelPoint(energy, gradient, diagonal, factors, normal, moment, stiffness)
 
     def value_and_gradient(self, x: Tensor, to: Reference) -> tuple[Tensor, Tensor]:
         """The energy but for its constant, and its gradient. *Shape:* ``(B, V, 3) -> (B,), (B, V, 3)``."""

@@ -202,4 +202,4 @@ def kernels() -> SimpleNamespace:
                     for a in range(3):
                         wp.atomic_add(out, place(to, a * n_blocks), result[a])
 
-    return SimpleNamespace(module=module, sizes=sizes, sizes_back=sizes_back, curved=curved)
+    return SimpleNamespace(sizes=sizes, sizes_back=sizes_back, curved=curved)

@@ -207,18 +207,17 @@ def convex(f: KernelFunctions, rider: KernelFunctions | None) -> SimpleNamespace
     @kernel
     def linearise(
         elements: wp.array[corners], own: wp.array[wp.int32], n_own: int, n_vertices: int, x: wp.array[vec3],
-        rests: wp.array[record], others: wp.array[other.record], n_references: int, total: wp.array[real],
+        rests: wp.array[record], others: wp.array[other.record], total: wp.array[real],
         gradient: wp.array[vec3], diagonal: wp.array[symmetric], factors: wp.array[Factors],
         other_factors: wp.array[other.Factors], threads: int,
     ):  # fmt: skip
         """Energy, gradient, and blocks and factors of the convex Hessian.
 
-        What has no arrays is left out. References come round where there are fewer than shapes.
+        What has no arrays is left out.
         """
         i = wp.tid()
         s = i // threads
         v = s * n_vertices
-        r = s % n_references
         summed = real(0.0)
         for k in range(i - s * threads, elements.shape[0], threads):
             q = elements[place(k, 0)]
@@ -228,7 +227,7 @@ def convex(f: KernelFunctions, rider: KernelFunctions | None) -> SimpleNamespace
             e = edge_vectors(x, v, q)
             if gradient:
                 energy, ridden, square = other.linearise(
-                    e[0], others, place(r * elements.shape[0], k), other_factors, place(s * elements.shape[0], k)
+                    e[0], others, place(s * elements.shape[0], k), other_factors, place(s * elements.shape[0], k)
                 )
                 summed += energy
                 received = vectors()
@@ -237,7 +236,7 @@ def convex(f: KernelFunctions, rider: KernelFunctions | None) -> SimpleNamespace
                 across = real(0.0)
                 if at >= 0:
                     m, g = f.linearise(e)
-                    to = rests[place(r * n_own, at)]
+                    to = rests[place(s * n_own, at)]
                     summed += potential.energy(m, to)
                     slope = potential.slope(m, to)
                     received = slope * g
@@ -254,9 +253,9 @@ def convex(f: KernelFunctions, rider: KernelFunctions | None) -> SimpleNamespace
                         wp.atomic_add(diagonal, place(v, q[j + 1]), block(along, g[j], across))
                     wp.atomic_add(diagonal, place(v, q[0]), square + block(along, whole, across))
             else:
-                summed += other.energy(e[0], others, place(r * elements.shape[0], k))
+                summed += other.energy(e[0], others, place(s * elements.shape[0], k))
                 if at >= 0:
-                    summed += potential.energy(f.measure(e), rests[place(r * n_own, at)])
+                    summed += potential.energy(f.measure(e), rests[place(s * n_own, at)])
         wp.atomic_add(total, s, summed)
 
     @kernel
@@ -289,7 +288,7 @@ def convex(f: KernelFunctions, rider: KernelFunctions | None) -> SimpleNamespace
         if scalars:
             wp.atomic_add(scalars, first + s, vec3(real(0.0), real(0.0), total))
 
-    return SimpleNamespace(module=module, linearise=linearise, product=product)
+    return SimpleNamespace(linearise=linearise, product=product)
 
 
 @cache
@@ -344,7 +343,7 @@ def forward(f: KernelFunctions) -> SimpleNamespace:
         wp.atomic_add(totals, s, wp.vec2d(total, energy))
 
     merge = _merge_kernel(f, module) if f.weight is not None else {}
-    return SimpleNamespace(module=module, jacobian=jacobian, **merge)
+    return SimpleNamespace(jacobian=jacobian, **merge)
 
 
 def _merge_kernel(f: KernelFunctions, module: "wp.Module") -> dict[str, "wp.Kernel"]:
@@ -592,7 +591,7 @@ def backward(f: KernelFunctions) -> SimpleNamespace:
                 out[place(3 * n * at, j)] = hessian_product(e, unit) + (beyond * g[j // 3, j % 3]) * g
 
     merge = _merge_back_kernel(f, module) if f.weight is not None else None
-    return SimpleNamespace(module=module, linearise=linearise, hessians=hessians, merge=merge)
+    return SimpleNamespace(linearise=linearise, hessians=hessians, merge=merge)
 
 
 @cache
@@ -631,4 +630,4 @@ def curving(n: int) -> SimpleNamespace:
                         whole += received
                     wp.atomic_add(out, place(3 * n_blocks * (s * n_vertices + q[0]) + a * n_blocks, b), -whole)
 
-    return SimpleNamespace(module=module, curved=curved)
+    return SimpleNamespace(curved=curved)
