@@ -150,9 +150,10 @@ class ContactEnergy:
         gradients = torch.stack([cross(other, within), cross(within, side), normal])
         return (height - self.gap).clamp_max(0), torch.cat([-gradients.sum(0)[None], gradients])
 
-    def value(self, x: Tensor) -> Tensor:
-        """Energy of each shape. *Shape:* ``(B, V, 3) -> (B,)``."""
-        return self._sum_by_shape(x, self.weights * self.shortfall(x)[0] ** 2)
+    def value(self, x: Tensor, shortfall: Tensor | None = None) -> Tensor:
+        """Energy of each shape, from missing distances where they are known. *Shape:* ``(B, V, 3), (N,) -> (B,)``."""
+        shortfall = self.shortfall(x)[0] if shortfall is None else shortfall
+        return x.new_zeros(len(x)).index_add(0, self.shapes, self.weights * shortfall**2)
 
     def at(self, x: Tensor) -> Point:
         """Derivatives, of which the contacts that keep the gap have none. *Shape:* ``(B, V, 3)``."""
@@ -172,11 +173,7 @@ class ContactEnergy:
             _rows(out).index_add_(1, corners, stiffness * rate.repeat(4) * on_corners)
             return out
 
-        return Point(self._sum_by_shape(x, self.weights * shortfall**2), gradient, diagonal, product)
-
-    def _sum_by_shape(self, x: Tensor, each: Tensor) -> Tensor:
-        """*Shape:* ``(B, V, 3), (N,) -> (B,)``."""
-        return x.new_zeros(len(x)).index_add(0, self.shapes, each)
+        return Point(self.value(x, shortfall), gradient, diagonal, product)
 
 
 class Pull(NamedTuple):

@@ -6,6 +6,7 @@ key-frame serve all shapes of the motion: they bend the shape on the path, and l
 stretch.
 """
 
+import copy
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -109,13 +110,10 @@ class ModalDecoder(nn.Module):
     @outside_inference_mode
     def with_keyframes(self, keyframes: Tensor, times: Tensor) -> "ModalDecoder":
         """Decoder with these modes along a path through other key-frames of the same connectivity."""
-        other = ModalDecoder.__new__(ModalDecoder)
-        nn.Module.__init__(other)
-        other._mesh = self._mesh
-        for name in ("faces", "columns", "moves", "reference"):
-            other.register_buffer(name, getattr(self, name), persistent=name != "faces")
-        other.register_buffer("keyframes", keyframes.detach().to(self.keyframes).clone())
-        other.register_buffer("times", times.detach().to(self.times).clone())
+        other = copy.copy(self)
+        other._buffers, other._modules = dict(self._buffers), dict(self._modules)
+        other.keyframes = keyframes.detach().to(self.keyframes).clone()
+        other.times = times.detach().to(self.times).clone()
         other._build()
         return other
 
@@ -159,7 +157,9 @@ class ModalDecoder(nn.Module):
         )
         x = torch.cat(shapes)[order]
         if motions is not None:
-            x = apply_motions(x, motions.expand(*lead, 6).reshape(-1, 6), self.size)
+            turns, moves = motions.expand(*lead, 6).reshape(-1, 1, 6).split(3, -1)
+            centre = x.mean(1, keepdim=True)
+            x = (x - centre) @ exp(turns[:, 0]).mT + centre + self.size * moves
         return x.reshape(*lead, *x.shape[1:])
 
     def _shapes(self, knots: Knots, i: int, a: Tensor, u: Tensor) -> Tensor:
@@ -198,9 +198,3 @@ def _limit_slivers(columns: Tensor, rest: Frames) -> Tensor:
     limit = MOST * ((areas * squared).sum(1, keepdim=True) / areas.sum()).sqrt()
     bound = (limit / squared.sqrt().clamp_min(torch.finfo(squared.dtype).tiny)).clamp_max(1)
     return (bound * columns).movedim(0, 1).contiguous()
-
-
-def apply_motions(x: Tensor, motions: Tensor, size: Tensor) -> Tensor:
-    """Turn shapes about their centres, and move them. *Shape:* ``(B, V, 3), (B, 6) -> (B, V, 3)``."""
-    centre = x.mean(1, keepdim=True)
-    return (x - centre) @ exp(motions[:, :3]).mT + centre + size * motions[:, None, 3:]
