@@ -523,11 +523,6 @@ def test_inconsistent_winding_is_repaired():
     assert trimesh.Trimesh(vertices[0], repaired, process=False).volume == pytest.approx(2 * ball.volume)
 
 
-def test_signed_volume_is_positive_outwards():
-    assert signed_volume(CUBE + 3, CUBE_FACES) == pytest.approx(1)
-    assert signed_volume(CUBE + 3, CUBE_FACES[:, ::-1]) == pytest.approx(-1)
-
-
 def moebius(n=12):
     angle = np.linspace(0, 2 * np.pi, n, endpoint=False)
     middle = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from textured import bend, split_at_seams, textured_glb, textured_obj, triangles_of_tube, tube
+from textured import bend, split_at_seams, textured_glb, triangles_of_tube
 
 import torch_modal as tm
 from torch_modal.cli import main as cli
@@ -124,26 +124,6 @@ def test_no_gap_after_subdivide(tmp_path: Path, suffix: str) -> None:
     half = bend(whole[0], 0.45)[original]
     error = np.linalg.norm(frames[2].numpy() - fitted(half, frames[2].numpy()), axis=1)
     assert error.max() < 0.15
-
-
-def test_textured_quads_through_the_command(tmp_path: Path) -> None:
-    """OBJ in, OBJ out: texture coordinates, two materials, groups and quads as they were, textures beside the files."""
-    x = tube()[0]
-    files = [textured_obj(tmp_path / "in", f"key-{n}.obj", shape, blanks=False) for n, shape in enumerate((x, bend(x)))]
-    assert cli.main(["subdivide", *map(str, files), "--out", str(tmp_path / "out"), *FAST, "--levels", "1"]) == 0
-    source = files[0].read_text().splitlines()
-    for number in range(3):
-        written = (tmp_path / "out" / f"frame-00{number}.obj").read_text().splitlines()
-        for kind in ("vt ", "usemtl ", "mtllib ", "g ", "o ", "s "):
-            assert [y for y in written if y.startswith(kind)] == [y for y in source if y.startswith(kind)]
-        for old, new in zip(
-            *([y.split() for y in text if y.startswith("f ")] for text in (source, written)), strict=True
-        ):
-            assert [word.split("/")[:2] for word in old] == [word.split("/")[:2] for word in new]
-    scene = trimesh.load_scene(tmp_path / "out" / "frame-001.obj", process=False)
-    assert {mesh.visual.material.image.size for mesh in scene.geometry.values()} == {(8, 8)}
-    frames = tm.load_keyframes(sorted((tmp_path / "out").glob("frame-*.obj"))).keyframes
-    assert torch.equal(frames[[0, 2]], tm.load_keyframes(files).keyframes)
 
 
 def fitted(x: np.ndarray, y: np.ndarray) -> np.ndarray:

@@ -1,6 +1,5 @@
 """Modes: the eigenproblem against independent truth, and the way from key-frames to bases."""
 
-import threading
 import warnings
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,7 @@ from solids import as_mesh, box, eigenmodes, lumped_mass, surface, together
 from torch_modal import threads
 from torch_modal.geometry.canonical import to_canonical
 from torch_modal.keyframes.check import MeshError, MeshWarning
-from torch_modal.modes import carrying, eigen, extract
+from torch_modal.modes import eigen, extract
 from torch_modal.modes import lattice as lattice_module
 from torch_modal.modes.eigen import ElasticModes, ModalAnalysisError
 from torch_modal.modes.extract import extract_bases, extract_modes
@@ -228,17 +227,6 @@ def test_loose_pieces_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     np.testing.assert_allclose(basis.eigenvalues, np.repeat(each, 2), rtol=1e-6)
 
 
-def test_more_pieces_than_modes(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Their 54 motions against each other used to leave no room for modes."""
-    many = together(*[box((2, 1, 1), (2.0, 1.0, 1.0))] * 10)
-    many.vertices[:, 2] += np.repeat(3.0 * np.arange(10), 12)
-    vertices, faces = as_mesh(many)
-    filled_with(monkeypatch, many, (vertices, faces))
-    with pytest.warns(MeshWarning, match="has 10 loose pieces"):
-        basis = extract_modes(vertices, faces, 20, cache=False)
-    assert basis.eigenvalues[0] > 0.01
-
-
 def test_a_small_piece_goes_along(monkeypatch: pytest.MonkeyPatch) -> None:
     """A button of a body: as the body moves beside it, and without modes of its own."""
     button = box((1, 1, 1), (0.1, 0.1, 0.1))
@@ -312,23 +300,6 @@ def test_threads_change_nothing(boxed: Mesh, monkeypatch: pytest.MonkeyPatch) ->
         np.testing.assert_array_equal(alone.modes, one.modes)
         np.testing.assert_array_equal(one.modes, other.modes)
         np.testing.assert_array_equal(alone.reference, one.reference)
-
-
-def test_keyframes_are_meshed_at_the_same_time(boxed: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
-    vertices, faces = boxed
-    together, calls = threading.Barrier(3), []
-
-    def wait_for_the_others(*_: object) -> Tetrahedra:
-        calls.append(None)
-        if len(calls) > 1:  # the first one is meshed alone
-            together.wait(timeout=30)  # passes only if three are in here
-        return lattice_module.lattice()
-
-    monkeypatch.setattr(threads, "n_threads", lambda: 3)
-    monkeypatch.setattr(TetWild, "fill", wait_for_the_others)
-    monkeypatch.setattr(carrying, "MAX_FIT", -1.0)  # each needs its own
-    four = np.stack([vertices] * 4)
-    assert len(extract_bases(four, faces, 4, mesher="tetwild", cache=False)) == 4
 
 
 @pytest.mark.parametrize(

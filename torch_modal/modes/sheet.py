@@ -94,11 +94,8 @@ def _cluster_weights(
     total = np.asarray(weights.sum(axis=1)).reshape(-1)
     weights = sp.diags(1 / np.where(total > 0, total, 1)) @ weights
     rows = np.flatnonzero(total == 0)
-    if len(rows):  # pieces that no cluster reaches follow those around the nearest one
-        tree, piece = cKDTree(points), fine.vertex_pieces[rows]
-        nearest = np.zeros(len(rows), dtype=np.int64)
-        for index in np.unique(piece):
-            nearest[piece == index] = tree.query(surface.points[rows[piece == index]].mean(axis=0))[1]
+    if len(rows):  # pieces that no cluster reaches follow the clusters around the nearest one
+        nearest = cKDTree(points).query(surface.points[rows])[1]
         follows = sp.csr_matrix((np.ones(len(rows)), (rows, nearest)), shape=(n_fine, n))
         weights = weights + follows @ _averages(mesh)
     return sp.coo_matrix(weights)
