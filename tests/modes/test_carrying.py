@@ -7,7 +7,7 @@ from bodies import bend
 from solids import as_it_is, as_mesh, box, eigenmodes
 
 from torch_modal.modes import carrying
-from torch_modal.modes.carrying import Carrier
+from torch_modal.modes.carrying import Carrier, nearest_rotations
 from torch_modal.modes.eigen import ModalAnalysisError, lowest_modes
 from torch_modal.modes.embedding import find_neighbours
 from torch_modal.modes.extract import extract_bases
@@ -69,6 +69,15 @@ def test_modes_of_the_carried_bar_are_those_of_the_bent_one(carrier: Carrier) ->
 def test_what_cannot_be_followed_is_seen(carrier: Carrier) -> None:
     assert carried(carrier, POINTS * (1.0, 1.0, -1.0)) is None  # mirrored
     assert carried(carrier, POINTS + np.random.default_rng(0).normal(size=POINTS.shape)) is None  # crumpled
+
+
+def test_nearest_rotations_against_singular_values() -> None:
+    random = np.random.default_rng(0)
+    matrices = random.normal(size=(3000, 3, 3)) * random.uniform(1e-9, 1e9, (3000, 1, 1))
+    matrices[:10], matrices[10:20, :, 0] = 0.0, 0.0  # of no and of two dimensions
+    u, _, vt = np.linalg.svd(matrices)
+    u[:, :, 2] *= np.sign(np.linalg.det(u @ vt))[:, None]
+    np.testing.assert_allclose(nearest_rotations(matrices), u @ vt, atol=1e-12)
 
 
 def test_clearances_of_a_plate_and_of_a_gap() -> None:

@@ -22,6 +22,9 @@ N_STEPS = 5
 MAX_FIT_RMS = 5e-3
 MAX_FIT = 0.1
 """Largest root mean square and maximum distances from the key-frame, in bounding-box diagonals."""
+FLAT = 1e-3
+"""Determinant over the cubed norm, below which a matrix counts as singular; a rotation has 0.19."""
+MOST_POLAR_STEPS = 20
 MAX_INVERTED = 0.04
 """Largest fraction of inverted tetrahedra. Up to 2.5 % change neither modes nor mid-shapes."""
 
@@ -108,7 +111,23 @@ def vertex_rotations(before: FloatArray, after: FloatArray, faces: IntArray) -> 
 
 
 def nearest_rotations(matrices: NDArray[Any]) -> FloatArray:
-    """The rotations nearest to matrices. *Shape:* ``(·, 3, 3) -> (·, 3, 3)``."""
-    u, _, vt = np.linalg.svd(matrices)
+    """The rotations nearest to matrices. *Shape:* ``(·, 3, 3) -> (·, 3, 3)``.
+
+    The orthogonal factor of the polar decomposition by Newton's iteration ``X <- (s X + X^-T / s) / 2``, scaled by
+    ``s = det(X)^(-1/3)`` (Higham 1986), in a third of the time of a singular value decomposition. The latter serves
+    mirrored and singular matrices.
+    """
+    sound = np.linalg.det(matrices) > FLAT * np.linalg.norm(matrices, axis=(1, 2)) ** 3
+    u, _, vt = np.linalg.svd(matrices[~sound])
     u[:, :, 2] *= np.sign(np.linalg.det(u @ vt))[:, None]
-    return u @ vt
+    x = np.ascontiguousarray(np.moveaxis(matrices[sound], 0, -1))
+    for _ in range(MOST_POLAR_STEPS):
+        cofactors = np.stack([np.cross(x[i - 2], x[i - 1], axis=0) for i in range(3)])  # det(X) X^-T
+        determinant = (x[0] * cofactors[0]).sum(axis=0)
+        scale = np.cbrt(determinant)
+        previous, x = x, 0.5 * (x / scale + cofactors * (scale / determinant))
+        if np.abs(x - previous).max(initial=0.0) < 1e-14:
+            break
+    rotations = np.empty((len(matrices), 3, 3))
+    rotations[~sound], rotations[sound] = u @ vt, np.moveaxis(x, -1, 0)
+    return rotations
