@@ -83,9 +83,9 @@ def coarsen(
     if n_faces < 4:
         raise ValueError(f"a coarse mesh needs at least 4 faces, got n_faces={n_faces}")
     sources, known = range(len(keyframes)) if candidates is None else candidates, {} if known is None else known
-    found: list[tuple[float, Coarsening]] = []
+    attempts: list[tuple[float, Coarsening]] = []
     for n in (int(factor * n_faces) for factor in MORE_FACES):
-        if found and (n >= len(faces) or found[-1][0] >= NEEDLE):
+        if attempts and (n >= len(faces) or attempts[-1][0] >= NEEDLE):
             break
         for i in set(sources) - set(known) if n < len(faces) else ():
             known[i] = decimate(keyframes[i], faces, n)[2]
@@ -93,8 +93,8 @@ def coarsen(
         tried = [(*_fatness(keyframes, one), one) for one in each]
         # Those without needles first, then by the 1st percentile.
         least, _, best = max(tried, key=lambda one: (min(one[0], NEEDLE), one[1]))
-        found.append((least, best))
-    return max(found, key=lambda one: min(one[0], NEEDLE))[1]
+        attempts.append((least, best))
+    return max(attempts, key=lambda one: min(one[0], NEEDLE))[1]
 
 
 def _fatness(keyframes: FloatArray, coarsening: Coarsening) -> tuple[float, float]:

@@ -40,7 +40,7 @@ class ElasticBody(NamedTuple):
             *Shape:* ``(3N, 3N)``.
         mass: ``M``, entries for vertices. *Shape:* ``(N, N)``.
         to_surface: Displacements of the surface from displacements of the body. *Shape:* ``(N, 3, k) -> (U, 3, k)``.
-        shift: Positive shift of the eigenproblem, near the lowest eigenvalues of slender bodies. None: that of a
+        shift: Positive shift of the eigenproblem, near the lowest eigenvalues of slender bodies. None: for a
             solid, the inverse square of the diagonal of the bounding box.
         largest_residual: Largest residual ``|K phi - lambda M phi| / (lambda |M phi|)`` of a mode.
     """

@@ -46,7 +46,7 @@ def run_child(
         timeout: Seconds until the program is killed.
         stop: Event that also ends the program.
         job: Content of its standard input.
-        environment: Its environment variables; by default those of this process.
+        environment: Its environment variables; by default this process's.
 
     Raises:
         ChildError: The program ended with an error, or after the timeout.

@@ -41,7 +41,7 @@ class TetWild:
 
     Attributes:
         edge_length_fac: Ideal edge length as a fraction of the bounding-box diagonal; None takes about two thirds of
-            the mean thickness (twice the volume over the area), or of that of the thinnest 5 % of the area unless parts
+            the mean thickness (twice the volume over the area), or of the thinnest 5 % of the area unless parts
             touch, from 0.012 to 0.04.
         epsilon: Largest distance of the tetrahedra's surface from the input, as a fraction of the diagonal.
         stop_energy: Quality at which fTetWild stops improving; lower is better and slower (its own default is 10).
@@ -102,8 +102,14 @@ class TetWild:
             tetrahedra = without_debris(
                 orient(_run_worker(surface, replace(self, edge_length_fac=edge_length_fac), stop))
             )
+            if len(tetrahedra.tets) == 0:
+                raise ValueError("the result is empty")
             # Vertices on the new surface are about one edge length apart, so no point of the old one is further away.
-            _check_fills(tetrahedra, surface, diagonal * (0.05 + 2 * edge_length_fac))
+            reach = diagonal * (0.05 + 2 * edge_length_fac)
+            if not np.abs(tetrahedra.vertices).max() <= np.abs(points).max() + reach:
+                raise ValueError("the result reaches far beyond the surface")
+            if n_far := int((cKDTree(tetrahedra.vertices).query(points)[0] > reach).sum()):
+                raise ValueError(f"{n_far} of its vertices are far from the result")
         except (ChildError, OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
             raise TetrahedralizationError(
                 f"cannot fill a mesh of {len(points)} vertices and {len(faces)} faces with tetrahedra: {error}. Check "
@@ -144,13 +150,3 @@ def _run_worker(surface: CanonicalSurface, settings: TetWild, stop: threading.Ev
         run_child([sys.executable, str(WORKER), str(job), str(result)], Path(folder), settings.timeout, stop)
         with result.open("rb") as file, np.load(file) as arrays:  # np.load leaves damaged files open
             return Tetrahedra(arrays["vertices"], arrays["tets"])
-
-
-def _check_fills(tetrahedra: Tetrahedra, surface: CanonicalSurface, reach: float) -> None:
-    """Reject a mesh that is empty, not finite, or does not cover the surface."""
-    if len(tetrahedra.tets) == 0:
-        raise ValueError("the result is empty")
-    if not np.abs(tetrahedra.vertices).max() <= np.abs(surface.points).max() + reach:
-        raise ValueError("the result reaches far beyond the surface")
-    if n_far := int((cKDTree(tetrahedra.vertices).query(surface.points)[0] > reach).sum()):
-        raise ValueError(f"{n_far} of its vertices are far from the result")
