@@ -238,20 +238,12 @@ def test_wrong_usage(meshes: list[str], tmp_path: Path, capsys: pytest.CaptureFi
         assert ".glb, .mp4" in misused(capsys, "subdivide", *meshes, "--out", name)
     for option in ("--ping-pong", "--ease"):
         assert "begin and end" in fails(capsys, "subdivide", *meshes, *out, "--cyclic", option)
-    assert "must end in .png or .pdf" in misused(capsys, "subdivide", *meshes, *out, "--picture", "a.jpg")
+    assert "must end in .png or .pdf" in fails(capsys, "subdivide", *meshes, *out, "--picture", "a.jpg")
     assert "one file, but there are 2" in misused(capsys, "modes", *meshes, "--out", "a.safetensors")
     assert "the same file name" in misused(capsys, "modes", meshes[0], meshes[0], "--out", "a")
-    for option, value in (
-        ("--levels", "-1"),
-        ("--levels", "1.5"),
-        ("--frames", "1"),
-        ("--duration", "0"),
-        ("--fps", "0"),
-        ("--fps", "nan"),
-        ("--fps", "inf"),
-        ("--modes", "0"),
-    ):
-        assert f"argument {option}: {value!r} is not a" in misused(capsys, "subdivide", *meshes, *out, option, value)
+    for option, value in (("--levels", "-1"), ("--frames", "1"), ("--duration", "0"), ("--fps", "nan")):
+        assert value in fails(capsys, "subdivide", *meshes, *out, option, value)
+    assert "invalid int value: '1.5'" in misused(capsys, "subdivide", *meshes, *out, "--levels", "1.5")
 
 
 def test_interrupt_says_one_line_and_leaves_with_130(meshes: list[str], tmp_path: Path) -> None:

@@ -179,7 +179,7 @@ def test_what_cannot_work_is_refused_before_the_work(
     assert "later.obj; got 1" in misused(capsys, *argv)
     assert "template.obj; got 2" in misused(capsys, *base, *out, "--keyframe-times", "3", "4")
     assert "required: SEEN" in misused(capsys, "complete", "template.obj", *out)
-    assert "is not a number above 0" in misused(capsys, *base, *out, "--noise", "0")
+    assert "noise is a length above 0" in fails(capsys, *base, *out, "--noise", "0")
     assert "2 times for 10 clouds (scans/s-00.ply, " in fails(capsys, *base, *out, "--times", "0", "1")
     assert "view is a direction" in fails(capsys, *base, *out, "--view", "0", "0", "0")
     own = ["--keyframes", "a.glb", "--keyframe-times", "0", "1", "--overwrite"]

@@ -227,6 +227,7 @@ def test_view_command_writes_a_page(
         (["--compare", "cube.ply"], "vertices"),
         (["--linear", "--keyframes", "0", "7"], "from 0 to 6"),
         (["--keyframes", "7"], "from 0 to 6"),
+        (["--fps", "0"], "fps must be a positive"),
         (["--compare", "missing.ply"], "no such file"),
     ],
 )
@@ -246,13 +247,6 @@ def test_command_says_what_is_wrong(
     assert main(["view", "grow.glb", *arguments, "--page", "page.html"]) == 1
     assert re.search(message, capsys.readouterr().err)
     assert not Path("page.html").exists()
-
-
-@pytest.mark.parametrize("arguments", [["--page", "page.png"], ["--fps", "0"]])
-def test_command_refuses_wrong_usage(arguments: list[str]) -> None:
-    with pytest.raises(SystemExit) as leaving:
-        main(["view", "a.glb", *arguments])
-    assert leaving.value.code == 2
 
 
 # ----------------------------------------------------------------------------------------------------- in a browser

@@ -3,12 +3,12 @@
 import argparse
 import os
 import re
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 from torch_modal.io.formats import ANIMATION_FORMATS
-from torch_modal.io.write import check_suffix, refuse_existing
+from torch_modal.io.write import refuse_existing
 
 MODES = ("n_modes", "method", "mesher", "cache", "progress")
 """Options of `extract_bases`, as `add_modes` and `add_cache` name them."""
@@ -16,46 +16,17 @@ REGISTRATION = ("landmarks", "same_subject", "cache", "progress")
 """Options of `register`, as `add_registration` and `add_cache` name them."""
 
 
-def number(kind: Callable[[str], Any], low: int = 0) -> Callable[[str], Any]:
-    """An argument type: a whole number of at least a bound, or a finite number above 0."""
-    wanted = f"a whole number of at least {low}" if kind is int else "a number above 0"
-
-    def convert(text: str) -> Any:
-        try:
-            value = kind(text)
-        except ValueError:
-            value = float("nan")
-        if not low <= value < float("inf") or (kind is float and value == 0):
-            raise argparse.ArgumentTypeError(f"{text!r} is not {wanted}")
-        return value
-
-    return convert
-
-
-def file_name(suffixes: Collection[str]) -> Callable[[str], Path]:
-    """An argument type: a file with one of these endings."""
-
-    def convert(text: str) -> Path:
-        try:
-            check_suffix(Path(text), suffixes)
-        except ValueError as error:
-            raise argparse.ArgumentTypeError(str(error)) from None
-        return Path(text)
-
-    return convert
-
-
 def add_levels(sub: argparse.ArgumentParser) -> None:
     """Add ``--levels`` of subdivision."""
     text = "how often the number of intervals doubles (default: %(default)s, 8 frames an interval)"
-    sub.add_argument("--levels", type=number(int), metavar="L", default=3, help=text)
+    sub.add_argument("--levels", type=int, metavar="L", default=3, help=text)
 
 
 def add_modes(sub: argparse.ArgumentParser) -> None:
     """Add options of `extract_bases`."""
     add, default = sub.add_argument, "(default: %(default)s)"
     text = f"elastic modes of each key-frame; 20 to 100 are usual {default}"
-    add("--modes", dest="n_modes", type=number(int, 1), default=30, metavar="N", help=text)
+    add("--modes", dest="n_modes", type=int, default=30, metavar="N", help=text)
     text = f"modes of the solid inside, of the surface itself (sheets, thin and open bodies), or what fits {default}"
     add("--method", choices=("auto", "solid", "shell"), default="auto", help=text)
     text = f"what fills solids: a lattice of cubes (deterministic), fTetWild, or what fits {default}"
@@ -65,8 +36,8 @@ def add_modes(sub: argparse.ArgumentParser) -> None:
 def add_forms(sub: argparse._ActionsContainer) -> None:
     """Add ``--bones`` and ``--targets``, forms of an animation as GLB."""
     text = "GLB: a skin of at most N bones, a tenth of the size, for engines (40 are usual)"
-    sub.add_argument("--bones", type=number(int, 1), metavar="N", help=text)
-    sub.add_argument("--targets", type=number(int, 1), metavar="N", help="GLB: N principal shapes as morph targets")
+    sub.add_argument("--bones", type=int, metavar="N", help=text)
+    sub.add_argument("--targets", type=int, metavar="N", help="GLB: N principal shapes as morph targets")
 
 
 def check_forms(args: argparse.Namespace, file: Path) -> None:

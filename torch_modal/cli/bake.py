@@ -4,8 +4,9 @@ import argparse
 from pathlib import Path
 
 from torch_modal.cli import arguments
-from torch_modal.cli.arguments import number, pick_options
+from torch_modal.cli.arguments import pick_options
 from torch_modal.io.formats import ANIMATION_FORMATS
+from torch_modal.io.write import check_suffix
 
 
 def add_arguments(sub: argparse.ArgumentParser) -> None:
@@ -14,12 +15,12 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
     text = "meshes in their order, a folder or a quoted pattern of them, an animated GLB, or an NPZ file"
     add("meshes", nargs="+", type=Path, metavar="MESH", help=text)
     text = f"the file: {', '.join(ANIMATION_FORMATS)}"
-    add("--out", type=arguments.file_name(ANIMATION_FORMATS), required=True, metavar="FILE", help=text)
+    add("--out", type=Path, required=True, metavar="FILE", help=text)
     arguments.add_forms(sub)
-    add("--fps", type=number(float), metavar="X", help="frames a second (default: as in the file, or 24)")
+    add("--fps", type=float, metavar="X", help="frames a second (default: as in the file, or 24)")
     add("--cyclic", action="store_true", help="the last frame leads on to the first")
     text = "take out trembling: what has a period of X frames is halved, what is slower hardly changes"
-    add("--smooth", type=number(float), metavar="X", help=text)
+    add("--smooth", type=float, metavar="X", help=text)
     arguments.add_registration(sub, optional=True)
     arguments.add_cache(sub)
 
@@ -41,6 +42,7 @@ def run(args: argparse.Namespace) -> None:
       scans of different connectivity:
         torch-modal bake "scans/*.ply" --register --bones 40 --out motion.glb
     """
+    check_suffix(args.out, ANIMATION_FORMATS)
     arguments.check_forms(args, args.out)
 
     import torch_modal as tm

@@ -5,8 +5,9 @@ from pathlib import Path
 from typing import Any
 
 from torch_modal.cli import arguments
-from torch_modal.cli.arguments import check_output, file_name, number, pick_options
+from torch_modal.cli.arguments import check_output, pick_options
 from torch_modal.io.formats import MESH_FORMATS, PICTURES
+from torch_modal.io.write import check_suffix
 
 SAMPLES = ("creature", "hand")
 INCOMPLETE = 3  # exit status of `precompute` when some sets have no bases
@@ -17,7 +18,7 @@ def add_register(sub: argparse.ArgumentParser) -> None:
     """Add the arguments of ``register``."""
     sub.add_argument("meshes", nargs=2, type=Path, metavar="MESH", help="the template, and the target")
     text = f"the template laid onto the target, {', '.join(MESH_FORMATS)}"
-    sub.add_argument("--out", type=file_name(MESH_FORMATS), required=True, metavar="FILE", help=text)
+    sub.add_argument("--out", type=Path, required=True, metavar="FILE", help=text)
     arguments.add_registration(sub)
     arguments.add_cache(sub)
 
@@ -38,6 +39,7 @@ def register(args: argparse.Namespace) -> None:
         torch-modal view cat.obj dog.obj --landmarks
         torch-modal register cat.obj dog.obj --across --landmarks pairs.txt --out wrapped.obj
     """
+    check_suffix(args.out, MESH_FORMATS)
     check_output(args, [args.out], args.meshes)
 
     import torch_modal as tm
@@ -59,7 +61,7 @@ def add_check(sub: argparse.ArgumentParser) -> None:
     add("meshes", nargs="+", type=Path, metavar="MESH", help="meshes of one connectivity")
     add("--keyframes", nargs="+", type=Path, default=[], metavar="FILE", help="meshes whose own crossings are known")
     text = "draw the meshes with crossings in colour, as .png or .pdf"
-    add("--picture", type=file_name(PICTURES), metavar="FILE", help=text)
+    add("--picture", type=Path, metavar="FILE", help=text)
 
 
 def check(args: argparse.Namespace) -> int:
@@ -79,6 +81,7 @@ def check(args: argparse.Namespace) -> int:
       torch-modal check out/frame-*.obj --keyframes open.obj fist.obj --picture crossings.png
     """
     if args.picture:
+        check_suffix(args.picture, PICTURES)
         check_output(args, [args.picture], [*args.meshes, *args.keyframes])
 
     import torch_modal as tm
@@ -206,9 +209,9 @@ def add_precompute(sub: argparse.ArgumentParser) -> None:
     add("root", type=Path, metavar="DIR", help="the folder tree with the key-frames")
     add("--out", type=Path, required=True, metavar="DIR", help="where the bases go")
     text = "sets at a time, each in a process with one thread (default: one for each processor)"
-    add("--workers", type=number(int, 1), metavar="N", help=text)
+    add("--workers", type=int, metavar="N", help=text)
     add("--scheduler", metavar="ADDRESS", help="run on the Dask cluster with this scheduler instead")
-    add("--timeout", type=number(float), metavar="S", default=600.0, help="for a set (default: 600)")
+    add("--timeout", type=float, metavar="S", default=600.0, help="for a set (default: 600)")
     text = "the meshes of a folder are a motion, in the order of their names, perhaps with a file times.txt"
     add("--sequence", action="store_true", help=text)
     arguments.add_modes(sub)

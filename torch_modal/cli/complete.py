@@ -4,7 +4,7 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
-from torch_modal.cli.arguments import number, pick_options
+from torch_modal.cli.arguments import pick_options
 from torch_modal.cli.subdivide import add_output, check_files, write_sequence
 
 
@@ -19,13 +19,13 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
     add("--keyframes", nargs="+", type=Path, default=[], metavar="MESH", help="further whole, exact meshes")
     text = "when the whole meshes are, the first included (default: that is a template of no time)"
     add("--keyframe-times", nargs="+", type=float, metavar="T", help=text)
-    add("--noise", type=number(float), metavar="X", help="standard deviation of the points (default: estimated)")
+    add("--noise", type=float, metavar="X", help="standard deviation of the points (default: estimated)")
     add("--estimate-times", action="store_true", help="times between the first and the last are not exact")
     add("--contact", action="store_true", help="keep parts from passing through each other (extra contact)")
     add("--view", nargs=3, type=float, metavar=("X", "Y", "Z"), help="direction to the camera of the clouds")
     add_output(sub, "what was seen above the result, coloured by its confidence")
-    add("--frames", type=number(int, 2), metavar="N", help="evenly in time (default: 1 to 8 for each interval)")
-    add("--fps", type=number(float), metavar="X", default=24.0, help="frames a second (default: %(default)g)")
+    add("--frames", type=int, metavar="N", help="evenly in time (default: 1 to 8 for each interval)")
+    add("--fps", type=float, metavar="X", default=24.0, help="frames a second (default: %(default)g)")
 
 
 def run(args: argparse.Namespace) -> None:
@@ -63,7 +63,7 @@ def run(args: argparse.Namespace) -> None:
     options = pick_options(args, "estimate_times", "contact", "progress")
     completion = tm.complete(rests, welded.faces, seen, times=times, **options)
     knots, when = completion.path.times if completion.path else completion.times, completion.times
-    if len(knots) > 1 and args.frames:
+    if len(knots) > 1 and args.frames and args.frames > 1:
         when = torch.linspace(float(knots[0]), float(knots[-1]), args.frames, dtype=torch.float64)
     elif len(knots) > 1:
         when = tm.frame_times(len(knots), min(3, max(0, 6 - (len(knots) - 2).bit_length())), times=knots)

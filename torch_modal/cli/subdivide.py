@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from torch_modal.cli import arguments
-from torch_modal.cli.arguments import number, pick_options
+from torch_modal.cli.arguments import pick_options
 from torch_modal.io.formats import ANIMATION_FORMATS, MESH_FORMATS, PICTURES, Timing
+from torch_modal.io.write import check_suffix
 
 ANIMATION = ("cyclic", "duration", "fps", "ping_pong", "ease")
 
@@ -20,11 +21,14 @@ def add_output(sub: argparse.ArgumentParser, picture: str) -> None:
     add("--out", type=Path, required=True, metavar="FILE_OR_FOLDER", help=text)
     text = "format of the numbered frames (default: as the first mesh, with everything else in its file)"
     add("--format", choices=[suffix[1:] for suffix in MESH_FORMATS], help=text)
-    add("--picture", type=arguments.file_name(PICTURES), metavar="FILE", help=f"also draw {picture}, .png or .pdf")
+    add("--picture", type=Path, metavar="FILE", help=f"also draw {picture}, .png or .pdf")
 
 
 def check_files(args: argparse.Namespace, inputs: list[Path]) -> Path:
     """Path of the animation, which a folder has next to the frames, after the checks of `check_output`."""
+    Timing(2, fps=args.fps)
+    if args.picture:
+        check_suffix(args.picture, PICTURES)
     animation, frames = args.out, []
     if not arguments.is_file(args, ANIMATION_FORMATS):
         animation, frames = args.out / "animation.glb", [*args.out.glob("frame-*")]
@@ -56,7 +60,7 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
     add("meshes", nargs="+", type=Path, metavar="MESH", help="key-frames, two or more, in their order")
     add_output(sub, "the sequence next to linear interpolation")
     arguments.add_levels(sub)
-    add("--frames", dest="n_frames", type=number(int, 2), metavar="N", help="of the result (default: by the levels)")
+    add("--frames", dest="n_frames", type=int, metavar="N", help="of the result (default: by the levels)")
     add("--cyclic", action="store_true", help="the last key-frame leads on to the first")
     text = "times of the key-frames, ascending, in any unit; of a cycle, also the time when it begins again"
     add("--times", nargs="+", type=float, metavar="T", help=text)
@@ -64,14 +68,14 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
     add("--no-smooth", dest="smooth", action="store_const", const=False, help=text)
     add("--contact", action="store_true", help="keep parts from passing through each other (extra contact)")
     text = "a coarser mesh of N vertices moves and carries the detail; 0: none (default: 20000 for large meshes)"
-    add("--proxy", type=number(int), metavar="N", help=text)
+    add("--proxy", type=int, metavar="N", help=text)
     text = "accurate; fast, without steps on the fine mesh; paper, its method whole (default: %(default)s)"
     add("--preset", choices=("accurate", "fast", "paper"), default="accurate", help=text)
     group = sub.add_argument_group("animation")
     text = "of the sequence once (default: 1 for a cycle, 2 for two key-frames, 1 an interval of more)"
-    group.add_argument("--duration", type=number(float), metavar="SECONDS", help=text)
+    group.add_argument("--duration", type=float, metavar="SECONDS", help=text)
     text = "frames a second; with --duration, pictures or samples a second of videos and point caches (default: 24)"
-    group.add_argument("--fps", type=number(float), metavar="X", help=text)
+    group.add_argument("--fps", type=float, metavar="X", help=text)
     group.add_argument("--ping-pong", action="store_true", help="there and back again")
     group.add_argument("--ease", action="store_true", help="slow at both ends")
     arguments.add_forms(group)

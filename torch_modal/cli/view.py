@@ -9,8 +9,9 @@ from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from torch_modal.cli.arguments import check_output, file_name, number
+from torch_modal.cli.arguments import check_output
 from torch_modal.io.formats import PAGES
+from torch_modal.io.write import check_suffix
 
 if TYPE_CHECKING:
     from torch_modal.view.page import Page
@@ -25,11 +26,11 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
     add("--compare", nargs="+", type=Path, action="append", default=[], metavar="FILE", help=text)
     add("--linear", action="store_true", help="also show linear interpolation of the key-frames of the first sequence")
     text = "which frames are key-frames, from 0 (default: the GLB's, or the first and the last)"
-    add("--keyframes", nargs="+", type=number(int), metavar="N", help=text)
+    add("--keyframes", nargs="+", type=int, metavar="N", help=text)
     add("--cyclic", action="store_true", help="the last frame leads on to the first")
-    add("--fps", type=number(float), metavar="X", help="frames a second (default: the GLB's, or 24)")
+    add("--fps", type=float, metavar="X", help="frames a second (default: the GLB's, or 24)")
     text = "write the page there, as .html (default: a temporary file, opened)"
-    add("--page", type=file_name(PAGES), metavar="FILE", help=text)
+    add("--page", type=Path, metavar="FILE", help=text)
     text = "a page to pick landmarks of two meshes or more; it starts with the landmarks of FILE, if given"
     add("--landmarks", nargs="?", const=True, metavar="FILE", help=text)
 
@@ -60,6 +61,7 @@ def run(args: argparse.Namespace) -> None:
     if args.landmarks and len(args.meshes) < 2:
         args.fail("--landmarks needs two meshes or more")
     if args.page:
+        check_suffix(args.page, PAGES)
         inputs = [] if args.landmarks in (None, True) else [Path(args.landmarks)]
         check_output(args, [args.page], [*chain(*sequences), *inputs])
 
