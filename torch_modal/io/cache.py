@@ -162,9 +162,9 @@ def _digest(value: Any) -> bytes:
     raise ContentError(f"a {kind.__qualname__} is neither plain data nor of a class of torch_modal")
 
 
-def _hash_items(kind: str, parts: Iterable[bytes]) -> bytes:
+def _hash_items(kind: str, chunks: Iterable[bytes]) -> bytes:
     total = hashlib.sha256(kind.encode())
-    for part in parts:
-        total.update(struct.pack("<q", len(part)))
-        total.update(part)
+    for chunk in chunks:
+        total.update(struct.pack("<q", len(chunk)))
+        total.update(chunk)
     return total.digest()

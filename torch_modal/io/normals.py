@@ -58,10 +58,10 @@ def carry_together(
     with_normals = [k for k, (normals, _, _) in enumerate(parts) if normals is not None]
     if with_normals:
         normals, positions, triangles = zip(*(parts[k] for k in with_normals), strict=True)
-        ends = np.cumsum([len(part) for part in positions])
-        shifted = [part + end - len(place) for part, end, place in zip(triangles, ends, positions, strict=True)]
+        ends = np.cumsum([len(points) for points in positions])
+        shifted = [rows + end - len(points) for rows, end, points in zip(triangles, ends, positions, strict=True)]
         carried = CarriedNormals(np.concatenate(normals), np.concatenate(positions), np.concatenate(shifted))
         rotated = np.stack([carried.at(x) for x in np.concatenate([frames[k] for k in with_normals], axis=1)])
-        for k, part in zip(with_normals, np.split(rotated, ends[:-1], axis=1), strict=True):
-            carried_normals[k] = part
+        for k, directions in zip(with_normals, np.split(rotated, ends[:-1], axis=1), strict=True):
+            carried_normals[k] = directions
     return carried_normals

@@ -102,7 +102,7 @@ class ObjAsset(Asset):
         return ("\n".join(lines) + "\n").encode("utf-8", errors="surrogateescape")
 
     @cached_property
-    def _carried_normals(self) -> tuple[IntArray, IntArray, IntArray, CarriedNormals]:
+    def _normals_carrier(self) -> tuple[IntArray, IntArray, IntArray, CarriedNormals]:
         """Vertex and normal of each pair that corners use; the pair of each corner, -1 for none; the pairs' normals.
 
         *Shape:* ``(n,), (n,), (C,)``.
@@ -118,7 +118,7 @@ class ObjAsset(Asset):
         return vertices, normals, which, carried
 
     def _write_normals(self, lines: list[str], positions: FloatArray) -> None:
-        vertices, normals, which, carried = self._carried_normals
+        vertices, normals, which, carried = self._normals_carrier
         text = [f"vn {x!r} {y!r} {z!r}" for x, y, z in carried.at(positions[vertices]).tolist()]
         if len(np.unique(normals)) == len(normals):
             for index, line in zip(normals.tolist(), text, strict=True):

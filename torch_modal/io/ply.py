@@ -132,14 +132,14 @@ class PlyAsset(Asset):
         self._note("properties", "properties " + ", ".join(further), further)
 
     @cached_property
-    def _carried_normals(self) -> CarriedNormals:
+    def _normals_carrier(self) -> CarriedNormals:
         return CarriedNormals(self._file.columns(*_NORMALS), self.positions, self.faces)
 
     def with_positions(self, positions: FloatArray) -> bytes:
         """The file with other positions."""
         new = dict(zip("xyz", positions.T, strict=True))
         if "normals" in self.carries:
-            new |= dict(zip(_NORMALS, self._carried_normals.at(positions).T, strict=True))
+            new |= dict(zip(_NORMALS, self._normals_carrier.at(positions).T, strict=True))
         return self._file.with_columns(new)
 
     @cached_property

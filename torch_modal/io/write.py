@@ -154,10 +154,11 @@ def _write(shapes: FloatArray, faces: IntArray, paths: list[Path], asset: Asset 
     for path in paths:
         refuse_existing(path, overwrite)
     extra_files: list[tuple[Path, bytes]] = []
-    same_format = asset is not None and asset.suffix == suffix
     if asset is not None:
         asset.check(shapes, paths[0], MESH_FORMATS[suffix].holds)
-    if asset is not None and same_format:
+    if asset is None or asset.suffix != suffix:
+        files = ((path, MESH_FORMATS[suffix].write(x, faces, asset)) for path, x in zip(paths, shapes, strict=True))
+    else:
         companions = {folder / name: data for name, data in asset.companions.items()}
         if taken := companions.keys() & paths:
             raise ValueError(f"{taken.pop()} is the name of a texture or library of {asset.path.name}; take another")
@@ -166,6 +167,4 @@ def _write(shapes: FloatArray, faces: IntArray, paths: list[Path], asset: Asset 
         for path, _ in extra_files:
             refuse_existing(path, overwrite)
         files = ((path, asset.with_positions(x)) for path, x in zip(paths, shapes, strict=True))
-    else:
-        files = ((path, MESH_FORMATS[suffix].write(x, faces, asset)) for path, x in zip(paths, shapes, strict=True))
     write_files(chain(extra_files, files))
