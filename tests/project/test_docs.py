@@ -180,7 +180,7 @@ def test_unknown_names_in_inline_code_are_found() -> None:
 
 def test_what_does_not_exist_is_found() -> None:
     text = """
-`torch-modal compress a.obj`, `torch-modal view --bones 3 --lines` and `--faster`; tm.InBetween and `tm.Between` of
+`torch-modal compress a.obj`, `torch-modal view --linear --lines` and `--faster`; tm.InBetween and `tm.Between` of
 torch_modal.layers.in_betwixt, tm.losses.Shell, `tests/project/test_docs.py::test_nothing`, `examples/walk.py`,
 `elastic/minimize.py`, `elastic/minimise.py`, `space.sample(3)`, `space.samples` and `Solution.state`.
 
