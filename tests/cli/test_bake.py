@@ -44,7 +44,8 @@ def test_a_folder_becomes_a_skin(folder: Path, tmp_path: Path, capsys: pytest.Ca
     assert fps == pytest.approx(12) and np.array_equal(faces, FACES)
     assert (frames - skin.shapes()).abs().max() < 1e-4 * DIAGONAL
     assert f"9 frames of {len(X)} vertices, 12 a second" in said and f"{skin.weights.shape[1]} bones" in said
-    assert errors(said) == [pytest.approx(rms(frames, FRAMES), abs=1e-4)]
+    at, between = errors(said)
+    assert at == pytest.approx(rms(frames, FRAMES), abs=1e-4) and 0 < between < 0.01
     # The skin is a sequence again: here as a point cache, at another rate.
     assert main(["bake", str(out), "--fps", "24", "--out", str(tmp_path / "b.npz"), "--quiet"]) == 0
     assert tm.load_sequence(tmp_path / "b.npz").frames[::2].sub(frames).abs().max() < 1e-5 * DIAGONAL
@@ -55,6 +56,20 @@ def test_principal_shapes_of_arrays(tmp_path: Path) -> None:
     assert main(["bake", str(tmp_path / "a.npz"), "--targets", "2", "--out", str(tmp_path / "a.glb")]) == 0
     frames = tm.load_sequence(tmp_path / "a.glb").frames
     assert 1e-5 < rms(frames, FRAMES) < 0.05
+
+
+def test_key_frames_alone_and_the_path_between_them(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "a.npz"
+    assert main(["bake", str(folder / "*.obj"), "--every", "3", "--out", str(out)]) == 0
+    (between,) = errors(capsys.readouterr().out)
+    frames = tm.load_sequence(out).frames
+    assert torch.equal(frames[[0, 3, 6, 8]], torch.tensor(FRAMES[[0, 3, 6, 8]]))
+    others = [1, 2, 4, 5, 7]
+    assert between == pytest.approx(rms(frames[others], FRAMES[others]), abs=1e-5) and between < 2e-3
+    assert main(["bake", str(folder), "--every", "4", "--cyclic", "--out", str(out), "--overwrite", "--quiet"]) == 0
+    assert torch.equal(tm.load_sequence(out).frames[[0, 4]], torch.tensor(FRAMES[[0, 4]]))
 
 
 def test_trembling_is_taken_out(folder: Path, tmp_path: Path) -> None:

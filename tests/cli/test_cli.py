@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import gltf_validator
 import numpy as np
@@ -308,6 +309,19 @@ def test_modes_writes_bases(meshes: list[str], tmp_path: Path, capsys: pytest.Ca
     assert capsys.readouterr().out.endswith("key-000.safetensors to key-001.safetensors\n")
     assert cli.main(["modes", meshes[0], "--out", str(tmp_path / "one.safetensors"), "--modes", "6", "--quiet"]) == 0
     assert tm.ModalBasis.load(tmp_path / "one.safetensors").n_modes == 6
+
+
+def test_a_doubtful_registration_is_written_if_it_is_kept(
+    meshes: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    positions = tm.load_keyframes(meshes).keyframes[1]
+    result = SimpleNamespace(doubtful=True, warnings=("far",), positions=positions, summary=lambda: "a summary")
+    monkeypatch.setattr(tm, "register", lambda *_, **__: result)
+    argv = ["register", *meshes, "--out", str(tmp_path / "a.obj"), "--quiet"]
+    assert "the result is doubtful: far. To help it" in fails(capsys, *argv)
+    assert cli.main([*argv, "--keep-doubtful"]) == 0
+    assert "warning: the result is doubtful: far" in capsys.readouterr().err
+    assert torch.equal(tm.load_keyframes([tmp_path / "a.obj"]).keyframes[0], positions)
 
 
 def test_demo_on_the_hand(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -254,3 +254,22 @@ def test_check_says_what_crosses(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert picture.stat().st_size > 5000
     assert cli.main(["check", str(file), "--picture", str(picture)]) == 1  # it exists
     assert "--overwrite" in capsys.readouterr().err
+
+
+def test_check_of_the_shapes_between(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    sample = load_sample("hand")
+    keys = [str(file) for file in sample_files("hand")]
+    assert cli.main(["check", *keys, "--between"]) == 3
+    said = capsys.readouterr().out
+    frames = tm.subdivide(sample.keyframes, sample.faces, 3, progress=False)
+    found = tm.self_contacts(frames, sample.faces, ignore=sample.keyframes)
+    for i in (0, 6, 8):
+        line = next(line for line in said.splitlines() if line.startswith(f"t = {i / 8:g} "))
+        assert line.split()[3:6] == [str(int(n[i])) for n in (found.number, found.n_new, found.n_far)]
+    shell = tm.losses.ShellLoss(sample.faces)
+    assert f"shell energy of the motion: {float(8 * shell(frames[1:], frames[:-1]).sum()):.4g}, of linear" in said
+    assert cli.main(["check", *keys, "--between", "--contact", "--quiet"]) == 0
+    with pytest.raises(SystemExit):
+        cli.main(["check", *keys, "--contact"])
+    assert cli.main(["check", keys[0], "--between"]) == 1
+    assert "at least 2 are needed" in capsys.readouterr().err

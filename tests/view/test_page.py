@@ -207,8 +207,9 @@ def test_view_command_writes_a_page(
     assert len(set(packed)) == 1, "the ball grows linearly"
     assert main(arguments) == 1
     assert "--overwrite" in capsys.readouterr().err
-    assert main([*arguments, "--overwrite", "--keyframes", "0", "3", "6", "--quiet"]) == 0
+    assert main([*arguments, "--overwrite", "--keyframes", "0", "3", "6", "--up", "z", "--quiet"]) == 0
     data = data_of(tm.Page(out.read_text(encoding="utf-8")))
+    assert data["groups"][0]["view"]["world_up"] == [0, 0, 1]
     assert [one["name"] for one in data["groups"][0]["sequences"]] == list(names)
     assert data["keyframes"] == [0, 3, 6]
 

@@ -1,6 +1,8 @@
 """Commands ``register``, ``check``, ``carry``, ``modes``, ``precompute`` and ``demo`` of ``torch-modal``."""
 
 import argparse
+import time
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +21,7 @@ def add_register(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("meshes", nargs=2, type=Path, metavar="MESH", help="the template, and the target")
     text = f"the template laid onto the target, {', '.join(MESH_FORMATS)}"
     sub.add_argument("--out", type=Path, required=True, metavar="FILE", help=text)
+    sub.add_argument("--keep-doubtful", action="store_true", help="write a doubtful result too, with a warning")
     arguments.add_registration(sub)
     arguments.add_cache(sub)
 
@@ -50,7 +53,10 @@ def register(args: argparse.Namespace) -> None:
     result = tm.register(template.positions, template.faces, target.positions, target.faces, **options)
     args.report(result.summary())
     if result.doubtful:
-        raise ValueError(f"the result is doubtful: {'; '.join(result.warnings)}. To help it, {ADVICE}")
+        why = f"the result is doubtful: {'; '.join(result.warnings)}"
+        if not args.keep_doubtful:
+            raise ValueError(f"{why}. To help it, {ADVICE}; --keep-doubtful writes it all the same")
+        warnings.warn(why, stacklevel=2)
     tm.save_mesh(result.positions, template.faces, args.out, args.overwrite, template)
     args.report(f"written: {args.out}")
 
@@ -60,6 +66,9 @@ def add_check(sub: argparse.ArgumentParser) -> None:
     add = sub.add_argument
     add("meshes", nargs="+", type=Path, metavar="MESH", help="meshes of one connectivity")
     add("--keyframes", nargs="+", type=Path, default=[], metavar="FILE", help="meshes whose own crossings are known")
+    text = "check the motion through the meshes: seven shapes between any two, with its shell energy and seconds"
+    add("--between", action="store_true", help=text)
+    add("--contact", action="store_true", help="with --between: keep parts from passing through each other")
     text = "draw the meshes with crossings in colour, as .png or .pdf"
     add("--picture", type=Path, metavar="FILE", help=text)
 
@@ -74,12 +83,19 @@ def check(args: argparse.Namespace) -> int:
     two parts that went through each other, not crossings that grew or folds. Without, all
     are new.
 
+    With --between, shapes between the meshes are computed and checked too; crossings of the
+    meshes themselves are then known. The shell energy of the motion, of n steps, is n times
+    the sum of ShellLoss from each shape to the next: free of units, and less is better.
+
     exit status: 0 nothing passes through anything far, 3 something does
 
     Examples:
       torch-modal check open.obj fist.obj
+      torch-modal check open.obj fist.obj --between --contact
       torch-modal check out/frame-*.obj --keyframes open.obj fist.obj --picture crossings.png
     """
+    if args.contact and not args.between:
+        args.fail("--contact is for the shapes that --between computes")
     if args.picture:
         check_suffix(args.picture, PICTURES)
         check_output(args, [args.picture], [*args.meshes, *args.keyframes])
@@ -90,6 +106,14 @@ def check(args: argparse.Namespace) -> int:
     welded = tm.weld_seams(shapes, faces)
     keyframes, shapes = welded.keyframes.split([len(args.keyframes), len(args.meshes)])
     names = [str(mesh) for mesh in args.meshes]
+    if args.between:
+        keyframes, started = welded.keyframes, time.perf_counter()
+        frames = tm.subdivide(shapes, welded.faces, 3, **pick_options(args, "contact", "progress"))
+        seconds, shell = time.perf_counter() - started, tm.losses.ShellLoss(welded.faces)
+        motions = frames, tm.linear_sequence(shapes, tm.keyframe_places(len(names), 3))
+        ours, linear = (float((len(x) - 1) * shell(x[1:], x[:-1]).sum()) for x in motions)
+        args.report(f"shell energy of the motion: {ours:.4g}, of linear interpolation: {linear:.4g}; {seconds:.1f} s")
+        names, shapes = [f"t = {i / 8:g}" for i in range(len(frames))], frames
     contacts = tm.self_contacts(shapes, welded.faces, keyframes if len(keyframes) else None)
     used = shapes[0][welded.faces.unique()]
     depths = 100 * contacts.depth.amax(1) / (used.amax(0) - used.amin(0)).norm()

@@ -29,6 +29,7 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
     add("--keyframes", nargs="+", type=int, metavar="N", help=text)
     add("--cyclic", action="store_true", help="the last frame leads on to the first")
     add("--fps", type=float, metavar="X", help="frames a second (default: the GLB's, or 24)")
+    add("--up", choices=("y", "z"), help="what is up (default: Y, unless the first shape is flat in Y)")
     text = "write the page there, as .html (default: a temporary file, opened)"
     add("--page", type=Path, metavar="FILE", help=text)
     text = "a page to pick landmarks of two meshes or more; it starts with the landmarks of FILE, if given"
@@ -106,7 +107,7 @@ def _sequences(sequences: list[list[Path]], args: argparse.Namespace) -> tuple[P
                 f"{paths[0]} has {len(frames)} shapes, {sequences[0][0]} has {n}; compared sequences need equally many"
             )
         shapes.append(frames)
-    asked = {"keyframe_indices": args.keyframes, "fps": args.fps, "cyclic": args.cyclic or None}
+    asked = {"keyframe_indices": args.keyframes, "fps": args.fps, "cyclic": args.cyclic or None, "up": args.up}
     options |= {name: value for name, value in asked.items() if value is not None}
     if args.linear:
         cyclic = bool(options.get("cyclic"))
