@@ -66,7 +66,7 @@ def by_dem_bones(frames: np.ndarray, faces: np.ndarray, bones: int) -> tm.Skin:
 
     made = solve_skinning(frames[0], frames, bone_count=bones, faces=faces)
     rest, weights, transforms = map(torch.tensor, (frames[0], made.weights.T, made.transforms))
-    return tm.Skin(rest, weights, transforms, 0.0)
+    return tm.Skin(rest, weights, transforms, 0.0, 0.0)
 
 
 def played_errors(skin: tm.Skin, shapes: np.ndarray, faces: np.ndarray, folder: Path) -> list[float]:

@@ -1,5 +1,7 @@
 """Motions as bones: by motions that are known, and against the definition."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -11,7 +13,7 @@ import torch_modal as tm
 from torch_modal.data.samples import load_sample
 from torch_modal.errors import MeshWarning
 from torch_modal.geometry.rotations import exp, log
-from torch_modal.motion.skin import _convex_weights, _Decomposition
+from torch_modal.motion.skin import _convex_weights, _Decomposition, _halfway_errors
 
 X, FACES = triangles_of_tube()
 BENT = torch.tensor(np.stack([bend(X, turn) for turn in np.linspace(0.01, 0.9, 7)]))
@@ -30,11 +32,17 @@ def arm(generator: torch.Generator, units: float = 1.0) -> tuple[Tensor, Tensor,
     return units * frames, torch.tensor(FACES), weights
 
 
+def off_at_frames(skin: tm.Skin, frames: Tensor) -> float:
+    """Root mean square distance over the diagonal."""
+    diagonal = (frames[0].amax(0) - frames[0].amin(0)).norm()
+    return float((skin.shapes() - frames).square().sum(-1).mean().sqrt() / diagonal)
+
+
 @pytest.mark.parametrize("units", [1.0, 1e-3, 1e3])
 def test_bones_that_are_known_are_found(generator: torch.Generator, units: float) -> None:
     frames, faces, weights = arm(generator, units)
     skin = tm.bake(frames, faces, 2)
-    assert skin.error < 1e-4 and skin.weights.shape[1] == 2
+    assert off_at_frames(skin, frames) < 1e-4 and skin.error < 1e-3 and skin.weights.shape[1] == 2
     second = skin.weights[:, int(skin.weights[-1].argmax())]
     torch.testing.assert_close(second, weights, atol=0.01, rtol=0)
     assert (torch.linalg.det(skin.transforms[..., :3, :3]) - 1).abs().max() < 1e-9
@@ -49,7 +57,10 @@ def test_shapes_are_those_of_the_definition(generator: torch.Generator) -> None:
         expected += skin.weights[:, j, None] * (skin.rest @ turn.mT + shift[:, None])
     torch.testing.assert_close(skin.shapes(), expected)
     diagonal = float((frames[0].amax(0) - frames[0].amin(0)).norm())
-    assert skin.error == pytest.approx(float((expected - frames).square().sum(-1).mean().sqrt()) / diagonal)
+    at, between = (x.square().sum(-1).mean() for x in (expected - frames, _halfway_errors(skin, frames)))
+    assert skin.error_at_frames == pytest.approx(float(at.sqrt()) / diagonal)
+    assert skin.error_between_frames == pytest.approx(float(between.sqrt()) / diagonal)
+    assert skin.error == pytest.approx(float((0.5 * (at + between)).sqrt()) / diagonal)
     assert torch.equal(skin.rest, frames[0])
     assert (skin.weights >= 0).all() and ((skin.weights > 0).sum(1) <= 3).all()
     torch.testing.assert_close(skin.weights * 65_535, (skin.weights * 65_535).round(), atol=1e-6, rtol=0)
@@ -92,7 +103,44 @@ def test_bones_turn_no_more_than_the_body() -> None:
     skin = tm.bake(frames, ball.faces)
     turns = skin.transforms[1:, :, :3, :3] @ skin.transforms[:-1, :, :3, :3].mT
     assert log(turns).norm(dim=-1).max() < np.radians(20) + np.pi / 32  # that is the largest turn of a triangle
-    assert skin.error < 1.1e-4
+    assert off_at_frames(skin, frames) < 1.1e-4 and skin.error < 1.1e-4
+
+
+def test_ties_leave_a_rigid_motion_as_it_is(generator: torch.Generator) -> None:
+    turns = exp(torch.randn(5, 3, generator=generator, dtype=torch.float64))
+    turns[0] = torch.eye(3)
+    fit = _Decomposition(BENT[0] @ turns.mT, 1)
+    weights = torch.ones(len(X), 1, dtype=torch.float64)
+    free = fit._fit_bones(fit.still, weights)
+    tied = fit._fit_bones(free, weights, torch.tensor([1e6], dtype=torch.float64))
+    torch.testing.assert_close(
+        tied, free, atol=0.01, rtol=0
+    )  # the turns of the vertices have a small part of the identity
+    torch.testing.assert_close(free[:, 0, :, :3], turns)
+
+
+def test_bones_that_move_as_one_are_merged(generator: torch.Generator) -> None:
+    frames, _, second = arm(generator)
+    fit = _Decomposition(frames, 4)
+    bones = tm.bake(frames, FACES, 2).transforms[:, [0, 1, 0], :3]
+    weights = torch.stack([0.5 * second, 1 - second, 0.5 * second], 1)
+    found, left, ties = fit._merge_bones(weights, bones, torch.arange(3.0))
+    assert found.shape == (len(X), 2) and left.shape[1] == len(ties) == 2
+    torch.testing.assert_close(found.sum(1), torch.ones_like(second))
+
+
+def test_errors_half_way_between_frames_by_hand() -> None:
+    """One bone: the body turns by 80 degrees and moves; then the bone alone has a wrong place in the last frame."""
+    turns = exp(torch.tensor([[0.0, 0, 0], [0, 1.4, 0], [0, 2.8, 0]], dtype=torch.float64))
+    frames = BENT[0] @ turns.mT + torch.tensor([[[0.0, 0, 0]], [[5, 0, 0]], [[5, 5, 0]]])
+    maps = torch.eye(4, dtype=torch.float64).repeat(3, 1, 1, 1)
+    maps[:, 0, :3, :3], maps[1:, 0, 0, 3], maps[2, 0, 1, 3] = turns, 5, 5
+    skin = tm.Skin(BENT[0], torch.ones(len(X), 1, dtype=torch.float64), maps, 0.0, 0.0)
+    assert _halfway_errors(skin, frames).abs().max() < 1e-9
+    wrong = skin.transforms.clone()
+    wrong[2, 0, 2, 3] += 0.5
+    off = _halfway_errors(replace(skin, transforms=wrong), frames).norm(dim=-1)
+    torch.testing.assert_close(off, torch.tensor([[0.0], [0.25]], dtype=torch.float64).expand_as(off))
 
 
 def test_weights_are_the_best_of_all_pairs(generator: torch.Generator) -> None:
@@ -103,6 +151,12 @@ def test_weights_are_the_best_of_all_pairs(generator: torch.Generator) -> None:
     off = (torch.einsum("tjab,vb->tjva", bones, fit.rest) - frames[:, None]).square().sum(-1).mean(0)
     torch.testing.assert_close(error, off.min(0).values, atol=1e-9, rtol=1e-6)
     assert torch.equal(weights.argmax(1), off.argmin(0))
+
+
+def test_samples_are_followed() -> None:
+    hand = load_sample("hand")
+    frames = torch.cat([hand.keyframes[:1], hand.truth, hand.keyframes[1:]])
+    assert tm.bake(frames, hand.faces, 20).error < 5e-4
 
 
 def test_fewest_bones_of_a_tolerance() -> None:

@@ -1,5 +1,6 @@
 """Linear blend skinning: vertices that follow bones."""
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -22,15 +23,23 @@ class Skin:
         rest: The shape that the bones move, frame 0. *Shape:* ``(V, 3)``.
         weights: Not negative, with sum one. *Shape:* ``(V, J)``.
         transforms: Rigid motions of the bones from rest, in the coordinates of the shapes. *Shape:* ``(T, J, 4, 4)``.
-        error: Root mean square distance to the frames, over the bounding-box diagonal of frame 0.
+        error_at_frames: Root mean square distance to the frames, over the bounding-box diagonal of frame 0.
+        error_between_frames: Root mean square distance half-way between frames, as players show it, to the mean of both
+            after the turns of the body and of the bones' vertices; over the same diagonal.
         times: When the frames are, as passed to :func:`torch_modal.bake`. *Shape:* ``(T,)``.
     """
 
     rest: Tensor
     weights: Tensor
     transforms: Tensor
-    error: float
+    error_at_frames: float
+    error_between_frames: float
     times: Tensor | None = None
+
+    @property
+    def error(self) -> float:
+        """Root mean square of both errors."""
+        return math.hypot(self.error_at_frames, self.error_between_frames) / math.sqrt(2)
 
     @torch.no_grad()
     def shapes(self) -> Tensor:

@@ -19,16 +19,21 @@ from torch_modal.errors import MeshWarning
 from torch_modal.geometry.connectivity import merge_seams
 from torch_modal.geometry.inspect import diagonals
 from torch_modal.geometry.rigid import best_rotation
-from torch_modal.geometry.skin import STEPS, Skin
+from torch_modal.geometry.rotations import exp, log, matrix
+from torch_modal.geometry.skin import STEPS, Skin, blend_bones
 from torch_modal.io.write import check_frames
 from torch_modal.times import Times, check_times
 
-ROUNDS = 30  # at most; fewer where one lowers the squared error by less than half a hundredth
+ROUNDS = 20  # at most; fewer where one lowers the error by less than a hundredth
 SWEEPS = 2  # over the bones in a round
 LEAST = 4  # vertices of a new bone; fewer leave its rotation undetermined
-EQUAL = 1e-5  # error over the diagonal below which no bone is added
+EQUAL = 1e-5  # distance of motions that count as one, over the diagonal
 CHUNK = 2**22  # products of bones at vertices, in memory at a time
 TINY, RIDGE = 1e-30, 1e-10
+TIED = 8  # further rounds, in which the rotations of a bone are tied to the rotations in the neighbouring frames
+TIES = 0.01, 1.0  # first and largest weight of it, over the squared error of all vertices; fourfold where bones turn on
+TURN = np.cos(np.radians(15))  # of a bone between frames, relative to its vertices
+THIN = 1e-4  # part of the identity in the rotation of a bone's vertices, which may lie on a line
 
 
 @torch.no_grad()
@@ -43,8 +48,9 @@ def bake(
     """A motion as linear blend skinning: bones that move rigidly, and their weights at each vertex.
 
     Bones start from clusters of vertices that move alike, split where the error is largest; then weights and bones are
-    fitted in turns (Le and Deng 2012, Smooth Skinning Decomposition with Rigid Bones). Copies of a vertex along seams
-    have equal weights.
+    fitted in turns (Le and Deng 2012, Smooth Skinning Decomposition with Rigid Bones). Rotations are tied to the
+    neighbouring frames, as players interpolate between them. Bones that move as one are merged. Copies of a
+    vertex along seams have equal weights.
 
     Args:
         frames: Vertex positions, two frames or more. Frame 0 is the rest shape. *Shape:* ``(T, V, 3)``.
@@ -93,9 +99,13 @@ def bake(
         transforms = torch.eye(4, dtype=torch.float64).repeat(*fitted.shape[:2], 1, 1)
         transforms[..., :3, :3] = fitted[..., :3]
         transforms[..., :3, 3] = fitted[..., 3] * diagonal + after - fitted[..., :3] @ after[0, 0]
-        skin = Skin(like[0], weights[copies].to(like), transforms.to(like), 0.0, when)
-        off = skin.shapes().double().cpu() - torch.from_numpy(shapes)
-        return replace(skin, error=float(off.square().sum(-1).mean().sqrt()) / diagonal)
+        skin = Skin(like[0], weights[copies].to(like), transforms.to(like), 0.0, 0.0, when)
+        goal = torch.from_numpy(shapes)
+        at, between = (
+            float(off.square().sum(-1).mean().sqrt()) / diagonal
+            for off in (skin.shapes().double().cpu() - goal, _halfway_errors(skin, goal))
+        )
+        return replace(skin, error_at_frames=at, error_between_frames=between)
 
     best = skin(bones)
     if tolerance is None:
@@ -118,7 +128,7 @@ class _Decomposition:
     def __init__(self, x: Tensor, influences: int) -> None:
         self.influences = influences
         self.rest = torch.nn.functional.pad(x[0], (0, 1), value=1)
-        self.rows = x.mT.flatten(0, 1)
+        self.shapes, self.rows = x, x.mT.flatten(0, 1)
         self.still = torch.eye(3, 4).to(x).repeat(len(x), 1, 1, 1)
 
     def solve(self, most: int) -> tuple[Tensor, Tensor]:
@@ -128,14 +138,20 @@ class _Decomposition:
         for _ in range(ROUNDS):
             last, bones = error.mean(), self._fit_bones(bones, weights)
             weights, error = self._fit_weights(bones, self.influences)
-            if error.mean() > 0.995 * last:
+            if error.mean() > 0.98 * last:
                 break
-        used = weights.sum(0) * STEPS >= 1
-        weights = weights[:, used]
+        ties, total = torch.full_like(bones[0, :, 0, 0], TIES[0]), error.sum() + EQUAL**2 * len(error)
+        for _ in range(TIED):
+            bones = self._fit_bones(bones, weights, total * ties)
+            steps = bones[1:, ..., :3] @ bones[:-1, ..., :3].mT
+            beyond = (steps * _frame_rotations(self.shapes, weights)[0]).sum((-2, -1)) < 1 + 2 * TURN
+            ties = torch.where(beyond.any(0), (4 * ties).clamp_max(TIES[1]), ties)
+            weights, error = self._fit_weights(bones, self.influences)
+        weights, bones, ties = self._merge_bones(weights, bones, ties)
         whole = (weights * STEPS).floor()
         rank = (weights * STEPS - whole).argsort(1, descending=True).argsort(1)
         weights = (whole + (rank < STEPS - whole.sum(1, keepdim=True))) / STEPS
-        return weights, self._fit_bones(bones[:, used], weights)
+        return weights, self._fit_bones(bones, weights, total * ties)
 
     def _cluster_bones(self, most: int) -> Tensor:
         """Bones of clusters of vertices that move alike; those with the largest errors are halved."""
@@ -187,21 +203,87 @@ class _Decomposition:
             errors.append((error + x.square().sum(0)).clamp_min(0) / n_frames)
         return weights, torch.cat(errors)
 
-    def _fit_bones(self, bones: Tensor, weights: Tensor) -> Tensor:
-        """Bones one after the other, each by the best rigid motion for its part of the vertices."""
+    def _fit_bones(self, bones: Tensor, weights: Tensor, ties: Tensor | None = None) -> Tensor:
+        """Bones one after the other, each by the best rigid motion for its part of the vertices.
+
+        Ties ``(J,)`` add the squared change of a rotation between frames, without the turn of the bone's vertices.
+        """
         n_frames, n = bones.shape[:2]
         weighted = (weights[:, :, None] * self.rest[:, None]).flatten(1)
         sums, moments = weighted.mT @ weighted, self.rows @ weighted
         columns = bones.transpose(1, 2).reshape(3 * n_frames, 4 * n).clone()
+        steps = None if ties is None else _frame_rotations(self.shapes, weights)[0]
         for block in [slice(4 * j, 4 * j + 4) for j in range(n)] * SWEEPS:
             *_, mass = middle = sums[block, block][3]
             if mass > TINY:
                 moment = moments[:, block] - columns @ sums[:, block] + columns[:, block] @ sums[block, block]
                 moment, middle = moment.unflatten(0, (n_frames, 3)) / mass, middle[:3] / mass
-                rotation = best_rotation(moment[..., :3] - moment[..., 3:] * middle)
+                covariance = moment[..., :3] - moment[..., 3:] * middle
+                if ties is None or steps is None:
+                    rotation = best_rotation(covariance)
+                else:
+                    j, rotation = block.start // 4, columns[:, block].unflatten(0, (n_frames, 3))[..., :3].clone()
+                    for some in (slice(0, None, 2), slice(1, None, 2)):  # frames whose neighbours are the others
+                        neighbours = torch.zeros_like(rotation)
+                        neighbours[1:] += steps[:, j] @ rotation[:-1]
+                        neighbours[:-1] += steps[:, j].mT @ rotation[1:]
+                        rotation[some] = best_rotation((covariance + ties[j] / mass * neighbours)[some])
                 shift = moment[..., 3] - rotation @ middle
                 columns[:, block] = torch.cat([rotation, shift[..., None]], 2).flatten(0, 1)
         return columns.reshape(n_frames, 3, n, 4).transpose(1, 2)
+
+    def _merge_bones(self, weights: Tensor, bones: Tensor, ties: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Drop bones that move nothing, and merge bones that move alike."""
+        kept = weights.sum(0) * STEPS >= 1
+        while True:
+            weights, bones, ties = weights[:, kept], bones[:, kept], ties[kept]
+            weighted = weights[:, :, None] * self.rest[:, None]
+            sums = torch.einsum("vja,vjb->jab", weighted, weighted)
+            grams = _grams(bones)
+            norms = grams.diagonal().movedim(-1, 0)
+            apart = norms[:, None] + norms - grams - grams.transpose(0, 1)
+            off = (apart * sums[:, None]).sum((2, 3)) / (len(bones) * sums[:, 3, 3, None])
+            j, k = divmod(int(off.fill_diagonal_(torch.inf).argmin()), len(off))
+            if off[j, k] > EQUAL**2:
+                return weights, bones, ties
+            weights[:, k] += weights[:, j]
+            kept = torch.arange(len(off), device=off.device) != j
+
+
+def _frame_rotations(x: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+    """Rotations of each bone's vertices from frame to frame, and their centres.
+
+    *Shape:* ``(T, V, 3), (V, J) -> (T - 1, J, 3, 3), (T, J, 3)``.
+    """
+    parts = weights / weights.sum(0).clamp_min(TINY)
+    centres = parts.mT @ x
+    sums = x.mT.flatten(0, 1) @ (parts[:, :, None] * x[0, :, None]).flatten(1)
+    moments = (
+        sums.unflatten(1, (-1, 3)).unflatten(0, (-1, 3)).transpose(1, 2) - centres[..., None] * centres[0, :, None]
+    )
+    width = moments[0].diagonal(dim1=1, dim2=2).sum(1)[:, None, None]
+    turns = best_rotation(moments + THIN * width * torch.eye(3).to(x))
+    return turns[1:] @ turns[:-1].mT, centres
+
+
+def _halfway_errors(skin: Skin, shapes: Tensor) -> Tensor:
+    """Errors of what players show half-way between frames, against the mean of both. *Shape:* ``(T - 1, V, 3)``.
+
+    The mean is taken after the turns of the body and, in its frame, of the bones' vertices, both put back by half.
+    """
+    bind, turns, shifts = skin.tracks()
+    weights, rest, middles = skin.weights.double().cpu(), skin.rest.double().cpu(), bind[1:, :3, 3:]
+    rotations = matrix(turns).movedim((0, 1), (2, 3))
+    local = (shapes - shifts[:, :1]) @ rotations[:, 0]
+    steps, centres = _frame_rotations(local, weights)
+    half = exp(0.5 * log(steps))
+    played = rotations[:-1, 1:] @ exp(0.5 * log(rotations[:-1, 1:].mT @ rotations[1:, 1:]))
+    shift = 0.5 * (shifts[:-1, 1:] + shifts[1:, 1:])[..., None] - played @ middles
+    off = blend_bones(weights, torch.cat([played, shift], 3), rest.expand(len(half), -1, -1))
+    centres = centres[..., None]
+    for turn, middle, x in ((half, centres[:-1], local[:-1]), (half.mT, centres[1:], local[1:])):
+        off -= 0.5 * blend_bones(weights, torch.cat([turn, middle - turn @ middle], 3), x)
+    return off
 
 
 def _grams(bones: Tensor) -> Tensor:
