@@ -15,7 +15,6 @@ from torch_modal.elastic.steps import (
     RIDGE,
     SumOfEnergies,
     TermsTowards,
-    chunk_of,
     descend,
     inverse_of_symmetric,
     step_length,
@@ -130,9 +129,3 @@ def test_a_step_that_goes_uphill_ends_where_the_parabola_is_least(case: Case) ->
     shorter = case.rows + length[:, None] * core.extend(move)
     assert bool((core.value(shorter, case.reference) < before).all())
     torch.testing.assert_close(length[0], -0.5 * slope[0] / (after - before - slope)[0])
-
-
-def test_chunks_fit_into_caches_or_the_memory_of_a_gpu() -> None:
-    assert chunk_of(10_000, torch.device("cpu")) == 2
-    assert chunk_of(10_000, torch.device("cuda")) == 100
-    assert chunk_of(10**8, torch.device("cpu")) == 1, "never none"

@@ -46,7 +46,6 @@ class Distortion(nn.Module):
         further: Terms beyond Eq. 5.
     """
 
-    vertices: Tensor
     edge: Tensor
     edges: Tensor
     hinge: Tensor
@@ -58,17 +57,8 @@ class Distortion(nn.Module):
         n_edges, n_hinges = len(interior), int(interior.sum())
         edge = torch.linspace(0, n_edges - 1, min(n_edges, MOST_ELEMENTS), dtype=torch.float64).round().long()
         hinge = (interior.cumsum(0) - 1)[edge[interior[edge]]]
-        edges, hinges = mesh.edges[edge], mesh.hinges[hinge]
-        vertices, places = torch.cat([edges.flatten(), hinges.flatten()]).unique(return_inverse=True)
-        own_edges, own_hinges = places.split([edges.numel(), hinges.numel()])
-        buffers = {
-            "vertices": vertices,
-            "edge": edge,
-            "edges": own_edges.view_as(edges).T.contiguous(),
-            "hinge": hinge,
-            "hinges": own_hinges.view_as(hinges).T.contiguous(),
-        }
-        for name, values in buffers.items():
+        elements = {"edge": edge, "edges": mesh.edges[edge], "hinge": hinge, "hinges": mesh.hinges[hinge]}
+        for name, values in elements.items():
             self.register_buffer(name, values, persistent=False)
         #: How many elements each one stands for.
         self.shares = n_edges / len(edge), n_hinges / max(len(self.hinge), 1)
@@ -85,9 +75,9 @@ class Distortion(nn.Module):
     def of_shell(self, shapes: Sequence[Tensor], rests: RestShapes) -> Tensor:
         """Stretching and bending. *Shape of each:* ``(B, V, 3) -> (S, B)``."""
         # All shapes at once: for so few elements, the number of operations determines the time.
-        rows = self._rows(*shapes, *rests.shapes.unbind(1))
-        hinges = edge_vectors_of(rows, self.hinges)
-        n, lengths, angles = len(shapes), norm(edge_vectors_of(rows, self.edges)[0]), BEND.measure(hinges)
+        rows = torch.stack([*shapes, *rests.shapes.unbind(1)]).movedim(-1, 0).contiguous()
+        hinges = edge_vectors_of(rows, self.hinges.T)
+        n, lengths, angles = len(shapes), norm(edge_vectors_of(rows, self.edges.T)[0]), BEND.measure(hinges)
         alpha, beta = self.on_elements(rests.stiffness)
         off = (lengths[:n, None] - lengths[n:]).abs()
         stretching = (alpha * off * (off / lengths[n:]).clamp_max(LARGEST_STRAIN)).sum(-1)
@@ -102,25 +92,12 @@ class Distortion(nn.Module):
 
     def slight(self, stiffness: Sequence[Tensor], like: Tensor) -> Tensor:
         """The distortion of a shape whose edges are all strained by :data:`SLIGHT`. *Shape:* ``(B,)``."""
-        lengths = norm(edge_vectors_of(self._rows(like.detach()), self.edges)[0]).sum((0, -1))
+        lengths = norm(edge_vectors_of(like.detach().movedim(-1, 0), self.edges.T)[0]).sum(-1)
         return self.shares[0] * stiffness[0].detach().mean(-1) * lengths * SLIGHT**2
-
-    def _rows(self, *shapes: Tensor) -> Tensor:
-        """The vertices of the elements, components first. *Shape of each:* ``(B, V, 3) -> (3, S, B, n)``."""
-        picked = torch.stack([x.index_select(-2, self.vertices) for x in shapes])
-        return picked.movedim(-1, 0).contiguous()
 
 
 class KernelDistortion(Distortion):
     """:class:`Distortion` without gradients in one kernel, in float64; with them it is the base class."""
-
-    elements: Tensor
-    hinged: Tensor
-
-    def __init__(self, mesh: Mesh, further: Energy | None) -> None:
-        super().__init__(mesh, further)
-        for name, places in (("elements", self.edges), ("hinged", self.hinges)):
-            self.register_buffer(name, self.vertices[places].T.int().contiguous(), persistent=False)
 
     def of_shell(self, shapes: Sequence[Tensor], rests: RestShapes) -> Tensor:
         """Overrides the base class."""
@@ -135,8 +112,8 @@ class KernelDistortion(Distortion):
         args += stiffness
         launch(
             make_once(kernels).distortion,
-            (n_samples, len(self.elements)),
-            [self.elements, self.hinged, *args, *sizes, sums],
+            (n_samples, len(self.edges)),
+            [self.edges.int(), self.hinges.int(), *args, *sizes, sums],
         )
         return (sums @ sums.new_tensor(self.shares)).to(rests.weights)
 

@@ -177,16 +177,13 @@ class Energy(nn.Module):
         for term, more in zip(terms, n_anchors, strict=True):
             _outlasting_buffers(term)
             corners, last = term.elements(mesh), n + more
-            if corners.dim() != 2 or corners.shape[1] < 2 or corners.is_floating_point():
+            lowest, highest = (float(corners.min()), float(corners.max())) if corners.numel() else (0, last)
+            rows = corners.dim() == 2 and corners.shape[1] >= 2 and not corners.is_floating_point()
+            if not (rows and 0 <= lowest <= highest <= last):
                 raise ValueError(
-                    f"{type(term).__name__}.elements gave {tuple(corners.shape)} of {corners.dtype}; they are rows of "
-                    "two vertex indices or more, (M, n)"
-                )
-            lowest, highest = (int(corners.min()), int(corners.max())) if corners.numel() else (0, last)
-            if not 0 <= lowest <= highest <= last:
-                raise ValueError(
-                    f"{type(term).__name__}.elements gave vertices from {lowest} to {highest}; they are 0 to {last}: "
-                    "vertices of the mesh, its centre, and the anchors of the term"
+                    f"{type(term).__name__}.elements are rows of two vertex indices or more, (M, n), from 0 to {last}: "
+                    "vertices of the mesh, its centre, and the anchors of the term; got "
+                    f"{tuple(corners.shape)} of {corners.dtype}, from {lowest:g} to {highest:g}"
                 )
             elements.append(corners)
         vertices = torch.arange(n)

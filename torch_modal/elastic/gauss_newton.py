@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from torch_modal.autograd import disable_compile, full_precision
-from torch_modal.elastic.minimise import AmplitudeEnergy, Solution, Status, add_ridge
+from torch_modal.elastic.minimise import Solution, Status, add_ridge
 from torch_modal.elastic.modal import Derivatives
 
 # Parts of a step that are tried side by side.
@@ -49,7 +49,7 @@ class GaussNewtonStep(nn.Module):
             Default: 1e-12 in float64, 1e-6 in float32.
     """
 
-    def __init__(self, energy: AmplitudeEnergy, damping: float | None = None) -> None:
+    def __init__(self, energy: Any, damping: float | None = None) -> None:
         super().__init__()
         self.energy = energy
         self.damping = damping
@@ -106,7 +106,7 @@ def _directions(derivatives: Derivatives, damping: float | None) -> Tensor:
 
 
 def newton(
-    energy: AmplitudeEnergy,
+    energy: Any,
     a: Tensor,
     placement: Any,
     max_steps: int = 10,

@@ -1,6 +1,7 @@
 """Gradients of a minimiser: by the implicit function theorem, or through a fixed number of steps."""
 
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 import torch
@@ -9,7 +10,7 @@ from torch import Tensor
 from torch_modal import trees
 from torch_modal.autograd import apply_function, apply_transpose, is_double_backward, merge_vmapped
 from torch_modal.elastic.gauss_newton import newton
-from torch_modal.elastic.minimise import AmplitudeEnergy, Solution, Status, add_ridge, minimise
+from torch_modal.elastic.minimise import Solution, Status, add_ridge, minimise
 from torch_modal.threads import warn
 
 Inverse = Callable[[Any, Tensor, Any, Tensor], Callable[[Tensor], Tensor]]
@@ -30,7 +31,7 @@ class _ArgMin(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        energy: AmplitudeEnergy, limits: tuple[Any, ...], tree: Any, usable: Tensor, *tensors: Tensor
+        energy: Any, limits: tuple[Any, ...], tree: Any, usable: Tensor, *tensors: Tensor
     ) -> tuple[Tensor, ...]:
         method, max_steps, tolerance, _ = limits
         start = usable.new_zeros(len(usable), energy.n_amplitudes, dtype=tensors[0].dtype)
@@ -61,14 +62,14 @@ class _ArgMin(torch.autograd.Function):
 
     @staticmethod
     def vmap(
-        info: Any, in_dims: tuple[Any, ...], energy: AmplitudeEnergy, limits: Any, tree: Any, *tensors: Tensor
+        info: Any, in_dims: tuple[Any, ...], energy: Any, limits: Any, tree: Any, *tensors: Tensor
     ) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
         output = _ArgMin.apply(energy, limits, tree, *merge_vmapped(info.batch_size, in_dims[3:], tensors))
         return tuple(value.unflatten(0, (info.batch_size, -1)) for value in output), (0,) * len(output)
 
 
 def _adjoint(
-    energy: AmplitudeEnergy, inverse: Inverse, tree: Any, amplitudes: Tensor, status: Tensor, *tensors: Tensor
+    energy: Any, inverse: Inverse, tree: Any, amplitudes: Tensor, status: Tensor, *tensors: Tensor
 ) -> Callable[[Tensor], tuple[Tensor, ...]]:
     """From gradients in the amplitudes, ``(B, n)``, to those in the tensors of the placement: linear."""
     solve = inverse(energy, amplitudes, trees.fill(tree, tensors), status == Status.CONVERGED)
@@ -87,9 +88,7 @@ def _adjoint(
     return pull_back
 
 
-def dense_inverse(
-    energy: AmplitudeEnergy, amplitudes: Tensor, placement: Any, converged: Tensor
-) -> Callable[[Tensor], Tensor]:
+def dense_inverse(energy: Any, amplitudes: Tensor, placement: Any, converged: Tensor) -> Callable[[Tensor], Tensor]:
     """Products with the inverse of the full Hessian; zero for samples that did not converge. *Shape:* ``(B, n)``."""
     hessian = add_ridge(energy.derivatives(amplitudes, placement).hessian)
     eye = torch.eye(hessian.shape[-1], dtype=hessian.dtype, device=hessian.device)
@@ -98,23 +97,13 @@ def dense_inverse(
     def solve(right: Tensor) -> Tensor:
         solution, info = torch.linalg.solve_ex(matrix, right)
         singular = (info != 0)[:, None]
-        _warn_of_singular(singular)
+        with suppress(RuntimeError):  # under vmap there is no number to see
+            if number := int(singular.sum()):
+                what = "the Hessian of {} in-betweens is singular: no gradient flows through their amplitudes"
+                warn(what, number, ConvergenceWarning)
         return torch.where(converged[:, None] & ~singular, solution, 0)
 
     return solve
-
-
-def _warn_of_singular(singular: Tensor) -> None:
-    try:
-        number = int(singular.sum())
-    except RuntimeError:  # under vmap there is no number to see
-        return
-    if number:
-        warn(
-            "the Hessian of {} in-betweens is singular: no gradient flows through their amplitudes",
-            number,
-            ConvergenceWarning,
-        )
 
 
 def solve_implicit(
@@ -141,9 +130,7 @@ def solve_implicit(
     return Solution(*apply_function(_ArgMin, energy, limits, tree, usable, *trees.leaves(placement)))
 
 
-def solve_unrolled(
-    energy: AmplitudeEnergy, placement: Any, usable: Tensor, max_steps: int, tolerance: float
-) -> Solution:
+def solve_unrolled(energy: Any, placement: Any, usable: Tensor, max_steps: int, tolerance: float) -> Solution:
     """Take exactly ``max_steps`` steps from zeros; gradients flow back through all of them.
 
     Arguments as for :func:`solve_implicit`.

@@ -143,7 +143,10 @@ class KernelVolume(KernelTerm):
         extended = self.extend(x)
         to_extended = to_x if self.closed else torch.zeros_like(extended)
         to_normal = None if to_normal is None else self.extend(to_normal)
-        self.of_faces("sizes_back", extended, to_sizes, self.n_faces, to_normal, to_extended)
+        normal = None if to_normal is None else torch.empty_like(to_normal)
+        values = [self.faces, extended.shape[1], extended, torch.empty_like(to_sizes), self.n_faces, normal]
+        adjoints = [None, None, to_extended, to_sizes, None, to_normal]
+        launch(make_once(volume.kernels).sizes, (len(x), len(self.faces)), values, adjoints)
         if not self.closed:
             to_x.add_(self.fold(to_extended))
 

@@ -5,40 +5,19 @@ Hessians of a Newton method, and need no second-order term.
 """
 
 from enum import IntEnum
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from torch_modal import trees
 from torch_modal.elastic.energy import energy_rounding
-from torch_modal.elastic.modal import Derivatives
 
 # Evaluations of the gradient with one Hessian of Gauss and Newton. Samples that need more get another.
 MOST_EVALUATIONS = 40
 
 # Steps shorter than this part of the quasi-Newton step make no progress worth an evaluation.
 SHORTEST = 0.02
-
-
-class AmplitudeEnergy(Protocol):
-    """Protocol of an energy of amplitudes with its derivatives."""
-
-    @property
-    def n_amplitudes(self) -> int:
-        """Number of amplitudes, n."""
-
-    def value(self, a: Tensor, placement: Any) -> Tensor:
-        """Energy. *Shape:* ``(..., B, n) -> (..., B)``."""
-
-    def derivatives(self, a: Tensor, placement: Any, second_order: bool = True) -> Derivatives:
-        """Derivatives. *Shape:* ``(B, n)``."""
-
-    def value_and_gradient(self, a: Tensor, placement: Any) -> tuple[Tensor, Tensor]:
-        """Energy and gradient, which can be differentiated in all that the placement holds.
-
-        *Shape:* ``(B, n) -> (B,), (B, n)``.
-        """
 
 
 class Status(IntEnum):
@@ -119,9 +98,7 @@ class State(NamedTuple):
     """The arguments of the energy for each sample."""
 
 
-def minimise(
-    energy: AmplitudeEnergy, a: Tensor, placement: Any, max_steps: int = 80, tolerance: float = 3e-7
-) -> Solution:
+def minimise(energy: Any, a: Tensor, placement: Any, max_steps: int = 80, tolerance: float = 3e-7) -> Solution:
     """Minimise by BFGS from the Gauss-Newton Hessian.
 
     A step is taken if the energy falls; otherwise the next one is half as long. A converged sample takes one more step,
@@ -130,7 +107,8 @@ def minimise(
     not depend on its batch.
 
     Args:
-        energy: The energy of the amplitudes.
+        energy: The energy of the amplitudes: a :class:`~torch_modal.elastic.modal.ModalEnergy`, or what has its
+            methods ``derivatives`` and ``value_and_gradient``.
         a: Where to start. *Shape:* ``(B, n)``.
         placement: What the energy knows of each sample: nested tuples of tensors. *Shape of each:* ``(B, ...)``.
         max_steps: Evaluations of the gradient at most.

@@ -153,18 +153,14 @@ class SumOfEnergies:
     def newton_direction(at: Point, n_products: int, keep: bool = False) -> tuple[Tensor]:
         """An approximate solution with the Hessian for the opposite of the gradient. *Shape:* ``(B, V, 3)``."""
         inverse = inverse_of_symmetric(at.diagonal.movedim(-1, 0))
-
-        def product(field: Tensor) -> Tensor:
-            return at.product(field.movedim(0, -1)).movedim(-1, 0)
-
-        def precondition(residual: Tensor) -> Tensor:
-            return (inverse * residual).sum(1)
-
-        def dot(a: Tensor, b: Tensor) -> Tensor:
-            return (a * b).sum((0, -1))[:, None]
-
-        right = -at.gradient.movedim(-1, 0)
-        return (conjugate_gradients(product, precondition, dot, right, n_products).movedim(0, -1),)
+        solution = conjugate_gradients(
+            lambda field: at.product(field.movedim(0, -1)).movedim(-1, 0),
+            lambda residual: (inverse * residual).sum(1),
+            lambda a, b: (a * b).sum((0, -1))[:, None],
+            -at.gradient.movedim(-1, 0),
+            n_products,
+        )
+        return (solution.movedim(0, -1),)
 
 
 def conjugate_gradients(
@@ -235,12 +231,12 @@ class TermsTowards(FreeEnergy):
         """*Shape:* ``(B, V, 3)``."""
         energy, n = self.energy, x.shape[1]
         at = EnergyAt(energy, self._extend(x), self.reference)
-
-        def product(field: Tensor) -> Tensor:
-            return energy.fold(at.product(energy.extend(field.movedim(-1, 0)))).movedim(0, -1)
-
-        gradient, diagonal = energy.fold(at.gradient()), at.diagonal()[..., :n]
-        return Point(at.value, gradient.movedim(0, -1), diagonal.movedim(0, -1), product)
+        return Point(
+            at.value,
+            energy.fold(at.gradient()).movedim(0, -1),
+            at.diagonal()[..., :n].movedim(0, -1),
+            lambda field: energy.fold(at.product(energy.extend(field.movedim(-1, 0)))).movedim(0, -1),
+        )
 
 
 ExtraEnergies = Callable[[slice, Tensor], Sequence[FreeEnergy]]
@@ -267,7 +263,7 @@ class FineEnergy(nn.Module):
 
         *Shape:* ``(B, V, 3)``.
         """
-        size, parts = chunk_of(x.shape[1], x.device), []
+        size, parts = max(1, (CHUNK if x.device.type == "cpu" else CHUNK_OF_GPU) // x.shape[1]), []
         for i in range(0, len(x), size):
             some = slice(i, i + size)
             start, others = x[some], () if extra is None else extra(some, x[some])
@@ -293,8 +289,3 @@ def descend_in_stages(problem: Any, x: Tensor, stages: Sequence[tuple[int, int]]
     for n_steps, n_products in stages:
         x = descend(problem, x, n_steps, n_products)
     return x
-
-
-def chunk_of(n_vertices: int, device: torch.device) -> int:
-    """Number of samples of so many vertices that are relaxed at a time."""
-    return max(1, (CHUNK if device.type == "cpu" else CHUNK_OF_GPU) // n_vertices)

@@ -109,7 +109,7 @@ def kernels() -> SimpleNamespace:
     real, vec3, module = wp.float64, wp.vec3d, wp.get_module("torch_modal.elastic.kernels.volume")
     half, sixth = wp.constant(real(0.5)), wp.constant(real(1 / 6))
 
-    @wp.kernel(module=module, enable_backward=False)
+    @wp.kernel(module=module)
     def sizes(
         faces: wp.array[wp.vec3i], n_vertices: int, x: wp.array[vec3], result: wp.array[vec3], n_areas: int,
         normal: wp.array[vec3], threads: int,
@@ -136,43 +136,6 @@ def kernels() -> SimpleNamespace:
             if k < n_areas:
                 surface += half * length_of(doubled)
         wp.atomic_add(result, 2 * s + 1, vec3(inside, surface, real(0.0)))
-
-    @wp.func
-    def area_of(p: vec3, q: vec3, r: vec3, factor: real):
-        return half * factor * length_of(wp.cross(q - p, r - p))
-
-    @wp.kernel(module=module)
-    def sizes_back(
-        faces: wp.array[wp.vec3i], n_vertices: int, x: wp.array[vec3], to_sizes: wp.array[vec3], n_areas: int,
-        to_normal: wp.array[vec3], to_x: wp.array[vec3], threads: int,
-    ):  # fmt: skip
-        """Adds the gradients; what the normals receive may be left out."""
-        i = wp.tid()
-        s = i // threads
-        v = s * n_vertices
-        middle = x[place(v, faces[faces.shape[0] - 1][2])]
-        inside = sixth * to_sizes[2 * s + 1][0]
-        surface = to_sizes[2 * s + 1][1]
-        to_all = vec3()
-        for k in range(i - s * threads, faces.shape[0], threads):
-            face = faces[place(k, 0)]
-            p = x[place(v, face[0])] - middle
-            q = x[place(v, face[1])] - middle
-            r = x[place(v, face[2])] - middle
-            if to_normal:
-                to_all = to_normal[place(v, face[0])] + to_normal[place(v, face[1])] + to_normal[place(v, face[2])]
-                to_all = sixth * to_all
-            of_p = inside * wp.cross(q, r) + wp.cross(q - r, to_all)
-            of_q = inside * wp.cross(r, p) + wp.cross(r - p, to_all)
-            of_r = inside * wp.cross(p, q) + wp.cross(p - q, to_all)
-            if surface != real(0.0) and k < n_areas:
-                more_p, more_q, more_r, _0 = wp.grad(area_of)(p, q, r, surface)
-                of_p += more_p
-                of_q += more_q
-                of_r += more_r
-            wp.atomic_add(to_x, place(v, face[0]), of_p)
-            wp.atomic_add(to_x, place(v, face[1]), of_q)
-            wp.atomic_add(to_x, place(v, face[2]), of_r)
 
     @wp.func
     def columns_of(columns: wp.array[wide], v: int, n_blocks: int, b: int):
@@ -202,4 +165,4 @@ def kernels() -> SimpleNamespace:
                     for a in range(3):
                         wp.atomic_add(out, place(to, a * n_blocks), result[a])
 
-    return SimpleNamespace(sizes=sizes, sizes_back=sizes_back, curved=curved)
+    return SimpleNamespace(sizes=sizes, curved=curved)

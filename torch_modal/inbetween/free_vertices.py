@@ -34,7 +34,7 @@ Placement = tuple[Tensor, Reference]
 class FreeVertices(nn.Module):
     """The energy in the displacements of some vertices, with the others fixed, in float64.
 
-    It is an :class:`~torch_modal.elastic.minimise.AmplitudeEnergy`; instead of a dense Hessian it has :meth:`inverse`.
+    It has the methods of a :class:`~torch_modal.elastic.modal.ModalEnergy`, and :meth:`inverse` instead of a Hessian.
 
     Args:
         energy: The energy.
