@@ -11,7 +11,7 @@ from shapes import edge_error, largest
 from torch import Tensor
 
 from torch_modal.elastic.bend import NEEDLE, SquaredBend, fullness
-from torch_modal.elastic.energy import Energy, RestShapes
+from torch_modal.elastic.energy import Energy, Rest, RestShapes
 from torch_modal.elastic.minimise import Status
 from torch_modal.elastic.shell import ShellEnergy
 from torch_modal.elastic.stretch import Stretch
@@ -138,13 +138,17 @@ def test_minimises_eq_5_against_measures_half_way_and_moves_nothing_else(
     usable = torch.ones(1, dtype=torch.bool)
     found, status = LocalInterpolation(mesh, energy, region)([y[None] for y in starts], given, usable)
     assert status.tolist() == [Status.CONVERGED]
-    rests = [energy.rest_of(y[None]) for y in (x, other)]
+
+    def rest_of(y: Tensor) -> Rest:
+        return energy.rest(energy.extend(y[None].movedim(-1, 0)))
+
+    rests = [rest_of(y) for y in (x, other)]
 
     x_full, y_full = (fullness(energy.parts[1].edge_vectors(z.mT[:, None]), NEEDLE) for z in (x, other))
 
     def gradient(y: Tensor) -> Tensor:
         y = y.clone().requires_grad_()
-        now, total = energy.rest_of(y[None]), torch.zeros((), dtype=torch.float64)
+        now, total = rest_of(y), torch.zeros((), dtype=torch.float64)
         for i, stiffness in enumerate((alpha, beta * x_full * y_full)):
             a, b = (rest.measures[i] for rest in rests)
             off = now.measures[i] - (a + energy.parts[i].term.difference(b, a) / 2)

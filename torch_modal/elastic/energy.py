@@ -42,6 +42,11 @@ class Reference(NamedTuple):
     constant: Tensor
     """The energy that remains, whatever the shape. *Shape:* ``(...)``."""
 
+    @classmethod
+    def of_records(cls, records: Sequence[Tensor]) -> "Reference":
+        """Records alone, without the constant."""
+        return cls(tuple(records), records[0].new_zeros(len(records[0])))
+
     def transpose(self) -> "Reference":
         """Records in the layout of kernels from the layout of torch, or the other way round."""
         return Reference(tuple(record.mT.contiguous() for record in self.records), self.constant)

@@ -131,24 +131,21 @@ class _Relaxation(Operation):
     def __init__(self, kernels: KernelEnergy, n_steps: int, n_products: int) -> None:
         self.kernels, self.n_steps, self.n_products = kernels, n_steps, n_products
 
-    def _reference(self, records: Sequence[Tensor]) -> Reference:
-        return Reference(tuple(records), records[0].new_zeros(len(records[0])))
-
     def run(self, kept: list[Any] | None, x: Tensor, *records: Tensor) -> tuple[Tensor, ...]:
-        problem = KernelProblem(self.kernels, self._reference(records))
+        problem = KernelProblem(self.kernels, Reference.of_records(records))
         with torch.no_grad():
             return (descend(problem, x, self.n_steps, self.n_products, kept),)
 
     def back(self, kept: list[Any], grads: Sequence[Tensor], x: Tensor, *records: Tensor) -> tuple[Tensor | None, ...]:
         if not kept:
             self.run(kept, x, *records)
-        to_x, to, to_records = grads[0], self._reference(records), [torch.zeros_like(record) for record in records]
+        to_x, to, to_records = grads[0], Reference.of_records(records), [torch.zeros_like(record) for record in records]
         for step in reversed(kept):
             to_x = self._step_back(step, to, to_x, to_records)
         return to_x, *to_records
 
     def by_torch(self, x: Tensor, *records: Tensor) -> tuple[Tensor, ...]:
-        terms = TermsTowards(self.kernels.energy, self._reference(records).transpose())
+        terms = TermsTowards(self.kernels.energy, Reference.of_records(records).transpose())
         return (descend(SumOfEnergies([terms]), x, self.n_steps, self.n_products),)
 
     def _step_back(self, step: Any, to: Reference, to_reached: Tensor, to_records: Sequence[Tensor]) -> Tensor:

@@ -325,23 +325,19 @@ class _GradientAndValue(Operation):
 
     def run(self, kept: list[Any] | None, a: Tensor, base: Tensor, *records: Tensor) -> tuple[Tensor, ...]:
         modal = self.modal
-        value, gradient = modal.kernels.value_and_gradient(modal.shapes(a, base), _without_constant(records))
+        value, gradient = modal.kernels.value_and_gradient(modal.shapes(a, base), Reference.of_records(records))
         return gradient.flatten(1) @ modal.flat.double().mT, value
 
     def back(
         self, kept: list[Any], grads: Sequence[Tensor], a: Tensor, base: Tensor, *records: Tensor
     ) -> tuple[Tensor | None, ...]:
-        modal, to = self.modal, _without_constant(records)
+        modal, to = self.modal, Reference.of_records(records)
         x, moved = modal.shapes(a, base), modal.shapes(grads[0], torch.zeros_like(base))
         to_base, to_records = torch.zeros_like(x), [torch.zeros_like(record) for record in records]
         modal.kernels.back(x, modal.kernels.at(x, to, 1), to, moved, to_base, to_records)
         return to_base.flatten(1) @ modal.flat.double().mT, to_base, *to_records
 
     def by_torch(self, a: Tensor, base: Tensor, *records: Tensor) -> tuple[Tensor, ...]:
-        placement = self.modal.by_torch(Placement(base, _without_constant(records)))
+        placement = self.modal.by_torch(Placement(base, Reference.of_records(records)))
         value, gradient = ModalEnergy.value_and_gradient(self.modal, a.to(placement.base), placement)
         return gradient.to(a), value.to(a)
-
-
-def _without_constant(records: Sequence[Tensor]) -> Reference:
-    return Reference(tuple(records), records[0].new_zeros(len(records[0])))

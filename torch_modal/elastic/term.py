@@ -55,7 +55,7 @@ class Potential(NamedTuple):
     """A function of measures and of a record of K rest shapes, as functions of Warp on one element."""
 
     record: Any
-    """The struct of a row of :attr:`torch_modal.elastic.energy.Reference.records`."""
+    """The type of a row of :attr:`torch_modal.elastic.energy.Reference.records`; its first number is the weight."""
     kind: Any
     """The type of the measures."""
     sums: Any
@@ -73,10 +73,6 @@ class Potential(NamedTuple):
     """Energy that is left: sums, factor, record."""
     n_rows: int
     """Numbers of a record."""
-    row: Any
-    """The type of a vector of them."""
-    pack: Any
-    """From the record to that."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -356,12 +352,7 @@ def square() -> Potential:
     """The potential of :class:`Term`."""
     import warp as wp
 
-    real, vec3, row = wp.float64, wp.vec3d, wp.vec2d
-
-    @wp.struct
-    class Square:
-        weight: real
-        value: real
+    real, vec3, record = wp.float64, wp.vec3d, wp.vec2d
 
     @wp.func
     def moments(q: real, w: real):
@@ -369,56 +360,42 @@ def square() -> Potential:
 
     @wp.func
     def merge_rests(m: vec3, factor: real):
-        to = Square()
+        to = record()
         if m[0] > real(0.0):
-            to.weight = factor * m[0]
-            to.value = m[1] / m[0]
+            to = record(factor * m[0], m[1] / m[0])
         return to
 
     @wp.func
-    def energy(q: real, to: Square):
-        return to.weight * (q - to.value) * (q - to.value)
+    def energy(q: real, to: record):
+        return to[0] * (q - to[1]) * (q - to[1])
 
     @wp.func
-    def slope(q: real, to: Square):
-        return real(2.0) * to.weight * (q - to.value)
+    def slope(q: real, to: record):
+        return real(2.0) * to[0] * (q - to[1])
 
     @wp.func
     def rate(q: real, gradient: real):
         return gradient
 
     @wp.func
-    def left(m: vec3, factor: real, to: Square):
+    def left(m: vec3, factor: real, to: record):
         energy_left = real(0.0)
         if m[0] > real(0.0):
-            energy_left = factor * (m[2] - m[1] * to.value)
+            energy_left = factor * (m[2] - m[1] * to[1])
         return energy_left
 
-    @wp.func
-    def pack(to: Square):
-        return row(to.weight, to.value)
-
-    return Potential(Square, real, vec3, moments, merge_rests, energy, slope, rate, left, 2, row, pack)
+    return Potential(record, real, vec3, moments, merge_rests, energy, slope, rate, left, 2)
 
 
 @cache
 @no_type_check
 def periodic() -> Potential:
-    """The potential of :class:`PeriodicTerm`, of cosine and sine of the measure."""
+    """The potential of :class:`PeriodicTerm`, of cosine and sine of the measure, with the rows of its record."""
     import warp as wp
 
     real, vec2 = wp.float64, wp.vec2d
-    vec5, row = (wp.types.vector(length=n, dtype=real) for n in (5, 6))
+    vec5, record = (wp.types.vector(length=n, dtype=real) for n in (5, 6))
     third = wp.constant(real(1 / 3))
-
-    @wp.struct
-    class Periodic:
-        weight: real
-        c: real
-        s: real
-        once: real
-        along: real
-        across: real
 
     @wp.func
     def moments(q: vec2, w: real):
@@ -426,53 +403,49 @@ def periodic() -> Potential:
 
     @wp.func
     def merge_rests(m: vec5, factor: real):
-        to = Periodic()
-        to.c = real(1.0)
+        c = real(1.0)
+        s = real(0.0)
+        squared = m[1] * m[1] + m[2] * m[2]
+        if m[0] > real(0.0) and squared > real(2.2250738585072014e-308):
+            per = real(1.0) / wp.sqrt(squared)
+            c = per * m[1]
+            s = per * m[2]
+        c2 = c * c - s * s
+        s2 = real(2.0) * c * s
+        once = c * m[1] + s * m[2]
+        whole = real(0.0)
         if m[0] > real(0.0):
-            squared = m[1] * m[1] + m[2] * m[2]
-            if squared > real(2.2250738585072014e-308):
-                per = real(1.0) / wp.sqrt(squared)
-                to.c = per * m[1]
-                to.s = per * m[2]
-            c2 = to.c * to.c - to.s * to.s
-            s2 = real(2.0) * to.c * to.s
-            to.weight = factor * m[0]
-            to.once = factor * (to.c * m[1] + to.s * m[2])
-            to.along = factor * (c2 * m[3] + s2 * m[4])
-            to.across = factor * (c2 * m[4] - s2 * m[3])
-        return to
+            whole = factor
+        along = whole * (c2 * m[3] + s2 * m[4])
+        return record(whole * m[0], c, s, whole * once, along, whole * (c2 * m[4] - s2 * m[3]))
 
     # Written out twice: the adjoint of a function that calls another computes that one once more.
     @wp.func
-    def energy(q: vec2, to: Periodic):
-        x = q[0] - to.c
-        y = q[1] - to.s
+    def energy(q: vec2, to: record):
+        x = q[0] - to[1]
+        y = q[1] - to[2]
         v = real(0.5) * (x * x + y * y)
-        s = to.c * q[1] - to.s * q[0]
-        return third * (real(8.0) * to.once * v - s * (to.along * s - to.across * (real(1.0) - v)))
+        s = to[1] * q[1] - to[2] * q[0]
+        return third * (real(8.0) * to[3] * v - s * (to[4] * s - to[5] * (real(1.0) - v)))
 
     @wp.func
-    def slope(q: vec2, to: Periodic):
-        x = q[0] - to.c
-        y = q[1] - to.s
+    def slope(q: vec2, to: record):
+        x = q[0] - to[1]
+        y = q[1] - to[2]
         cosine = real(1.0) - real(0.5) * (x * x + y * y)
-        s = to.c * q[1] - to.s * q[0]
-        twice = real(2.0) * s * (to.along * cosine + to.across * s)
-        return third * (real(8.0) * to.once * s - twice + to.across)
+        s = to[1] * q[1] - to[2] * q[0]
+        twice = real(2.0) * s * (to[4] * cosine + to[5] * s)
+        return third * (real(8.0) * to[3] * s - twice + to[5])
 
     @wp.func
     def rate(q: vec2, gradient: vec2):
         return q[0] * gradient[1] - q[1] * gradient[0]
 
     @wp.func
-    def left(m: vec5, factor: real, to: Periodic):
-        return real(2.5) * to.weight - third * (real(8.0) * to.once - real(0.5) * to.along)
+    def left(m: vec5, factor: real, to: record):
+        return real(2.5) * to[0] - third * (real(8.0) * to[3] - real(0.5) * to[4])
 
-    @wp.func
-    def pack(to: Periodic):
-        return row(to.weight, to.c, to.s, to.once, to.along, to.across)
-
-    return Potential(Periodic, vec2, vec5, moments, merge_rests, energy, slope, rate, left, 6, row, pack)
+    return Potential(record, vec2, vec5, moments, merge_rests, energy, slope, rate, left, 6)
 
 
 @cache

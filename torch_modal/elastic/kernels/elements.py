@@ -178,7 +178,7 @@ def _rider(f: KernelFunctions | None) -> SimpleNamespace:
         slope = potential.slope(m, rest)
         square = symmetric()
         if factors:
-            along, across = c.stiffness(m, slope, real(2.0) * rest.weight)
+            along, across = c.stiffness(m, slope, real(2.0) * rest[0])
             factors[to] = c.factors_of(g, along, across)
             square = block(along, g[0], across)
         return potential.energy(m, rest), slope * g[0], square
@@ -241,7 +241,7 @@ def convex(f: KernelFunctions, rider: KernelFunctions | None) -> SimpleNamespace
                     slope = potential.slope(m, to)
                     received = slope * g
                     if diagonal:
-                        along, across = c.stiffness(m, slope, real(2.0) * to.weight)
+                        along, across = c.stiffness(m, slope, real(2.0) * to[0])
                         factors[place(s * n_own, at)] = c.factors_of(g, along, across)
                 received[0] = received[0] + ridden
                 add(gradient, v, q, received)
@@ -318,7 +318,7 @@ def forward(f: KernelFunctions) -> SimpleNamespace:
             to = rests[place(s * elements.shape[0], k)]
             row = s * n_rows + first_row + k
             m, g = f.linearise(edge_vectors(x, s * n_vertices, q))
-            root = wp.sqrt(real(2.0) * to.weight)
+            root = wp.sqrt(real(2.0) * to[0])
             g = root * g
             for b in range(n_blocks):
                 product_row = wide()
@@ -410,11 +410,11 @@ def _merge_back_kernel(f: KernelFunctions, module: "wp.Module") -> "wp.Kernel":
     corners, edge_vectors, add, sums = c.corners, c.edge_vectors, c.add, potential.sums
     merging = _merging(f)
     fullness, softness, mean_of, merge_rests = merging.fullness, merging.softness, merging.mean_of, merging.merge
-    pack, row, weight_of = potential.pack, potential.row, f.weight
+    record, weight_of = potential.record, f.weight
 
     @wp.func
-    def of_record(m: sums, factor: real, received: row):
-        return wp.dot(pack(potential.merge_rests(m, factor)), received)
+    def of_record(m: sums, factor: real, received: record):
+        return wp.dot(potential.merge_rests(m, factor), received)
 
     @wp.func
     def of_measure(m: potential.kind, pull: real, received: sums):
@@ -424,7 +424,7 @@ def _merge_back_kernel(f: KernelFunctions, module: "wp.Module") -> "wp.Kernel":
     def merge(
         elements: wp.array[corners], n_vertices: int, x: wp.array[vec3], weights: wp.array[real], whole: wp.array[real],
         stiffness: wp.array[real], start: wp.array[vec3], altitude: real, relative: int, n_shapes: int,
-        n_stiffness: int, to_out: wp.array[row], to_x: wp.array[vec3], to_weights: wp.array[real],
+        n_stiffness: int, to_out: wp.array[record], to_x: wp.array[vec3], to_weights: wp.array[real],
         to_stiffness: wp.array[real], to_start: wp.array[vec3], threads: int,
     ):  # fmt: skip
         """Adds the gradients; the means, and the energy that remains, have none."""
@@ -486,14 +486,14 @@ def backward(f: KernelFunctions) -> SimpleNamespace:
     """Adjoints, and second derivatives."""
     c, potential, module, n = _common(f), f.potential, _module(f, "backward"), f.n
     vectors, corners, edge_vectors, add, inner = c.vectors, c.corners, c.edge_vectors, c.add, c.inner
-    stiffness, record, pack, row = c.stiffness, potential.record, potential.pack, potential.row
+    stiffness, record = c.stiffness, potential.record
     kind, slope_of = potential.kind, potential.slope
 
     @wp.func
     def of_measure(m: kind, to: record, to_energy: real, to_slope: real, to_along: real, to_across: real):
         """Results that follow from the measure, times what each of them receives."""
         slope = potential.slope(m, to)
-        along, across = stiffness(m, slope, real(2.0) * to.weight)
+        along, across = stiffness(m, slope, real(2.0) * to[0])
         return to_energy * potential.energy(m, to) + to_slope * slope + to_along * along + to_across * across
 
     @wp.func
@@ -515,7 +515,7 @@ def backward(f: KernelFunctions) -> SimpleNamespace:
         elements: wp.array[corners], n_vertices: int, x: wp.array[vec3], rests: wp.array[record],
         to_total: wp.array[real], to_gradient: wp.array[vec3], to_diagonal: wp.array[symmetric],
         fields: wp.array[vec3], pushed: wp.array[vec3], n_samples: int, n_products: int, to_x: wp.array[vec3],
-        to_rests: wp.array[row], threads: int,
+        to_rests: wp.array[record], threads: int,
     ):  # fmt: skip
         """Adjoint of ``linearise``, from what energy, gradient and blocks receive, and of the products with factors.
 
@@ -536,7 +536,7 @@ def backward(f: KernelFunctions) -> SimpleNamespace:
             to_along = real(0.0)
             to_across = real(0.0)
             if to_diagonal:
-                along, _across = stiffness(m, slope, real(2.0) * to.weight)
+                along, _across = stiffness(m, slope, real(2.0) * to[0])
                 first = vec3()
                 for j in range(wp.static(n)):
                     first += g[j]
@@ -566,7 +566,7 @@ def backward(f: KernelFunctions) -> SimpleNamespace:
             to_m, received, _0, _1, _2, _3 = wp.grad(of_measure)(m, to, to_energy, inner(g, d), to_along, to_across)
             to_e = hessian_product(e, to_g) + potential.rate(m, to_m) * g
             add(to_x, v, q, to_e)
-            to_rests[at] = to_rests[at] + pack(received)
+            to_rests[at] = to_rests[at] + received
 
     @wp.kernel(module=module)
     def hessians(
@@ -584,7 +584,7 @@ def backward(f: KernelFunctions) -> SimpleNamespace:
             m, g = f.linearise(e)
             slope = potential.slope(m, to)
             to_m, _0 = wp.grad(slope_of)(m, to)
-            beyond = potential.rate(m, to_m) - real(2.0) * to.weight
+            beyond = potential.rate(m, to_m) - real(2.0) * to[0]
             for j in range(3 * n):
                 unit = vectors()
                 unit[j // 3, j % 3] = slope
