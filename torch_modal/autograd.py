@@ -68,15 +68,6 @@ def is_vmapped(x: Tensor) -> bool:
     return inner is not x and (torch._C._functorch.is_batchedtensor(x) or is_vmapped(inner))
 
 
-def in_use(index: Tensor, n: int) -> list[int]:
-    """The numbers of an index; those that it may have, up to ``n``, where it has no data."""
-    return (
-        list(range(n))
-        if is_traced(index)
-        else run_outside_transforms(lambda index_values: index_values.unique().tolist(), index)
-    )
-
-
 def require_numbers(layer: str, x: Tensor) -> None:
     """Raise where tensors have no numbers, which decide the steps of a layer.
 
@@ -278,22 +269,13 @@ class _LinearMap(torch.autograd.Function):
 linear_map: Callable[[Linear, Linear, Tensor], Tensor] = partial(apply_function, _LinearMap)
 
 
-def jvp_by_transposing(
-    function: Callable[..., Any], inputs: Sequence[Tensor], tangents: Sequence[Tensor | None]
-) -> Any:
-    """The Jacobian of a function times tangents, None for zero, as the transpose of its gradient.
-
-    Within ``torch.autograd.forward_ad``, torch has no other forward mode, but reverse mode.
-    """
-    output, back = torch.func.vjp(function, *inputs)[:2]
-    zeros = torch.zeros_like(output) if isinstance(output, Tensor) else tuple(map(torch.zeros_like, output))
-    return apply_transpose(back, zeros, inputs, tangents)
-
-
 def apply_transpose(
     linear: Callable[..., Sequence[Tensor]], zeros: Any, inputs: Sequence[Tensor], tangents: Sequence[Tensor | None]
 ) -> Any:
     """The transpose of a linear function, times tangents of what it gives, None for zero.
+
+    Of the gradient of a function, it is the Jacobian of the function times the tangents. Within
+    ``torch.autograd.forward_ad``, torch has no other forward mode, but reverse mode.
 
     Args:
         linear: The function.

@@ -123,7 +123,7 @@ def assert_kernels(run: Any, truth: Any, given: list[Tensor], atol: float, to: f
 
 def test_local_steps(case: Case) -> None:
     assert float((case.by_torch(*case.given) - case.given[0]).abs().max()) > 1e-2
-    assert_kernels(case.by_warp, case.by_torch, case.given, 1e-8 * CANONICAL_SIZE, 2e-6, case.fused.parts[2].closed)
+    assert_kernels(case.by_warp, case.by_torch, case.given, 1e-8 * CANONICAL_SIZE, 4e-6, case.fused.parts[2].closed)
 
 
 @torch.no_grad()

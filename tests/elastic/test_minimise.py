@@ -26,14 +26,6 @@ from torch_modal.layers.mid_shape import MidShape
 # ----------------------------------------------------------------------------------------------- known solutions
 
 
-def test_minimum_of_rosenbrock_is_found() -> None:
-    solution = minimise(Rosenbrock(), start([-1.2, 1.0], [3.0, -2.0], [1.0, 1.0]), None)
-    torch.testing.assert_close(solution.amplitudes, torch.ones(3, 2, dtype=torch.float64), atol=1e-6, rtol=0)
-    assert solution.converged.all()
-    assert solution.n_steps[2] == 0, "it started at the solution"
-    assert (solution.gradient_norm[:2] <= 3e-7).all()
-
-
 def test_a_step_by_the_kernel_is_that_of_torch() -> None:
     """Samples that converge, go uphill, have tried the shortest step, had converged before, and bend downwards."""
     pytest.importorskip("warp")

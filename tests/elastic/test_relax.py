@@ -62,14 +62,6 @@ def case(request: pytest.FixtureRequest, small_bars: Shapes) -> Case:
     return Case(small_bars, small_bars.faces if request.param == "closed" else small_bars.faces[6:])
 
 
-def test_gradient_is_that_of_the_energy_of_each_sample(case: Case) -> None:
-    got = case.core.fold(case.at(case.x).gradient())
-    for sample in range(BATCH):
-        x = case.x[sample].clone().requires_grad_()
-        (truth,) = torch.autograd.grad(case.energy(x, sample), x)
-        torch.testing.assert_close(got[:, sample].T, truth, rtol=1e-11, atol=1e-9)
-
-
 def test_convex_hessian_is_gauss_newton_and_the_stretched_edges(case: Case) -> None:
     core, at = case.core, case.at(case.x)
     n, edges, volume = case.x[0].numel(), at.terms[0], at.terms[2]

@@ -115,16 +115,6 @@ def test_paired_space_takes_terms_too(bars: Shapes) -> None:
 # ------------------------------------------------------------------------------------------------ stiffness in parts
 
 
-def test_stiffness_per_element_equals_a_number_where_it_is_one(bars: Shapes) -> None:
-    x_a, x_b = bars.keyframes[1:]
-    n = len(Mesh.of(bars.faces, x_a.shape[0]).edges)
-    whole, each = (
-        tm.InBetween(bars.bases[1:], bars.faces, objective=tm.Objective(alpha=alpha, coarse_faces=200))
-        for alpha in (300.0, torch.full((n,), 300.0, dtype=DOUBLE))
-    )
-    torch.testing.assert_close(each(x_a, x_b, 0.5), whole(x_a, x_b, 0.5), rtol=0, atol=1e-9)
-
-
 def test_a_soft_part_takes_the_deformation(bars: Shapes) -> None:
     """By the energy with these stiffnesses, the layer that knows them does better than the one that does not."""
     x_a, x_b = bars.keyframes[1:]

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torch_modal.autograd import in_use, is_traced, is_vmapped
+from torch_modal.autograd import is_traced, is_vmapped, run_outside_transforms
 
 # Velocities are cut from this many times the slower one of the steps before and after on, and never reach three times:
 # what stops, stops, and no quantity that grows overshoots (Fritsch and Carlson 1980).
@@ -108,8 +108,10 @@ def evaluate_by_interval(
         n: Number of intervals.
         shapes: Computes some rows of the batch, which are in one interval.
     """
-    intervals = in_use(segment, n) or [0]  # of nothing, nothing
-    if is_traced(segment) or is_vmapped(segment):
+    traced = is_traced(segment)
+    used = range(n) if traced else run_outside_transforms(lambda x: x.unique().tolist(), segment)
+    intervals = list(used) or [0]  # of nothing, nothing
+    if traced or is_vmapped(segment):
         place, size = sum((segment == i) * place for place, i in enumerate(intervals)), segment.shape[0]
         order = place * size + torch.arange(size, device=segment.device)
         return [shapes(i, slice(None)) for i in intervals], order

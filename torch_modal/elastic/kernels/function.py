@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torch_modal.autograd import apply_function, is_double_backward, is_traced, jvp_by_transposing, merge_vmapped
+from torch_modal.autograd import apply_function, is_double_backward, is_traced, merge_vmapped
 
 
 class Operation:
