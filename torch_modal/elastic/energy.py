@@ -391,5 +391,5 @@ class RestShapes(NamedTuple):
         if start is not None:
             begin = energy.extend(start.movedim(-1, 0))
         pairs = zip(energy.parts, self.stiffness, strict=True)
-        merged = [summand.merge_rests(rows, self.weights, own, begin, relative) for summand, own in pairs]
+        merged = [summand.merge_rests(rows, self.weights, stiffness, begin, relative) for summand, stiffness in pairs]
         return join_references(merged)

@@ -71,7 +71,7 @@ class _ArgMin(torch.autograd.Function):
 def _adjoint(
     energy: Any, inverse: Inverse, tree: Any, amplitudes: Tensor, status: Tensor, *tensors: Tensor
 ) -> Callable[[Tensor], tuple[Tensor, ...]]:
-    """From gradients in the amplitudes, ``(B, n)``, to those in the tensors of the placement: linear."""
+    """From gradients in the amplitudes, ``(B, n)``, to gradients in the tensors of the placement: linear."""
     solve = inverse(energy, amplitudes, trees.fill(tree, tensors), status == Status.CONVERGED)
 
     def slope(*tensors: Tensor) -> Tensor:

@@ -167,7 +167,7 @@ class ModalEnergy(nn.Module):
         return at.value, self._along_columns(at.gradient())
 
     def _along_columns(self, extended: Tensor) -> Tensor:
-        """From gradients in the vertices to those in the amplitudes. *Shape:* ``(3, B, V) -> (B, n)``."""
+        """From gradients in the vertices to gradients in the amplitudes. *Shape:* ``(3, B, V) -> (B, n)``."""
         return extended.transpose(0, 1).flatten(1) @ self.columns.flatten(1).mT
 
 

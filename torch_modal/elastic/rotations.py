@@ -1,4 +1,4 @@
-"""Local rotations by Warp kernels, tested against those in torch."""
+"""Local rotations by Warp kernels, tested against local rotations in torch."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

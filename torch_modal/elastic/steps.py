@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from functools import reduce
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -42,14 +42,8 @@ class Point(NamedTuple):
         return (self.gradient * direction).sum((1, 2))
 
 
-class FreeEnergy(Protocol):
-    """An energy of all vertices."""
-
-    def value(self, x: Tensor) -> Tensor:
-        """*Shape:* ``(B, V, 3) -> (B,)``."""
-
-    def at(self, x: Tensor) -> Point:
-        """*Shape:* ``(B, V, 3)``."""
+FreeEnergy = Any
+"""An energy of all vertices: ``value(x)``, *shape* ``(B, V, 3) -> (B,)``, and ``at(x)``, a :class:`Point`."""
 
 
 def inverse_of_symmetric(blocks: Tensor) -> Tensor:
@@ -201,7 +195,7 @@ def conjugate_gradients(
     return solution
 
 
-class TermsTowards(FreeEnergy):
+class TermsTowards:
     """Terms towards a reference.
 
     Args:

@@ -238,7 +238,7 @@ class Term(nn.Module):
 
         Args:
             start: Edge vectors there. *Shape:* ``(n-1, 3, B, M)``.
-            rest: Those of K rest shapes. *Shape:* ``(n-1, 3, B, K, M)``.
+            rest: Edge vectors of K rest shapes. *Shape:* ``(n-1, 3, B, K, M)``.
             weights: Of the rest shapes, where the factors are relative to them. *Shape:* ``(B, K)``.
 
         Returns:
@@ -317,7 +317,7 @@ class PeriodicTerm(Term):
         return 8 / 3 * once * v - 1 / 6 * (along * v2 - across * s2)
 
     def derivatives(self, measures: Tensor, record: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Overrides those of the square."""
+        """Overrides the derivatives of the square."""
         weight, c, s, once, along, across = record.unbind(-2)
         v, sine, v2, s2 = _turns(measures, c, s)
         slope = 8 / 3 * once * sine - 1 / 3 * (along * s2 - across * (1 - v2))
