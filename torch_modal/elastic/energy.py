@@ -259,8 +259,8 @@ class Energy(nn.Module):
         """
         measures, stiffness = [], []
         for summand, values, rest_weights in zip(self.parts, rest.measures, rest.weights, strict=True):
-            corners = weights[:, None] if summand.term.total else weights[:, summand.corners]
-            element_weights, rest_weights = corners.flatten(1, -2).mean(1), rest_weights.expand_as(values)
+            total, rest_weights = summand.term.total, rest_weights.expand_as(values)
+            element_weights = weights.mean(1, keepdim=True) if total else weights[:, summand.corners].mean(1)
             first = values[..., :1, :]  # differences of angles from it go the short way round
             measures.append((element_weights * (first + summand.term.difference(values, first))).sum(-2))
             stiffness.append((element_weights * rest_weights).sum(-2).clamp_min(0))

@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torch_modal.autograd import apply_function, is_double_backward, is_traced, merge_vmapped
+from torch_modal.autograd import apply_function, apply_transpose, is_double_backward, is_traced, merge_vmapped
 
 
 class Operation:
@@ -46,8 +46,9 @@ class _Fused(torch.autograd.Function):
     @staticmethod
     def jvp(ctx: Any, *tangents: Tensor | None) -> tuple[Tensor | None, ...]:
         n, by_torch = ctx.operation.n_differentiable, ctx.operation.by_torch
-        results = jvp_by_transposing(lambda *tensors: by_torch(*tensors)[:n], ctx.saved_tensors, tangents[2:])
-        return *results, *[None] * (ctx.operation.n_results - n)
+        results, back = torch.func.vjp(lambda *tensors: by_torch(*tensors)[:n], *ctx.saved_tensors)[:2]
+        moved = apply_transpose(back, tuple(map(torch.zeros_like, results)), ctx.saved_tensors, tangents[2:])
+        return *moved, *[None] * (ctx.operation.n_results - n)
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
