@@ -338,7 +338,8 @@ class TestRotations:
 
         def by(kind: type, first: Tensor, second: Tensor, t: Tensor) -> Tensor:
             before, own, after = (frames_of(shape, rotations.faces) for shape in (x[2:3], first, second))
-            found = cubics(torch.stack([rotations.step(before, own), rotations.step(own, after)]), t.new_ones(2), False)
+            steps = torch.stack([rotations.step(before, own), rotations.step(own, after)])
+            found = cubics(steps, torch.ones(2, dtype=DOUBLE), False)
             size = torch.stack(own[3:])
             trajectory = Trajectory(own.e1, own.e2, own.normal, size, *(part[1] for part in found))
             return kind.edges_along(rotations, trajectory, which, t)
