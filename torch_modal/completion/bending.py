@@ -1,12 +1,14 @@
 """Modal deformations of a shape near a reference, with their derivatives: rotation-strain coordinates of modes."""
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
 from torch_modal.geometry.poisson import Reconstruction
 from torch_modal.geometry.rigid import infinitesimal_motions
 from torch_modal.geometry.rotations import exp
-from torch_modal.geometry.triangle_frames import bent_sides, frames, sides
+from torch_modal.geometry.triangle_frames import bent_sides, frames_of
 from torch_modal.motion.decoder import bending_columns
 
 MOST_STRAIN = 1.0
@@ -14,15 +16,12 @@ MOST_STRAIN = 1.0
 coarse one on which amplitudes are found."""
 
 
-class ModalPose:
+class ModalPose(NamedTuple):
     """Amplitudes of modes, then a rigid motion. *Shape:* ``(k,), (3, 3), (3,)``."""
 
-    def __init__(self, amplitudes: Tensor, rotation: Tensor, move: Tensor) -> None:
-        self.amplitudes, self.rotation, self.move = amplitudes, rotation, move
-
-    def apply(self, x: Tensor) -> Tensor:
-        """The rigid motion. *Shape:* ``(V, 3)``."""
-        return x @ self.rotation.mT + self.move
+    amplitudes: Tensor
+    rotation: Tensor
+    move: Tensor
 
 
 class ModalBending:
@@ -37,51 +36,39 @@ class ModalBending:
         self.reconstruction = Reconstruction(reference, faces)
         #: What an amplitude of 1 does to each triangle, in its own coordinates. *Shape:* ``(k, 6, F)``.
         self.columns = bending_columns(reference, faces, modes)
-        self._by_face = self.columns.permute(2, 1, 0).contiguous()
 
     def still(self) -> ModalPose:
         """No deformation."""
         return ModalPose(self.columns.new_zeros(len(self.columns)), torch.eye(3).double(), torch.zeros(3).double())
 
     def _sides(self, base: Tensor, bending: Tensor, n_copies: int = 1) -> tuple[Tensor, Tensor]:
-        own = frames(sides(base.T[:, None].contiguous(), self.faces.repeat(n_copies, 1)))
-        turn = bending[0] * own.e1[:, 0] + bending[1] * own.e2[:, 0] + bending[2] * own.normal[:, 0]
-        return bent_sides(turn[:, None], bending[3:, None].clamp(-MOST_STRAIN, MOST_STRAIN), own)
+        rest = frames_of(base[None], self.faces.repeat(n_copies, 1))
+        turn = bending[0] * rest.e1[:, 0] + bending[1] * rest.e2[:, 0] + bending[2] * rest.normal[:, 0]
+        return bent_sides(turn[:, None], bending[3:, None].clamp(-MOST_STRAIN, MOST_STRAIN), rest)
 
     def shape(self, base: Tensor, pose: ModalPose) -> Tensor:
         """The deformed shape. *Shape:* ``(V, 3)``."""
         bending = torch.einsum("k,kcf->cf", pose.amplitudes, self.columns)
         rest = base.T[:, None].contiguous()
-        return pose.apply(self.reconstruction(self._sides(base, bending), rest)[:, 0].T)
+        return self.reconstruction(self._sides(base, bending), rest)[:, 0].T @ pose.rotation.mT + pose.move
 
     def linearise(self, base: Tensor, pose: ModalPose, rigid: bool = False) -> tuple[Tensor, Tensor]:
         """The deformed shape, and its derivatives in amplitudes, a move and a turn about its centroid.
 
         If rigid, in the last two alone. *Shape:* ``(V, 3), (V, 3, k + 6)``.
         """
-        rest, n = base.T[:, None].contiguous(), len(base)
-        bending = torch.einsum("k,kcf->cf", pose.amplitudes, self.columns)
-        if not rigid:
-            # Six copies of all faces, in each of which another coordinate of the sides is differentiated: one backward.
-            copies = bending.repeat(1, 6).requires_grad_()
-            with torch.enable_grad():
-                ends = torch.cat(self._sides(base, copies, 6))[:, 0].view(6, 6, -1).diagonal()
-                slopes = torch.autograd.grad(ends.sum(), copies)[0].view(6, 6, -1).permute(2, 1, 0)
-        x = pose.apply(self.reconstruction(self._sides(base, bending), rest)[:, 0].T)
+        x = self.shape(base, pose)
         motions = infinitesimal_motions(x - x.mean(0)).movedim(0, -1)
         if rigid:
             return x, motions
-        # The right-hand side of the Poisson problem at the corners of each face, by its bending.
-        of_first, of_second = slopes.split(3, 1)  # (F, 3, 6) each
-        one, other, last = self.reconstruction.weights.view(3, -1)[..., None, None]
-        corners = [
-            -one * of_first - last * of_second,
-            (one + other) * of_first - other * of_second,
-            (other + last) * of_second - other * of_first,
-        ]
-        moved = (torch.cat(corners, 1) @ self._by_face).view(3 * len(self.faces), -1)
-        right = moved.new_zeros(n, moved.shape[1]).index_add(0, self.faces.flatten(), moved)
-        fields = self.reconstruction.poisson(right, torch.zeros_like(right)).view(n, 3, -1)
+        # Six copies of all faces, in each of which another coordinate of the sides is differentiated: one backward.
+        copies = torch.einsum("k,kcf->cf", pose.amplitudes, self.columns).repeat(1, 6).requires_grad_()
+        with torch.enable_grad():
+            ends = torch.cat(self._sides(base, copies, 6))[:, 0].view(6, 6, -1).diagonal()
+            slopes = torch.autograd.grad(ends.sum(), copies)[0].view(6, 6, -1).permute(2, 1, 0)
+        changes = (slopes @ self.columns.permute(2, 1, 0)).permute(1, 2, 0)  # (6, k, F)
+        still = base.new_zeros(len(self.columns), len(base), 3)
+        fields = self.reconstruction.fit((changes[:3], changes[3:]), still).permute(1, 2, 0)
         return x, torch.cat([pose.rotation @ fields, motions], -1)
 
     @staticmethod

@@ -17,10 +17,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torch_modal.arrays import FloatArray
 from torch_modal.autograd import outside_inference_mode
 from torch_modal.completion.confidence import DOUBTFUL, compare, confidence_of
 from torch_modal.completion.frames import CompletionProblem
-from torch_modal.completion.gradient import LastSolve, with_gradients
+from torch_modal.completion.gradient import LastSolve, ShapesOfPoints
 from torch_modal.completion.observation import Observation, check_observations
 from torch_modal.completion.poses import FramePoses, times_between
 from torch_modal.completion.refinement import ROUNDS, Refinement
@@ -114,77 +115,62 @@ def complete(
         raise ValueError("the paired space (Eq. 4) has two shapes for each time, a completion one: space='joint'")
     if objective.contact:
         require_contact()
-    solver = _Completer(whole.detach(), faces, observations, times, objective)
-    completion, solves = solver.run(estimate_times, progress)
-    points = [one.points for one in solver.observations]
-    if not torch.is_grad_enabled() or not any(x.requires_grad for x in points):
+    observations = list(observations)
+    completion, axes, solves = _complete(
+        whole.detach(), faces, observations, times, objective, estimate_times, progress
+    )
+    points = torch.cat([one.points.double().cpu() for one in observations])
+    if not torch.is_grad_enabled() or not points.requires_grad:
         return completion
-    return solver.with_gradients(completion, solves, points)
+    knots = ShapesOfPoints.apply(list(solves.values()), axes, completion.knots, points)
+    rows = [list(solves).index(t) for t in completion.times.tolist()]
+    return completion._replace(knots=knots, shapes=knots[rows])
 
 
-class _Completer:
-    """All stages."""
-
-    @outside_inference_mode
-    def __init__(
-        self,
-        whole: Tensor,
-        faces: Tensor,
-        observations: Sequence[Observation],
-        times: Times,
-        objective: Objective,
-    ) -> None:
-        is_template = whole.dim() == 2
-        self.like, shapes, indices = check_arrays(whole[None] if is_template else whole, faces)
-        self.observations = check_observations(observations, shapes.shape[1])
-        exact = np.zeros(0) if is_template else check_times(times, len(shapes)).numpy()
-        self.objective = objective
-        self.problem = CompletionProblem(shapes, torch.from_numpy(indices), exact, self.observations)
-        #: Key-frames by their times.
-        self.exact = dict(zip(exact.tolist(), self.like, strict=False))
-
-    @outside_inference_mode
-    def run(self, estimate: bool, progress: Progress) -> tuple[Completion, list[LastSolve]]:
-        """The motion, and how each shape was found."""
-        problem = self.problem
-        with ProgressReport(len(problem.frames) * (4 + ROUNDS), "completing", progress) as report:
-            poses = FramePoses(problem).search(report)
-            if estimate:
-                for frame, t in zip(problem.frames, times_between(problem, poses), strict=True):
-                    frame.time = t
-            x, solves = Refinement(problem, self.objective).run(poses, report)
-        misses, trust, seen, doubtful = compare(problem, x)
-        if doubtful:
-            some = ", ".join(f"{t:g} ({100 * explained:.0f} %)" for t, explained in list(doubtful.items())[:8])
-            warnings.warn(
-                f"the shapes at {some} explain less than {100 * DOUBTFUL:.0f} % of the points seen then: they are "
-                "doubtful, and their confidence is low. Do the points show this body, in its units?",
-                MeshWarning,
-                stacklevel=5,
-            )
-        times, like = [frame.time for frame in problem.frames], self.like
-        shapes = [self.exact.get(t, problem.to_caller(one).to(like)) for t, one in zip(times, x, strict=True)]
-        knots = self.exact | dict(zip(times, shapes, strict=True))
-        order = sorted(knots)
-        stacked = torch.stack([knots[t] for t in order])
-        path = Path(stacked, problem.faces, times=order, objective=self.objective) if len(order) > 1 else None
-        completion = Completion(
-            torch.tensor(times, dtype=torch.float64, device=like.device),
-            torch.stack(shapes),
-            confidence_of(problem, x, seen).to(like),
-            [(each / problem.scale).to(like) for each in misses],
-            [each.to(like) for each in trust],
-            stacked,
-            path,
+@outside_inference_mode
+def _complete(
+    whole: Tensor,
+    faces: Tensor,
+    observations: list[Observation],
+    times: Times,
+    objective: Objective,
+    estimate_times: bool,
+    progress: Progress,
+) -> tuple[Completion, FloatArray, dict[float, LastSolve | None]]:
+    """The motion; the turn to the axes of the minimisation; and, by time, how each knot was found, None if exact."""
+    is_template = whole.dim() == 2
+    like, shapes, indices = check_arrays(whole[None] if is_template else whole, faces)
+    check_observations(observations, shapes.shape[1])
+    exact = np.zeros(0) if is_template else check_times(times, len(shapes)).numpy()
+    problem = CompletionProblem(shapes, torch.from_numpy(indices), exact, observations)
+    with ProgressReport(len(problem.frames) * (4 + ROUNDS), "completing", progress) as report:
+        poses = FramePoses(problem).search(report)
+        if estimate_times:
+            when = times_between(problem, poses)
+            problem.frames = [frame._replace(time=t) for frame, t in zip(problem.frames, when, strict=True)]
+        x, solves = Refinement(problem, objective).run(poses, report)
+    misses, trust, seen, doubtful = compare(problem, x)
+    if doubtful:
+        some = ", ".join(f"{t:g} ({100 * explained:.0f} %)" for t, explained in list(doubtful.items())[:8])
+        warnings.warn(
+            f"the shapes at {some} explain less than {100 * DOUBTFUL:.0f} % of the points seen then: they are "
+            "doubtful, and their confidence is low. Do the points show this body, in its units?",
+            MeshWarning,
+            stacklevel=4,
         )
-        return completion, solves
-
-    def with_gradients(
-        self, completion: Completion, solves: Sequence[LastSolve], points: Sequence[Tensor]
-    ) -> Completion:
-        """Add gradients in the points."""
-        at, every = completion.times.tolist(), sorted(set(self.exact) | set(completion.times.tolist()))
-        used = [None if t in self.exact else solve for t, solve in zip(at, solves, strict=True)]
-        shapes = with_gradients(completion.shapes, points, used, self.problem.axes)
-        rows = torch.tensor([every.index(t) for t in at], device=shapes.device)
-        return completion._replace(shapes=shapes, knots=completion.knots.index_copy(0, rows, shapes))
+    moments = [frame.time for frame in problem.frames]
+    completed = dict(zip(moments, problem.to_caller(x).to(like), strict=True))
+    shape_at = completed | dict(zip(exact.tolist(), like, strict=False))
+    order = sorted(shape_at)
+    knots = torch.stack([shape_at[t] for t in order])
+    completion = Completion(
+        torch.tensor(moments, dtype=torch.float64, device=like.device),
+        torch.stack([shape_at[t] for t in moments]),
+        confidence_of(problem, x, seen).to(like),
+        [(each / problem.scale).to(like) for each in misses],
+        [each.to(like) for each in trust],
+        knots,
+        Path(knots, problem.faces, times=order, objective=objective) if len(order) > 1 else None,
+    )
+    solve_at: dict[float, LastSolve | None] = dict(zip(moments, solves, strict=True))
+    return completion, problem.axes, {t: None if t in exact else solve_at[t] for t in order}

@@ -5,8 +5,8 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from torch_modal.completion.frames import CompletionProblem, robust
-from torch_modal.completion.pairs import SampledSurface
+from torch_modal.completion.frames import CompletionProblem
+from torch_modal.completion.pairs import SampledSurface, robust_weights
 from torch_modal.geometry.rigid import best_fit
 
 NEAR = 2.5
@@ -31,22 +31,22 @@ def compare(problem: CompletionProblem, x: Tensor) -> tuple[list[Tensor], list[T
         was seen then, *shape* ``(T, V)``; and the times of doubtful shapes with the part of the points that they
         explain.
     """
-    n = sum(len(frame.samples) for frame in problem.frames)
-    misses, trust, doubtful = [x.new_zeros(0)] * n, [x.new_zeros(0)] * n, dict[float, float]()
-    seen = x.new_zeros(x.shape[:2])
+    doubtful, seen = dict[float, float](), x.new_zeros(x.shape[:2])
+    results = dict[int, tuple[Tensor, Tensor]]()  # by the first of the points
     for i, frame in enumerate(problem.frames):
         surface = SampledSurface(x[i].numpy(), problem.mesh)
         for one in frame.samples:
-            distances, agree = one.misses(surface)
-            weights = agree * robust(distances, one.noise)
-            misses[one.number], trust[one.number] = torch.from_numpy(distances), torch.from_numpy(weights)
+            distances, agree = one.seen.misses(surface)
+            weights = agree * robust_weights(distances, one.noise)
+            results[one.rows.start] = torch.from_numpy(distances), torch.from_numpy(weights)
             gaps, nearest = cKDTree(one.seen.points).query(surface.vertices, 3)
             close = (weights[nearest] * np.exp(-0.5 * (gaps / NEAR) ** 2)).max(1)
             explained = float(weights.mean())
             if explained < DOUBTFUL:
                 doubtful[frame.time] = explained
             seen[i] = torch.maximum(seen[i], min(1.0, explained / DOUBTFUL) * torch.from_numpy(close))
-    return misses, trust, seen, doubtful
+    misses, trust = zip(*(results[start] for start in sorted(results)), strict=True)
+    return list(misses), list(trust), seen, doubtful
 
 
 def confidence_of(problem: CompletionProblem, x: Tensor, seen: Tensor) -> Tensor:

@@ -8,7 +8,7 @@ import torch
 from scipy.sparse.linalg import LinearOperator, cg
 from torch import Tensor
 
-from torch_modal.arrays import FloatArray, IntArray
+from torch_modal.arrays import FloatArray
 from torch_modal.autograd import is_double_backward
 from torch_modal.completion.energy import PointEnergy
 from torch_modal.elastic.energy import Energy, RestShapes
@@ -26,8 +26,6 @@ class LastSolve(NamedTuple):
     energy: Energy
     rests: RestShapes
     points: PointEnergy
-    observations: IntArray
-    """The observation of each pair. *Shape:* ``(n,)``."""
 
     def adjoint(self, grad: FloatArray) -> FloatArray:
         """Gradient in the point of each pair, of a gradient in the shape. *Shape:* ``(V, 3) -> (n, 3)``."""
@@ -52,39 +50,30 @@ class LastSolve(NamedTuple):
         return 2 * self.points.forces(torch.from_numpy(solution).view(shape))[1].numpy()
 
 
-def with_gradients(
-    shapes: Tensor, points: Sequence[Tensor], solves: Sequence[LastSolve | None], axes: FloatArray
-) -> Tensor:
-    """Shapes as functions of the points of all observations; pairs and rest shapes are constants.
+class ShapesOfPoints(torch.autograd.Function):
+    """Shapes as functions of all observed points; pairs and rest shapes are constants.
 
-    Args:
-        shapes: The minimisers, in the caller's coordinates. *Shape:* ``(T, V, 3)``.
-        points: Of each observation. *Shape of each:* ``(n, 3)``.
-        solves: How each shape was found; None where it is a constant.
-        axes: Turns the caller's coordinates into the coordinates of the solves. *Shape:* ``(3, 3)``.
+    Arguments are how each shape was found, None where it is a constant; the matrix that turns the caller's coordinates
+    into the coordinates of the solves, *shape* ``(3, 3)``; the shapes, *shape* ``(T, V, 3)``; and the points, *shape*
+    ``(n, 3)``.
     """
-    return _ShapesOfPoints.apply(solves, axes, shapes, *points)
 
-
-class _ShapesOfPoints(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, solves: Sequence[LastSolve | None], axes: FloatArray, shapes: Tensor, *points: Tensor
+        ctx: Any, solves: Sequence[LastSolve | None], axes: FloatArray, shapes: Tensor, points: Tensor
     ) -> Tensor:
-        ctx.solves, ctx.axes, ctx.like = solves, axes, [one.detach() for one in points]
+        """The shapes."""
+        ctx.solves, ctx.axes, ctx.like = solves, axes, points.detach()
         return shapes.clone()
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        """Gradient in the points."""
         if is_double_backward(grad):
             raise RuntimeError("completed shapes have first derivatives only; take the gradient without create_graph")
-        total = [np.zeros(one.shape) for one in ctx.like]
-        for solve, own in zip(ctx.solves, grad.detach().cpu().double().numpy(), strict=True):
-            if solve is None or not own.any():
-                continue
-            with torch.enable_grad():
-                to_points = solve.adjoint(own @ ctx.axes.T) @ ctx.axes
-            for number in np.unique(solve.observations):
-                some = solve.observations == number
-                np.add.at(total[number], solve.points.numbers[some], to_points[some])
-        return None, None, None, *(torch.from_numpy(one).to(like) for one, like in zip(total, ctx.like, strict=True))
+        total = np.zeros(ctx.like.shape)
+        for solve, slope in zip(ctx.solves, grad.detach().cpu().double().numpy(), strict=True):
+            if solve is not None and slope.any():
+                with torch.enable_grad():
+                    np.add.at(total, solve.points.numbers, solve.adjoint(slope @ ctx.axes.T) @ ctx.axes)
+        return None, None, None, torch.from_numpy(total).to(ctx.like)

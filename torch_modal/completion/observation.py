@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -45,58 +46,47 @@ class Observation:
     view: Tensor | None = None
 
     def __post_init__(self) -> None:
-        def put(name: str, value: object) -> None:
-            object.__setattr__(self, name, value)
-
-        put("time", float(self.time))
-        if not torch.tensor(self.time).isfinite():
-            raise ValueError(f"an observation's time is a finite number; got {self.time}")
+        values: dict[str, Any] = {"time": float(self.time)}
+        object.__setattr__(self, "time", values["time"])  # named by all other messages
         points = torch.as_tensor(self.points)
         if points.dim() != 2 or points.shape[1] != 3 or len(points) < LEAST or not points.is_floating_point():
             raise ValueError(
                 f"{self}: points are floating-point of the shape (n, 3), with n of {LEAST} or more; got "
                 f"{tuple(points.shape)} of {points.dtype}"
             )
-        put("points", points)
-        n = len(points)
-        for name, shape in (("normals", (n, 3)), ("barycentric", (n, 3)), ("weights", (n,)), ("view", (3,))):
-            value = getattr(self, name)
-            if value is not None:
-                value = torch.as_tensor(value, device=points.device).to(points.dtype).detach()
-                if value.shape != shape:
-                    raise ValueError(f"{self}: {name} have the shape {shape}; got {tuple(value.shape)}")
-                put(name, value)
-        for name, shape in (("vertices", (n,)), ("corners", (n, 3))):
-            value = getattr(self, name)
-            if value is not None:
-                value = torch.as_tensor(value, device=points.device)
-                if value.shape != shape or value.is_floating_point() or value.dtype == torch.bool:
-                    raise ValueError(
-                        f"{self}: {name} are vertex indices of the shape {shape}; got {tuple(value.shape)} of "
-                        f"{value.dtype}"
-                    )
-                put(name, value.long())
-        for name in ("points", "normals", "barycentric", "weights", "view"):
-            value = getattr(self, name)
-            if value is not None and not bool(value.detach().isfinite().all()):
-                raise ValueError(f"{self}: {name} hold numbers that are not finite; leave out what was not observed")
+        values["points"], n = points, len(points)
+        indices = {"vertices": (n,), "corners": (n, 3)}
+        numbers = {"normals": (n, 3), "barycentric": (n, 3), "weights": (n,), "view": (3,)}
+        for name, shape in (indices | numbers).items():
+            if getattr(self, name) is None:
+                continue
+            value = torch.as_tensor(getattr(self, name), device=points.device)
+            whole = not (value.is_floating_point() or value.dtype == torch.bool)
+            if value.shape != shape or (name in indices and not whole):
+                what = "are vertex indices of" if name in indices else "have"
+                raise ValueError(f"{self}: {name} {what} the shape {shape}; got {tuple(value.shape)} of {value.dtype}")
+            values[name] = value.long() if name in indices else value.to(points.dtype).detach()
+        for name, value in values.items():
+            if not bool(torch.as_tensor(value).detach().isfinite().all()):
+                raise ValueError(f"{self}: {name} must be finite; leave out what was not observed")
+        weights, view = values.get("weights"), values.get("view")
         if (self.corners is None) != (self.barycentric is None):
             raise ValueError(f"{self}: corners and barycentric go together")
         if self.vertices is not None and self.corners is not None:
             raise ValueError(f"{self}: markers lie at vertices, or in triangles (corners); got both")
         if not self.is_cloud and (self.normals is not None or self.view is not None):
             raise ValueError(f"{self}: normals and view belong to clouds; these points have their places already")
-        if self.weights is not None and not (bool((self.weights >= 0).all()) and bool(self.weights.sum() > 0)):
+        if weights is not None and not (bool((weights >= 0).all()) and bool(weights.sum() > 0)):
             raise ValueError(f"{self}: weights are 0 or more, and not all 0")
         if self.noise is not None and not 0 < self.noise < torch.inf:
             raise ValueError(f"{self}: noise is a length above 0, in the unit of the points; got {self.noise}")
-        for name in ("normals", "view"):
-            value = getattr(self, name)
-            if value is not None:
-                lengths = value.norm(dim=-1, keepdim=True)
-                if name == "view" and not bool(lengths > 0):
-                    raise ValueError(f"{self}: view is a direction; got a vector of length 0")
-                put(name, value / lengths.clamp_min(torch.finfo(value.dtype).tiny))
+        if view is not None and not bool(view.any()):
+            raise ValueError(f"{self}: view is a direction; got a vector of length 0")
+        for name in values.keys() & {"normals", "view"}:
+            lengths = values[name].norm(dim=-1, keepdim=True)
+            values[name] = values[name] / lengths.clamp_min(torch.finfo(points.dtype).tiny)
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
 
     def __repr__(self) -> str:
         return f"Observation at {self.time:g}"
@@ -115,19 +105,12 @@ class Observation:
         return self.vertices[:, None].expand(-1, 3), first
 
 
-def check_observations(observations: Sequence[Observation], n_vertices: int) -> list[Observation]:
-    """The observations as a list; raises a ValueError where one does not fit the mesh."""
-    if isinstance(observations, Observation):
-        raise ValueError("observations are a list of torch_modal.Observation; got one alone")
-    given = list(observations)
-    others = sorted({type(one).__name__ for one in given if not isinstance(one, Observation)})
-    if others or not given:
+def check_observations(observations: Sequence[Any], n_vertices: int) -> None:
+    """Raise a ValueError where an observation is none, or does not fit the mesh."""
+    others = sorted({type(one).__name__ for one in observations if not isinstance(one, Observation)})
+    if others or not observations:
         raise ValueError(f"observations are a list of torch_modal.Observation; got {', '.join(others) or 'none'}")
-    for one in given:
-        if not one.is_cloud:
-            corners = one.places()[0]
-            if not 0 <= int(corners.min()) <= int(corners.max()) < n_vertices:
-                raise ValueError(
-                    f"{one}: vertices lie in 0 to {n_vertices - 1}; got {int(corners.min())} to {int(corners.max())}"
-                )
-    return given
+    for one in observations:
+        low, high = (0, 0) if one.is_cloud else map(int, one.places()[0].aminmax())
+        if not 0 <= low <= high < n_vertices:
+            raise ValueError(f"{one}: vertices lie in 0 to {n_vertices - 1}; got {low} to {high}")

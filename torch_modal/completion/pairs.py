@@ -5,12 +5,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import sparse
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from torch_modal.arrays import BoolArray, FloatArray, IntArray
 from torch_modal.geometry.closest import closest_on_triangles, dot
-from torch_modal.geometry.connectivity import Connectivity
+from torch_modal.geometry.connectivity import Connectivity, connected_pieces
 from torch_modal.registration.surface import MeshSurface, places_between
 
 # Places of each triangle that are candidates: its middle, and one near each corner.
@@ -24,6 +23,8 @@ LEAN = 3.0
 ALIKE = 0.3
 # Cells of the picture in which surfaces hide others, the depth below which they do not, cosine of grazing sight.
 CELL, DEPTH, GRAZING = 2.0, 3.0, 0.15
+# Distance, in standard deviations of the noise, at which a point loses three quarters of its weight.
+OUTLIERS = 4.0
 # Neighbours of a point of a cloud, and how many of their usual distances are a gap.
 N_NEIGHBOURS, GAP = 8, 3.0
 
@@ -46,6 +47,21 @@ class Pairs(NamedTuple):
         """Distances of the points from their places on a shape. *Shape:* ``(V, 3) -> (n,)``."""
         return np.linalg.norm(self.places @ x - self.points, axis=1)
 
+    def misses(self, surface: MeshSurface) -> tuple[FloatArray, BoolArray]:
+        """Distances of the points from their places, all of which count. *Shape:* ``(n,)``."""
+        return self.distances(surface.vertices), np.ones(len(self.points), bool)
+
+    def score(self, surface: MeshSurface, unit: float) -> float:
+        """Part of the points that the surface leaves out."""
+        off = (self.distances(surface.vertices) / unit) ** 2
+        return float(self.weights @ (off / (1 + off)))
+
+
+def robust_weights(distances: FloatArray, noise: float) -> FloatArray:
+    """Weights of points at distances (Geman and McClure)."""
+    weights: FloatArray = 1 / (1 + (distances / (OUTLIERS * noise)) ** 2) ** 2
+    return weights
+
 
 def join_features(points: FloatArray, normals: FloatArray | None) -> FloatArray:
     """Points with their normals, as places of which near ones are alike. *Shape:* ``(n, 3), (n, 3) -> (n, 6)``."""
@@ -64,8 +80,8 @@ class SampledSurface(MeshSurface):
         self, points: FloatArray, normals: FloatArray | None
     ) -> tuple[IntArray, FloatArray, FloatArray, BoolArray]:
         """Face and coordinates of the place that looks most like each point, the distance, and if normals agree."""
-        own = None if normals is None else self.face_normals[self.sample_faces]
-        face = self.sample_faces[cKDTree(join_features(self.samples, own)).query(join_features(points, normals))[1]]
+        sampled = None if normals is None else self.face_normals[self.sample_faces]
+        face = self.sample_faces[cKDTree(join_features(self.samples, sampled)).query(join_features(points, normals))[1]]
         barycentric, distances = closest_on_triangles(points, self.vertices[self.faces[face]])
         agree = np.ones(len(points), bool) if normals is None else dot(self.face_normals[face], normals) > ALIKE
         return face, barycentric, distances, agree
@@ -111,13 +127,13 @@ class Cloud:
         """The usual distance of a neighbour."""
         return float(np.median(self._tree.query(self.points, min(N_NEIGHBOURS, len(self.points)))[0][:, -1]))
 
-    def closest(self, surface: SampledSurface) -> tuple[IntArray, FloatArray, FloatArray, BoolArray]:
-        """:meth:`SampledSurface.most_alike` of its points."""
-        return surface.most_alike(self.points, self.normals)
+    def misses(self, surface: SampledSurface) -> tuple[FloatArray, BoolArray]:
+        """Distances of the points from the places that look most like them, and if normals agree. *Shape:* ``(n,)``."""
+        return surface.most_alike(self.points, self.normals)[2:]
 
     def places(self, surface: SampledSurface, released: BoolArray | None = None) -> Pairs:
         """The places of the points whose normals agree."""
-        face, barycentric, _, agree = self.closest(surface)
+        face, barycentric, _, agree = surface.most_alike(self.points, self.normals)
         if released is not None:
             agree &= ~released[surface.faces[face]].any(1)
         kept = np.flatnonzero(agree)
@@ -146,7 +162,7 @@ class Cloud:
 
     def squared_misses(self, surface: SampledSurface, unit: float) -> FloatArray:
         """Squared distances of the points in a unit; infinite where normals disagree. *Shape:* ``(n,)``."""
-        _, _, distances, agree = self.closest(surface)
+        distances, agree = self.misses(surface)
         return np.where(agree, (distances / unit) ** 2, np.inf)
 
     def score(self, surface: SampledSurface, unit: float) -> float:
@@ -160,12 +176,12 @@ class Cloud:
         return total
 
     def unexplained_groups(self, surface: SampledSurface, reach: float, least: int) -> list[IntArray]:
-        """Connected groups of points that are far from the surface."""
+        """Connected groups of points that are far from the surface, the largest first."""
         off = np.flatnonzero(self.squared_misses(surface, reach) > 1)
         if len(off) < least:
             return []
-        pairs = cKDTree(self.points[off]).query_pairs(GAP / 2 * self.usual_gap, output_type="ndarray")
-        graph = sparse.coo_matrix((np.ones(len(pairs)), pairs.T), shape=(len(off), len(off)))
-        labels = connected_components(graph, directed=False)[1]
-        groups = [off[labels == label] for label in np.unique(labels)]
-        return sorted((g for g in groups if len(g) >= least), key=len, reverse=True)
+        neighbours = self._tree.query(self.points, min(N_NEIGHBOURS, len(self.points)))[0]
+        gap = GAP / 2 * float(np.median(neighbours[:, -1]))
+        pieces = connected_pieces(cKDTree(self.points[off]).query_pairs(gap, output_type="ndarray"), len(off))
+        sizes = np.bincount(pieces)
+        return [off[pieces == k] for k in np.argsort(-sizes, kind="stable") if sizes[k] >= least]

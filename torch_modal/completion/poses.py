@@ -13,10 +13,10 @@ from torch import Tensor
 from torch_modal.completion.bending import ModalBending, ModalPose
 from torch_modal.completion.frames import CompletionProblem
 from torch_modal.completion.pairs import Pairs
-from torch_modal.completion.search import PoseSearch, Seen
+from torch_modal.completion.search import PoseSearch
 from torch_modal.geometry.rigid import best_fit
 from torch_modal.geometry.triangle_frames import frames_of, mirrored_sides
-from torch_modal.modes.coarsening import Coarsening, coarsen
+from torch_modal.modes.coarsening import coarsen
 from torch_modal.modes.extract import extract_bases
 from torch_modal.motion.decoder import scale_modes
 from torch_modal.motion.path import Path
@@ -48,28 +48,26 @@ class FramePoses:
     """Finds modal poses of all frames of a problem."""
 
     def __init__(self, problem: CompletionProblem) -> None:
-        self.problem, self.frames, self.faces = problem, problem.frames, problem.faces
+        self.problem, self.faces = problem, problem.faces
         basis = extract_bases(problem.template[None], self.faces, N_MODES)[0]
         modes = scale_modes(basis.modes, 100.0)
         self.bending = ModalBending(problem.template, self.faces, modes)
-        self.coarse: Coarsening | None = None
-        coarse_bending = self.bending
-        if len(self.faces) > COARSE_FACES:
-            whole = problem.whole.numpy()
-            self.coarse = coarsen(whole, self.faces.numpy(), COARSE_FACES, range(len(whole)), {})
-            restricted = [torch.from_numpy(self.coarse.restrict(x.numpy())) for x in (problem.template, modes)]
-            coarse_bending = ModalBending(restricted[0], torch.from_numpy(self.coarse.faces), restricted[1])
-        self.poses = PoseSearch(coarse_bending, basis.eigenvalues)
+        whole = problem.whole.numpy()
+        self.coarse = coarsen(whole, self.faces.numpy(), COARSE_FACES, range(len(whole)), {})
+        reference, fields = self._coarsen(problem.template), self._coarsen(modes)
+        self.poses = PoseSearch(ModalBending(reference, torch.from_numpy(self.coarse.faces), fields), basis.eigenvalues)
         #: Times and whole shapes.
         self.whole = list(zip(problem.times.tolist(), problem.whole, strict=False))
+        #: With known places on the coarse mesh.
+        self.frames = [one._replace(markers=[self._restrict(pairs) for pairs in one.markers]) for one in problem.frames]
 
     def search(self, report: ProgressReport) -> list[Tensor]:
         """Shapes of all frames. *Shape of each:* ``(V, 3)``."""
-        n, fits = len(self.frames), dict[int, ModalFit]()
+        n, fits, template = len(self.frames), dict[int, ModalFit](), self.problem.template
         if not self.whole:
-            rigid = [self._place_rigidly(i, self.problem.template) for i in range(n)]
+            rigid = [self.poses.rigid(self._coarsen(template), frame) for frame in self.frames]
             first = int(np.argmin([score for _, score in rigid]))
-            fits[first] = self._search(first, [(self.problem.template, rigid[first][0])])
+            fits[first] = self._search(first, [(template, rigid[first][0])])
             report.update()
         self._outward(fits, {}, report)
         if not self.whole:
@@ -83,10 +81,9 @@ class FramePoses:
                 fits[i] = min(fits[i], again, key=lambda one: one.score)
             report.update()
         shapes = []
-        for i in range(n):
-            one = fits[i]
-            pose = self.poses.stiffen(self._coarsen(one.base), one.pose, self._seen(i))
-            shapes.append(self.bending.shape(one.base, pose))
+        for i, frame in enumerate(self.frames):
+            pose = self.poses.stiffen(self._coarsen(fits[i].base), fits[i].pose, frame)
+            shapes.append(self.bending.shape(fits[i].base, pose))
             report.update()
         return shapes
 
@@ -112,7 +109,7 @@ class FramePoses:
 
     def _alike(self, i: int, shapes: Sequence[Tensor]) -> list[tuple[Tensor, ModalPose]]:
         """The shapes that explain most of a frame after a rigid motion: motions repeat."""
-        placed = [(x, *self._place_rigidly(i, x)) for x in shapes]
+        placed = [(x, *self.poses.rigid(self._coarsen(x), self.frames[i])) for x in shapes]
         return [(x, pose) for x, pose, _ in sorted(placed, key=lambda one: one[2])[:N_ALIKE]]
 
     def _starts(self, t: float, known: list[tuple[float, Tensor]]) -> list[tuple[Tensor, ModalPose]]:
@@ -145,30 +142,16 @@ class FramePoses:
         middle = last.mean(0)
         return (x - middle) @ motion.rotation.mT + 2 * middle - before.mean(0)
 
-    def _place_rigidly(self, i: int, x: Tensor) -> tuple[ModalPose, float]:
-        """The pose of a shape in a frame, and how much it leaves unexplained."""
-        seen, base = self._seen(i), self._coarsen(x)
-        pose = self.poses.rigid(base, seen)
-        return pose, self.poses.score(base, pose, seen)
-
     def _search(self, i: int, starts: Sequence[tuple[Tensor, ModalPose]]) -> ModalFit:
         """A frame by modes."""
-        coarse = [(self._coarsen(x), pose) for x, pose in starts]
-        k, pose, score = self.poses.fit(coarse, self._seen(i))
-        base = starts[k][0]
-        return ModalFit(self.bending.shape(base, pose), base, pose, score)
-
-    def _seen(self, i: int) -> Seen:
-        """Observations of a frame, on the coarse mesh."""
-        return self.frames[i].seen([self._restrict(pairs) for pairs in self.frames[i].markers])
+        k, pose, score = self.poses.fit([(self._coarsen(x), pose) for x, pose in starts], self.frames[i])
+        return ModalFit(self.bending.shape(starts[k][0], pose), starts[k][0], pose, score)
 
     def _coarsen(self, x: Tensor) -> Tensor:
-        return x if self.coarse is None else torch.from_numpy(self.coarse.restrict(x.numpy()))
+        return torch.from_numpy(self.coarse.restrict(x.numpy()))
 
     def _restrict(self, pairs: Pairs) -> Pairs:
         """Known places on the coarse mesh."""
-        if self.coarse is None:
-            return pairs
         rows = pairs.places.tocoo()
         cluster = np.maximum(self.coarse.clusters[rows.col], 0)
         shape = len(pairs.points), self.coarse.n_vertices

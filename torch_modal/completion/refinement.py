@@ -5,11 +5,10 @@ import torch
 from scipy import sparse
 from torch import Tensor
 
-from torch_modal.arrays import FloatArray
 from torch_modal.completion.energy import PointEnergy
-from torch_modal.completion.frames import OUTLIERS, CompletionProblem, Frame, robust
+from torch_modal.completion.frames import CompletionProblem, Frame
 from torch_modal.completion.gradient import LastSolve
-from torch_modal.completion.pairs import Cloud, Pairs, SampledSurface
+from torch_modal.completion.pairs import OUTLIERS, Cloud, Pairs, SampledSurface, robust_weights
 from torch_modal.contact.active import ContactSearch
 from torch_modal.contact.separate import separate
 from torch_modal.elastic.backend import choose
@@ -51,7 +50,7 @@ class Refinement:
     """
 
     def __init__(self, problem: CompletionProblem, objective: Objective) -> None:
-        self.problem, self.frames = problem, problem.frames
+        self.problem = problem
         self.mesh, self.backend, self.contact = Mesh(problem.mesh), choose("auto"), objective.contact
         closed = all(encloses(x, problem.mesh) for x in problem.whole)
         terms = objective.all_terms()
@@ -61,66 +60,63 @@ class Refinement:
         points = self.fine.energy.anchors
         #: Fixed points of the terms. *Shape:* ``(1, P, 3)``.
         self.anchors = None if points is None else torch.from_numpy(problem.to_canonical(points))[None]
-        #: Stiffness of points of known places, as :data:`OF_KNOWN`.
-        self.of_known = OF_KNOWN
 
     def run(self, poses: list[Tensor], report: ProgressReport) -> tuple[Tensor, list[LastSolve]]:
         """Shapes of the frames from their poses by modes, and how each was found. *Shape:* ``(T, V, 3)``."""
-        for frame, pose in zip(self.frames, poses, strict=True):
+        frames = self.problem.frames
+        for i, pose in enumerate(poses):
             surface = SampledSurface(pose.numpy(), self.problem.mesh)
-            frame.samples = [one.with_noise(surface) for one in frame.samples]
-        poses = [self._follow(frame, x) for frame, x in zip(self.frames, poses, strict=True)]
+            frames[i] = frames[i]._replace(samples=[one.with_noise(surface) for one in frames[i].samples])
+        followed = torch.stack([self._follow(frame, pose) for frame, pose in zip(frames, poses, strict=True)])
         (numbers, weights), solves = self._rests(), list[LastSolve]()
-        x = torch.stack(poses)
+        x, of_known = followed, OF_KNOWN
         for k in range(ROUNDS + 1):
-            shapes = torch.cat([torch.stack(poses), self.problem.whole, x])[numbers]
-            steps = LAST if k == ROUNDS else (STEPS, PRODUCTS)
-            solves = []
-            for i, frame in enumerate(self.frames):
+            shapes = torch.cat([followed, self.problem.whole, x])[numbers]
+            steps, solves = LAST if k == ROUNDS else (STEPS, PRODUCTS), []
+            for i, frame in enumerate(frames):
                 rests = RestShapes(shapes[i : i + 1], weights[i : i + 1], self.stiffness, self.anchors)
-                solves.append(self._relax(frame, x[i : i + 1], rests, steps))
+                solves.append(self._relax(frame, x[i : i + 1], rests, steps, of_known))
                 report.update(k < ROUNDS)
             x = torch.cat([solve.x for solve in solves])
+            # Points of known places are missed by their noise, neither more nor less (Morozov's discrepancy).
             ratios = [
-                ratio for frame, one in zip(self.frames, x, strict=True) for ratio in self._noise_ratios(frame, one)
+                np.mean(np.minimum(one.seen.distances(shape) / one.noise, OUTLIERS) ** 2) / 3
+                for frame, shape in zip(frames, x.numpy(), strict=True)
+                for one in frame.samples
+                if isinstance(one.seen, Pairs)
             ]
             if ratios:
-                # Points of known places are missed by their noise, neither more nor less (Morozov's discrepancy).
-                factor = float(np.clip(np.median(ratios), 0.5, 2.0))
-                self.of_known = float(np.clip(self.of_known * factor**2, *STIFFNESSES))
-        if self.contact:
-            x = self._separate(solves)
-        return x, solves
+                of_known = float(np.clip(of_known * np.clip(np.median(ratios), 0.5, 2.0) ** 2, *STIFFNESSES))
+        return self._separate(solves) if self.contact else x, solves
 
-    def _follow(self, frame: Frame, x: Tensor) -> Tensor:
+    def _follow(self, frame: Frame, pose: Tensor) -> Tensor:
         """The shape after as-rigid-as-possible steps towards the clouds of a frame. *Shape:* ``(V, 3)``."""
         if not frame.clouds:
-            return x
-        moved, n = x.numpy(), sum(len(cloud.points) for cloud in frame.clouds)
-        surface = ElasticSurface(SampledSurface(moved, self.problem.mesh))
-        unit = surface.stiffness * min(n, len(moved) / 2)
+            return pose
+        x, n = pose.numpy(), sum(len(cloud.points) for cloud in frame.clouds)
+        elastic = ElasticSurface(SampledSurface(x, self.problem.mesh))
+        unit = elastic.stiffness * min(n, len(x) / 2)
         # Every part is anchored, also one that no point is near.
-        anchor = sparse.identity(len(moved), format="csr"), moved, np.full(len(moved), ANCHOR * surface.stiffness)
+        anchor = sparse.identity(len(x), format="csr"), x, np.full(len(x), ANCHOR * elastic.stiffness)
         for weight, reach in zip(np.geomspace(*WEIGHTS, FOLLOWS), np.geomspace(*REACH, FOLLOWS), strict=True):
-            current, pulls = SampledSurface(moved, self.problem.mesh), [anchor]
+            current, pulls = SampledSurface(x, self.problem.mesh), [anchor]
             for pairs in [*(cloud.places(current) for cloud in frame.clouds), *frame.markers]:
-                trust = robust(pairs.distances(moved), reach / OUTLIERS)
+                trust = robust_weights(pairs.distances(x), reach / OUTLIERS)
                 pulls.append((pairs.places, pairs.points, weight * unit * pairs.weights * trust))
-            moved = surface.follow(moved, pulls)
-        return torch.from_numpy(moved)
+            x = elastic.follow(x, pulls)
+        return torch.from_numpy(x)
 
-    def _relax(self, frame: Frame, x: Tensor, rests: RestShapes, steps: tuple[int, int]) -> LastSolve:
+    def _relax(self, frame: Frame, x: Tensor, rests: RestShapes, steps: tuple[int, int], of_known: float) -> LastSolve:
         """Steps of all vertices of a frame, with pairs found where they start. *Shape:* ``(1, V, 3)``."""
-        surface, numbers, springs = SampledSurface(x[0].numpy(), self.problem.mesh), [], []
-        for sample in frame.samples:
-            seen, n = sample.seen, len(sample.observation.points)
-            pairs, factor = (seen.places(surface), STIFFNESS) if isinstance(seen, Cloud) else (seen, self.of_known)
-            trust = robust(pairs.distances(surface.vertices), sample.noise)
-            springs.append(pairs._replace(weights=factor / sample.noise**2 * n * pairs.weights * trust))
-            numbers.append(np.full(len(pairs.points), sample.number))
+        surface, springs = SampledSurface(x[0].numpy(), self.problem.mesh), []
+        for seen, rows, noise in frame.samples:
+            pairs, factor = (seen.places(surface), STIFFNESS) if isinstance(seen, Cloud) else (seen, of_known)
+            trust = robust_weights(pairs.distances(surface.vertices), noise)
+            weights = factor / noise**2 * len(seen.points) * pairs.weights * trust
+            springs.append(pairs._replace(weights=weights, numbers=rows.start + pairs.numbers))
         points = PointEnergy(springs)
         x = self.fine.relax(x, rests, (steps,), lambda *_: [points])
-        return LastSolve(x, self.fine.energy, rests, points, np.concatenate(numbers))
+        return LastSolve(x, self.fine.energy, rests, points)
 
     def _separate(self, solves: list[LastSolve]) -> Tensor:
         """Push apart the parts of each shape that pass through each other, but for what whole shapes do.
@@ -141,46 +137,27 @@ class Refinement:
             shapes.append(separate(solve.x, relax, search)[0])
         return torch.cat(shapes)
 
-    @staticmethod
-    def _noise_ratios(frame: Frame, x: Tensor) -> list[float]:
-        """Squared distances of points from their known places, over those that their noise explains."""
-        misses = [one.distances(x.numpy()) for one in frame.markers]
-        noises = [one.noise for one in frame.samples if isinstance(one.seen, Pairs)]
-        return [
-            float(np.mean(np.minimum(each / noise, OUTLIERS) ** 2)) / 3
-            for each, noise in zip(misses, noises, strict=True)
-        ]
-
     def _rests(self) -> tuple[Tensor, Tensor]:
         """Rest shapes of each frame, and their weights: its own by modes, whole ones, and neighbours in time.
 
         Numbers count frames by modes, then whole shapes, then frames as they are. *Shape of each:* ``(T, 5)``.
         """
-        n, n_whole, exact = len(self.frames), len(self.problem.whole), self.problem.times
-        times = np.array([frame.time for frame in self.frames])
-        whole, frames = np.arange(n, n + n_whole), np.arange(n + n_whole, 2 * n + n_whole)
-        every, numbers = np.concatenate([exact, times]), np.concatenate([whole[: len(exact)], frames])
+        frames, exact = self.problem.frames, self.problem.times
+        n, n_whole, times = len(frames), len(self.problem.whole), np.array([frame.time for frame in frames])
+        whole, completed = np.arange(n, n + len(exact)), np.arange(n + n_whole, 2 * n + n_whole)
         rows, weights = [], []
-        for i, t in enumerate(times):
-            others = numbers != frames[i]
-            by_modes = OWN_OF_CLOUDS if self.frames[i].clouds else OWN
-            row, parts = [i], [by_modes]
-            for share, pool, which in (
-                (WHOLE, exact, whole),
-                (1 - by_modes - WHOLE, every[others], numbers[others]),
-            ):
-                first, last, u = _around(pool, t) if len(pool) else (0, 0, 0.0)
-                which = which if len(pool) else whole  # the template, or one frame alone
-                row, parts = [*row, which[first], which[last]], [*parts, share * (1 - u), share * u]
+        for i, frame in enumerate(frames):
+            by_modes = OWN_OF_CLOUDS if frame.clouds else OWN
+            every = np.append(whole, np.delete(completed, i)), np.append(exact, np.delete(times, i))
+            row, shares = [i], [by_modes]
+            for share, numbers, when in ((WHOLE, whole, exact), (1 - by_modes - WHOLE, *every)):
+                if not len(when):  # the template, of no time
+                    numbers, when = np.array([n]), np.zeros(1)
+                order = np.argsort(when, kind="stable")
+                after = np.searchsorted(when[order], frame.time, side="right")
+                ends = order[np.clip([after - 1, after], 0, len(when) - 1)]
+                u = float(np.interp(frame.time, when[ends], (0.0, 1.0)))
+                row, shares = [*row, *numbers[ends]], [*shares, share * (1 - u), share * u]
             rows.append(row)
-            weights.append(parts)
+            weights.append(shares)
         return torch.tensor(np.array(rows)), torch.tensor(weights, dtype=torch.float64)
-
-
-def _around(times: FloatArray, t: float) -> tuple[int, int, float]:
-    """Indices of the last time before another and of the first after, and how far between; the nearest, outside."""
-    order = np.argsort(times, kind="stable")
-    before = int(np.searchsorted(times[order], t, side="right")) - 1
-    first, last = order[max(before, 0)], order[min(before + 1, len(times) - 1)]
-    gap = times[last] - times[first]
-    return int(first), int(last), float(np.clip((t - times[first]) / gap, 0, 1)) if gap > 0 else 0.0

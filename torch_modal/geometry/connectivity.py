@@ -175,6 +175,14 @@ def vertex_areas(vertices: FloatArray, faces: IntArray) -> FloatArray:
     return summed.astype(np.float64)  # integers if there are no faces
 
 
+def edge_graph(vertices: FloatArray, mesh: Connectivity) -> sparse.csr_matrix:
+    """Lengths of the edges, none zero, between their ends. *Shape:* ``(V, 3) -> (V, V)``."""
+    i, j = mesh.edges.T
+    lengths = np.linalg.norm(vertices[i] - vertices[j], axis=1)
+    half = sparse.coo_matrix((np.maximum(lengths, 1e-12 * lengths.max(initial=0)), (i, j)), (mesh.n_vertices,) * 2)
+    return (half + half.T).tocsr()
+
+
 def farthest_apart(graph: sparse.csr_matrix, among: IntArray, n: int) -> tuple[IntArray, FloatArray]:
     """Vertices far from each other along a graph, fewer where no more can be reached, and the distances from each.
 

@@ -16,7 +16,7 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 
 from torch_modal import extras
 from torch_modal.arrays import BoolArray, FloatArray, IntArray
-from torch_modal.geometry.connectivity import Connectivity
+from torch_modal.geometry.connectivity import Connectivity, edge_graph
 from torch_modal.geometry.inspect import signed_volume
 from torch_modal.geometry.surface import Surface
 from torch_modal.geometry.triangle_pairs import dot, triangles_cross
@@ -81,10 +81,7 @@ class Crossings:
     @cached_property
     def lengths(self) -> sparse.csr_matrix:
         """Edge lengths as a graph. *Shape:* ``(V, V)``."""
-        i, j = self.mesh.edges.T
-        length = np.maximum(np.linalg.norm(self.like[i] - self.like[j], axis=1), 1e-12 * self.diagonal)
-        half = sparse.coo_matrix((length, (i, j)), (self.mesh.n_vertices,) * 2)
-        return (half + half.T).tocsr()
+        return edge_graph(self.like, self.mesh)
 
     @cached_property
     def pairs_of_known(self) -> list[IntArray]:

@@ -20,8 +20,9 @@ def landmark_table(landmarks: Any, shapes: Sequence[FloatArray]) -> FloatArray:
         FileNotFoundError: There is no such file.
         MeshError: Landmarks do not match the meshes, or a vertex does not exist.
     """
-    n, given = len(shapes), np.zeros(0) if landmarks is None else landmarks
-    table: Any = read_landmarks(given, n) if isinstance(given, (str, os.PathLike)) else to_numpy(given)
+    n = len(shapes)
+    is_file = isinstance(landmarks, (str, os.PathLike))
+    table: Any = read_landmarks(landmarks, n) if is_file else to_numpy([] if landmarks is None else landmarks)
     if table.size == 0:
         return np.zeros((0, n, 3))
     if table.ndim == 3 and table.shape[1:] == (n, 3) and table.dtype.kind in "iuf" and np.isfinite(table).all():
@@ -31,14 +32,12 @@ def landmark_table(landmarks: Any, shapes: Sequence[FloatArray]) -> FloatArray:
             f"landmarks have shape {table.shape} and dtype {table.dtype}; for {n} meshes they are vertex numbers (n, "
             f"{n}) or finite points (n, {n}, 3)"
         )
-    for k, (own, vertices) in enumerate(zip(table.T, shapes, strict=True)):
-        wrong = np.flatnonzero((own < 0) | (own >= len(vertices)))
-        if len(wrong):
-            raise MeshError(
-                f"landmark {wrong[0]} names vertex {own[wrong[0]]} of mesh {k}, which has {len(vertices)} vertices, "
-                "both counted from 0"
-            )
-    return np.stack([vertices[own] for own, vertices in zip(table.T, shapes, strict=True)], axis=1)
+    for i, k in np.argwhere((table < 0) | (table >= [len(vertices) for vertices in shapes])):
+        raise MeshError(
+            f"landmark {i} names vertex {table[i, k]} of mesh {k}, which has {len(shapes[k])} vertices, both counted "
+            "from 0"
+        )
+    return np.stack([vertices[column] for column, vertices in zip(table.T, shapes, strict=True)], axis=1)
 
 
 def read_landmarks(path: str | os.PathLike[str], n_meshes: int) -> IntArray | FloatArray:
@@ -51,11 +50,8 @@ def read_landmarks(path: str | os.PathLike[str], n_meshes: int) -> IntArray | Fl
         FileNotFoundError: There is no such file.
         MeshError: A line cannot be used.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file")
     rows: list[list[float]] = []
-    for number, line in enumerate(path.read_text(errors="replace").splitlines(), 1):
+    for number, line in enumerate(Path(path).read_text(errors="replace").splitlines(), 1):
         words = line.partition("#")[0].replace(",", " ").split()
         if not words:
             continue
@@ -63,18 +59,12 @@ def read_landmarks(path: str | os.PathLike[str], n_meshes: int) -> IntArray | Fl
             row = [float(word) for word in words]
         except ValueError:
             row = []
-        if (
-            not np.isfinite(row).all()
-            or len(row) not in (n_meshes, 3 * n_meshes)
-            or (rows and len(row) != len(rows[0]))
-        ):
+        named = len(row) == n_meshes and all(value.is_integer() and value >= 0 for value in row)
+        placed = len(row) == 3 * n_meshes and np.isfinite(row).all()
+        if not (named or placed) or (rows and len(row) != len(rows[0])):
             raise MeshError(
                 f"{path}, line {number}: {line.strip()[:60]!r} is no landmark for {n_meshes} meshes; each line holds "
-                f"{n_meshes} vertex numbers, counted from 0, or {3 * n_meshes} coordinates, all lines alike"
-            )
-        if len(row) == n_meshes and any(value != int(value) or value < 0 for value in row):
-            raise MeshError(
-                f"{path}, line {number}: vertex numbers are whole and count from 0, got {line.strip()[:60]!r}"
+                f"{n_meshes} vertex numbers, which count from 0, or {3 * n_meshes} coordinates, all lines alike"
             )
         rows.append(row)
     if not rows:
@@ -84,9 +74,6 @@ def read_landmarks(path: str | os.PathLike[str], n_meshes: int) -> IntArray | Fl
 
 
 def landmark_vertices(path: str | os.PathLike[str], shapes: Sequence[FloatArray]) -> IntArray:
-    """Landmarks of a file as vertex indices; points give the nearest vertices. *Shape:* ``(n, K)``."""
-    table: Any = read_landmarks(path, len(shapes))
-    points = landmark_table(table, shapes)
-    if table.ndim == 2:
-        return np.asarray(table, dtype=np.int64)
+    """Vertices nearest to the landmarks of a file. *Shape:* ``(n, K)``."""
+    points = landmark_table(path, shapes)
     return np.stack([cKDTree(shape).query(points[:, k])[1] for k, shape in enumerate(shapes)], axis=1)
