@@ -117,7 +117,7 @@ def body(kind: str, seed: int, pose_seed: int) -> MeshSurface:
         for name in model.phenotype_labels
     }
     posed = model(pose_parameters=torch.tensor(pose, dtype=torch.float32)[None], phenotype_kwargs=shape)
-    return skin.moved(posed["vertices"][0].double().numpy()[cKDTree(rest).query(skin.vertices)[1]])
+    return skin.with_vertices(posed["vertices"][0].double().numpy()[cKDTree(rest).query(skin.vertices)[1]])
 
 
 def plain(surface: MeshSurface) -> MeshSurface:
@@ -127,7 +127,7 @@ def plain(surface: MeshSurface) -> MeshSurface:
     mean, x = sparse.diags(1 / np.asarray(around.sum(1)).ravel()) @ around, surface.vertices
     for _ in range(25):
         x = 0.5 * (x + mean @ x)
-    return surface.moved(x)
+    return surface.with_vertices(x)
 
 
 def remeshed(surface: MeshSurface, random: np.random.Generator) -> MeshSurface:
@@ -146,7 +146,7 @@ def pair(first: MeshSurface, second: MeshSurface, seed: int, *, same_subject: bo
     truth = first.rows(first.closest(template.vertices)) @ second.vertices @ turn.T
     at = landmark_vertices() if marked else []
     marks = np.stack([first.vertices[at], second.vertices[at] @ turn.T], axis=1) if marked else None
-    return Pair(template, target.moved(target.vertices @ turn.T), truth, same_subject, marks)
+    return Pair(template, target.with_vertices(target.vertices @ turn.T), truth, same_subject, marks)
 
 
 @cache

@@ -36,7 +36,7 @@ from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.data.samples import sample_files
 from torch_modal.geometry.decimation import decimate
 from torch_modal.io.read import open_asset
-from torch_modal.registration.surface import MeshSurface, referenced
+from torch_modal.registration.surface import MeshSurface, drop_unreferenced
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "examples"))
 from _animals import animal, galloping, held_out, tips
@@ -105,7 +105,7 @@ def damaged(
         tops = vertices[fins].mean(1) + 0.02 * size * random.normal(size=(20, 3))
         new = np.column_stack([fins[:, :2], len(vertices) + np.arange(20)])
         vertices, faces = np.concatenate([vertices, tops]), np.concatenate([faces, new])
-    surface, _ = referenced(vertices, faces)
+    surface, _ = drop_unreferenced(vertices, faces)
     return surface.vertices, surface.faces
 
 
@@ -220,7 +220,7 @@ def animals(times: dict[str, float] | None, there: str = "stout") -> Subjects:
         surface = MeshSurface(rest, faces)
         rows = surface.rows(surface.closest(np.concatenate([tips(cones), held_out(cones)])))
         x = rest if times is None else galloping(kind, times[kind])
-        found.append((surface.moved(x), rows @ x))
+        found.append((surface.with_vertices(x), rows @ x))
     (here, places), (other, its_places) = found if there == "stout" else found[::-1]
     return here, other, places, its_places
 
@@ -236,7 +236,7 @@ def hands(pose: int) -> Subjects:
         for pair in itertools.pairwise(marks[1:5].tolist())
     ]
     own, its = np.concatenate([marks, webs]).T
-    return here, there.moved(shapes[pose]), first[own], shapes[pose][its]
+    return here, there.with_vertices(shapes[pose]), first[own], shapes[pose][its]
 
 
 def woman() -> Subjects:

@@ -17,8 +17,8 @@ for library in ("robust_laplacian", "potpourri3d", "igl"):
     pytest.importorskip(library, reason=f"{library} is not installed; it is part of the extra 'register'")
 
 Mesh = tuple[np.ndarray, np.ndarray]
-EXACT = Distances(0.0, 0.0, 0.0)
-PERFECT = Quality(EXACT, EXACT, stretch=0.0, flipped_area=0.0, folds=0, unsupported_area=0.0)
+EXACT = Distances(0.0, 0.0)
+PERFECT = Quality(EXACT, EXACT, stretch=0.0, flipped_area=0.0, unsupported_area=0.0)
 
 
 def judged(
@@ -38,7 +38,7 @@ def judged(
 
 
 def off(mean: float) -> Distances:
-    return Distances(mean, 0.0, 0.0)
+    return Distances(mean, 0.0)
 
 
 # What is wrong, the value without confidence, the one with full confidence, and a word of the message.
@@ -46,7 +46,7 @@ ONE_SUBJECT = {
     "to target": (lambda v: {"quality": PERFECT._replace(to_target=off(v))}, 1.0, 0.3, "mean distance"),
     "from target": (lambda v: {"quality": PERFECT._replace(from_target=off(v))}, 1.0, 0.3, "mean distance"),
     "flipped": (lambda v: {"quality": PERFECT._replace(flipped_area=v)}, 0.10, 0.01, "flipped"),
-    "unsupported": (lambda v: {"quality": PERFECT._replace(unsupported_area=v)}, 0.05, 0.02, "no target beside"),
+    "unsupported": (lambda v: {"quality": PERFECT._replace(unsupported_area=v)}, 0.05, 0.02, "no target next to"),
     "mirrored": (lambda v: {"mirrored_lead": v}, *MIRRORED, "mirror image"),
     "another": (lambda v: {"lead": v}, 0.0, 0.1, "another map"),
     "sliding": (lambda v: {"freedom": v}, 0.9, 0.65, "slide"),
@@ -196,7 +196,8 @@ def test_smooth_surfaces_slide() -> None:
     assert freedom(points) > 5 > freedom(egg) > 1.2
     turn = Rotation.from_rotvec([1, 2, 3]).as_matrix()
     assert freedom(10 * egg @ turn + [1, 2, 3]) == pytest.approx(freedom(egg), rel=1e-3)
-    few, some = (SpectralShape(MeshSurface(egg, faces)).farthest_points(n)[0] for n in (5, 16))
+    samples = SpectralShape(MeshSurface(egg, faces)).samples[0]
+    few, some = samples[:5], samples[:16]
     assert freedom(egg, fixed=some) < 0.65 and 0.9 < freedom(egg, fixed=few) < freedom(egg)
     assert freedom(*limbs(3)) < 0.7
 

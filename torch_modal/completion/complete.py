@@ -150,6 +150,7 @@ def _complete(
             problem.frames = [frame._replace(time=t) for frame, t in zip(problem.frames, when, strict=True)]
         x, solves = Refinement(problem, objective).run(poses, report)
     misses, trust, seen, doubtful = compare(problem, x)
+    sizes = [len(one.points) for one in observations]
     if doubtful:
         some = ", ".join(f"{t:g} ({100 * explained:.0f} %)" for t, explained in list(doubtful.items())[:8])
         warnings.warn(
@@ -167,8 +168,8 @@ def _complete(
         torch.tensor(moments, dtype=torch.float64, device=like.device),
         torch.stack([shape_at[t] for t in moments]),
         confidence_of(problem, x, seen).to(like),
-        [(each / problem.scale).to(like) for each in misses],
-        [each.to(like) for each in trust],
+        list((misses / problem.scale).to(like).split(sizes)),
+        list(trust.to(like).split(sizes)),
         knots,
         Path(knots, problem.faces, times=order, objective=objective) if len(order) > 1 else None,
     )

@@ -19,7 +19,7 @@ DOUBTFUL = 0.5
 """Part of the points that a shape has to explain."""
 
 
-def compare(problem: CompletionProblem, x: Tensor) -> tuple[list[Tensor], list[Tensor], Tensor, dict[float, float]]:
+def compare(problem: CompletionProblem, x: Tensor) -> tuple[Tensor, Tensor, Tensor, dict[float, float]]:
     """Compare shapes with what was seen.
 
     Args:
@@ -27,26 +27,25 @@ def compare(problem: CompletionProblem, x: Tensor) -> tuple[list[Tensor], list[T
         x: The shapes at its times. *Shape:* ``(T, V, 3)``.
 
     Returns:
-        Of each observation, the distances of its points at a size of 100, and what they count for; what of each shape
-        was seen then, *shape* ``(T, V)``; and the times of doubtful shapes with the part of the points that they
+        The distances of all observed points at a size of 100, and what they count for, *shape* ``(n,)``; what of each
+        shape was seen then, *shape* ``(T, V)``; and the times of doubtful shapes with the part of the points that they
         explain.
     """
     doubtful, seen = dict[float, float](), x.new_zeros(x.shape[:2])
-    results = dict[int, tuple[Tensor, Tensor]]()  # by the first of the points
+    misses, trust = np.zeros((2, sum(len(one.points) for frame in problem.frames for one in frame.seen)))
     for i, frame in enumerate(problem.frames):
         surface = SampledSurface(x[i].numpy(), problem.mesh)
-        for one in frame.samples:
-            distances, agree = one.seen.misses(surface)
+        for one in frame.seen:
+            distances, agree = one.misses(surface)
             weights = agree * robust_weights(distances, one.noise)
-            results[one.rows.start] = torch.from_numpy(distances), torch.from_numpy(weights)
-            gaps, nearest = cKDTree(one.seen.points).query(surface.vertices, 3)
+            misses[one.numbers], trust[one.numbers] = distances, weights
+            gaps, nearest = cKDTree(one.points).query(surface.vertices, 3)
             close = (weights[nearest] * np.exp(-0.5 * (gaps / NEAR) ** 2)).max(1)
             explained = float(weights.mean())
             if explained < DOUBTFUL:
                 doubtful[frame.time] = explained
             seen[i] = torch.maximum(seen[i], min(1.0, explained / DOUBTFUL) * torch.from_numpy(close))
-    misses, trust = zip(*(results[start] for start in sorted(results)), strict=True)
-    return list(misses), list(trust), seen, doubtful
+    return torch.from_numpy(misses), torch.from_numpy(trust), seen, doubtful
 
 
 def confidence_of(problem: CompletionProblem, x: Tensor, seen: Tensor) -> Tensor:

@@ -49,8 +49,7 @@ class PointEnergy:
 
     def value(self, x: Tensor) -> Tensor:
         """*Shape:* ``(1, V, 3) -> (1,)``."""
-        off, forces = self.forces(x, self.points)
-        return (off * forces).sum()[None]
+        return self.at(x).value
 
     def at(self, x: Tensor) -> Point:
         """*Shape:* ``(1, V, 3)``."""

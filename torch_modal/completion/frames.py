@@ -1,6 +1,6 @@
 """Observations by their times, at a size of 100 in the axes of the first shape."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -24,26 +24,10 @@ HALF, NOISES_OF_HALF = 1.0, 3.0
 """Distance at which half of a miss counts, at least, and in noises."""
 
 
-class Sample(NamedTuple):
-    """An observation at a size of 100."""
-
-    seen: Cloud | Pairs
-    rows: slice
-    """Its points among the points of all observations."""
-    noise: float
-    """Its standard deviation; 0 where it is not known yet."""
-
-    def with_noise(self, surface: SampledSurface) -> "Sample":
-        """The noise estimated where it is not known: from the median of distances with such an error."""
-        median = float(np.median(self.seen.misses(surface)[0])) / (0.6745 if isinstance(self.seen, Cloud) else 1.538)
-        return self._replace(noise=self.noise or float(np.clip(median, *NOISES)))
-
-
 class Frame(NamedTuple):
     """Observations of one time."""
 
     time: float
-    samples: list[Sample]
     clouds: list[Cloud]
     markers: list[Pairs]
     soft: float
@@ -51,18 +35,25 @@ class Frame(NamedTuple):
     unit: float
     """Distance at which half of a miss counts."""
 
-    @classmethod
-    def of(cls, time: float, samples: list[Sample]) -> "Frame":
-        """All samples of a time."""
-        clouds = [one.seen for one in samples if isinstance(one.seen, Cloud)]
-        markers = [one.seen for one in samples if isinstance(one.seen, Pairs)]
-        soft = min((one.noise or NOISE) ** 2 / (SWAY**2 * len(one.seen.points)) for one in samples)
-        unit = NOISES_OF_HALF * max(one.noise for one in samples)
-        return cls(time, samples, clouds, markers, max(SOFT, soft), max(HALF, unit))
+    @property
+    def seen(self) -> list[Cloud | Pairs]:
+        """All observations."""
+        return [*self.clouds, *self.markers]
+
+    def with_noise(self, surface: SampledSurface) -> "Frame":
+        """The noise estimated where it is not known."""
+        clouds, markers = ([_with_noise(one, surface) for one in seen] for seen in (self.clouds, self.markers))
+        return self._replace(clouds=clouds, markers=markers)
 
     def thin(self, n: int) -> "Frame":
         """With so many points of each cloud, chosen at random, always the same."""
         return self._replace(clouds=[cloud.thin(n) for cloud in self.clouds])
+
+
+def _with_noise(seen: Any, surface: SampledSurface) -> Any:
+    """The noise from the median of distances with such an error, from a surface or from a point."""
+    median = float(np.median(seen.misses(surface)[0])) / (0.6745 if isinstance(seen, Cloud) else 1.538)
+    return seen._replace(noise=seen.noise or float(np.clip(median, *NOISES)))
 
 
 class CompletionProblem:
@@ -84,12 +75,12 @@ class CompletionProblem:
         _, self.axes, self.centre, self.scale = to_canonical(shapes[0], faces.numpy())
         self.whole = torch.from_numpy((shapes - self.centre) @ self.axes.T * self.scale)
         self.template = self.whole[0]
-        samples: dict[float, list[Sample]] = {}
-        start = 0
-        for one in observations:
-            samples.setdefault(one.time, []).append(self._sample(one, slice(start, start := start + len(one.points))))
-        #: *Length:* T.
-        self.frames = [Frame.of(t, samples[t]) for t in sorted(samples)]
+        ends = np.cumsum([len(one.points) for one in observations])
+        seen = [(one, self._sample(one, int(end))) for one, end in zip(observations, ends, strict=True)]
+        self.frames = [
+            self._frame(t, [sample for one, sample in seen if one.time == t])
+            for t in sorted({one.time for one in observations})
+        ]
 
     def to_canonical(self, x: Tensor, direction: bool = False) -> FloatArray:
         """Points, or directions, in its axes. *Shape:* ``(..., 3)``."""
@@ -100,17 +91,27 @@ class CompletionProblem:
         """The inverse. *Shape:* ``(..., 3)``."""
         return (x / self.scale) @ torch.from_numpy(self.axes) + torch.from_numpy(self.centre)
 
-    def _sample(self, one: Observation, rows: slice) -> Sample:
+    @staticmethod
+    def _frame(time: float, samples: list[Cloud | Pairs]) -> Frame:
+        soft = min((one.noise or NOISE) ** 2 / (SWAY**2 * len(one.points)) for one in samples)
+        unit = NOISES_OF_HALF * max(one.noise for one in samples)
+        clouds = [one for one in samples if isinstance(one, Cloud)]
+        markers = [one for one in samples if isinstance(one, Pairs)]
+        return Frame(time, clouds, markers, max(SOFT, soft), max(HALF, unit))
+
+    def _sample(self, one: Observation, end: int) -> Cloud | Pairs:
         points, known = self.to_canonical(one.points), self.template[self.faces.unique()]
         weights = np.ones(len(points)) if one.weights is None else one.weights.cpu().double().numpy()
-        seen: Cloud | Pairs
+        noise = 0.0 if one.noise is None else max(one.noise * self.scale, NOISES[0])
+        weights, numbers = weights / weights.sum(), np.arange(end - len(points), end)
+        sample: Cloud | Pairs
         if one.is_cloud:
             normals, view = (None if x is None else self.to_canonical(x, True) for x in (one.normals, one.view))
-            seen = Cloud(points, normals, weights, view)
+            sample = Cloud(points, normals, weights, numbers, noise, view)
         else:
             corners, barycentric = one.places()
             places = places_between(corners.cpu().numpy(), barycentric.cpu().double().numpy(), len(self.template))
-            seen = Pairs(places, points, None, weights / weights.sum(), np.arange(len(points)))
+            sample = Pairs(points, None, weights, numbers, noise, places)
             known = torch.from_numpy(places @ self.template.numpy())
         require_units(f"{one}: the points", torch.from_numpy(points), "the first shape", known[None], 1 / self.scale)
-        return Sample(seen, rows, 0.0 if one.noise is None else max(one.noise * self.scale, NOISES[0]))
+        return sample

@@ -1,6 +1,5 @@
 """Pairs of observed points and places on a surface: by position and normal, in both directions, robust."""
 
-from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -30,10 +29,8 @@ N_NEIGHBOURS, GAP = 8, 3.0
 
 
 class Pairs(NamedTuple):
-    """Places on a surface that belong to points."""
+    """Points, and the places on a surface that belong to them."""
 
-    places: sparse.csr_matrix
-    """*Shape:* ``(n, V)``."""
     points: FloatArray
     """*Shape:* ``(n, 3)``."""
     normals: FloatArray | None
@@ -41,7 +38,11 @@ class Pairs(NamedTuple):
     weights: FloatArray
     """*Shape:* ``(n,)``."""
     numbers: IntArray
-    """Indices of the points among those observed. *Shape:* ``(n,)``."""
+    """Indices of the points among all observed ones. *Shape:* ``(n,)``."""
+    noise: float
+    """Standard deviation; 0 where it is not known yet."""
+    places: sparse.csr_matrix
+    """*Shape:* ``(n, V)``."""
 
     def distances(self, x: FloatArray) -> FloatArray:
         """Distances of the points from their places on a shape. *Shape:* ``(V, 3) -> (n,)``."""
@@ -98,34 +99,27 @@ class SampledSurface(MeshSurface):
         return np.flatnonzero(front & (nearest[cell.ravel()] - depth < DEPTH))
 
 
-class Cloud:
-    """A cloud at a size of 100."""
+class Cloud(NamedTuple):
+    """A cloud at a size of 100, with the fields of :class:`Pairs`, and the direction to the camera."""
 
-    def __init__(
-        self, points: FloatArray, normals: FloatArray | None, weights: FloatArray, view: FloatArray | None
-    ) -> None:
-        self.points, self.normals, self.weights, self.view = points, normals, weights, view
+    points: FloatArray
+    normals: FloatArray | None
+    weights: FloatArray
+    numbers: IntArray
+    noise: float
+    view: FloatArray | None
 
     def thin(self, n: int) -> "Cloud":
         """So many of the points, chosen at random, always the same."""
         if len(self.points) <= n:
             return self
-        kept = np.random.default_rng(0).permutation(len(self.points))[:n]
-        normals = None if self.normals is None else self.normals[kept]
-        return Cloud(self.points[kept], normals, self.weights[kept], self.view)
+        chosen = np.random.default_rng(0).permutation(len(self.points))[:n]
+        return Cloud(*self._select(chosen, self.weights[chosen] / self.weights[chosen].sum()), self.view)
 
-    @cached_property
-    def _tree(self) -> Any:
-        return cKDTree(self.points)
-
-    @cached_property
-    def _featured(self) -> Any:
-        return cKDTree(join_features(self.points, self.normals))
-
-    @cached_property
-    def usual_gap(self) -> float:
-        """The usual distance of a neighbour."""
-        return float(np.median(self._tree.query(self.points, min(N_NEIGHBOURS, len(self.points)))[0][:, -1]))
+    def _select(self, rows: IntArray, weights: FloatArray) -> tuple[Any, ...]:
+        """The first fields of some of the points, with other weights."""
+        normals = None if self.normals is None else self.normals[rows]
+        return self.points[rows], normals, weights, self.numbers[rows], self.noise
 
     def misses(self, surface: SampledSurface) -> tuple[FloatArray, BoolArray]:
         """Distances of the points from the places that look most like them, and if normals agree. *Shape:* ``(n,)``."""
@@ -137,50 +131,26 @@ class Cloud:
         if released is not None:
             agree &= ~released[surface.faces[face]].any(1)
         kept = np.flatnonzero(agree)
-        normals = None if self.normals is None else self.normals[kept]
         places = places_between(surface.faces[face[kept]], barycentric[kept], len(surface.vertices))
-        return Pairs(places, self.points[kept], normals, self.weights[kept] / self.weights.sum(), kept)
-
-    def pairs(self, surface: SampledSurface, released: BoolArray | None = None) -> list[Pairs]:
-        """Places for the points, and, where the view is known, points for the visible places."""
-        pairs = [self.places(surface, released)]
-        if self.view is None or self.normals is None:
-            return pairs
-        seen = surface.visible(self.view)
-        seen = seen[:: max(1, len(seen) // len(self.points))]
-        faces = surface.sample_faces[seen]
-        nearest = self._featured.query(join_features(surface.samples[seen], surface.face_normals[faces]))[1]
-        agree = dot(surface.face_normals[faces], self.normals[nearest]) > ALIKE
-        if released is not None:
-            agree &= ~released[surface.faces[faces]].any(1)
-        seen, faces, nearest = seen[agree], faces[agree], nearest[agree]
-        if len(seen):
-            places = places_between(surface.faces[faces], _PLACES[seen % len(_PLACES)], len(surface.vertices))
-            share = np.full(len(seen), 1 / len(seen))
-            pairs.append(Pairs(places, self.points[nearest], self.normals[nearest], share, nearest))
-        return pairs
-
-    def squared_misses(self, surface: SampledSurface, unit: float) -> FloatArray:
-        """Squared distances of the points in a unit; infinite where normals disagree. *Shape:* ``(n,)``."""
-        distances, agree = self.misses(surface)
-        return np.where(agree, (distances / unit) ** 2, np.inf)
+        return Pairs(*self._select(kept, self.weights[kept]), places)
 
     def score(self, surface: SampledSurface, unit: float) -> float:
         """Part of the cloud that the surface leaves out, and of the visible surface that the cloud leaves out."""
-        off = self.squared_misses(surface, unit)
-        total = float((self.weights * (1 - 1 / (1 + off))).sum() / self.weights.sum())
+        distances, agree = self.misses(surface)
+        total = float(self.weights @ np.where(agree, 1 - 1 / (1 + (distances / unit) ** 2), 1))
         if self.view is not None:
             seen = surface.samples[surface.visible(self.view)]
-            gap = (self._tree.query(seen)[0] / (3 * unit)) ** 2
+            gap = (cKDTree(self.points).query(seen)[0] / (3 * unit)) ** 2
             total += float((gap / (1 + gap)).mean()) if len(seen) else 1.0
         return total
 
-    def unexplained_groups(self, surface: SampledSurface, reach: float, least: int) -> list[IntArray]:
+    def find_unexplained(self, surface: SampledSurface, reach: float, least: int) -> list[IntArray]:
         """Connected groups of points that are far from the surface, the largest first."""
-        off = np.flatnonzero(self.squared_misses(surface, reach) > 1)
+        distances, agree = self.misses(surface)
+        off = np.flatnonzero(~agree | (distances > reach))
         if len(off) < least:
             return []
-        neighbours = self._tree.query(self.points, min(N_NEIGHBOURS, len(self.points)))[0]
+        neighbours = cKDTree(self.points).query(self.points, min(N_NEIGHBOURS, len(self.points)))[0]
         gap = GAP / 2 * float(np.median(neighbours[:, -1]))
         pieces = connected_pieces(cKDTree(self.points[off]).query_pairs(gap, output_type="ndarray"), len(off))
         sizes = np.bincount(pieces)

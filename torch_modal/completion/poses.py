@@ -76,7 +76,7 @@ class FramePoses:
             report.update(len(fits))
             self._outward(fits, before, report)
         for i in sorted(range(n), key=lambda i: -fits[i].score):
-            if known := self._known({j: one for j, one in fits.items() if j != i}):
+            if known := self._knots({j: one for j, one in fits.items() if j != i}):
                 again = self._search(i, self._starts(self.frames[i].time, known))
                 fits[i] = min(fits[i], again, key=lambda one: one.score)
             report.update()
@@ -91,7 +91,7 @@ class FramePoses:
         """Add all other frames, those near in time to what is known first; none is worse than it was before."""
         left = [i for i in range(len(self.frames)) if i not in fits]
         while left:
-            known = self._known(fits)
+            known = self._knots(fits)
             gaps = [min(abs(self.frames[i].time - t) for t, _ in known) for i in left]
             i = left.pop(int(np.argmin(gaps)))
             starts = self._starts(self.frames[i].time, known)
@@ -102,7 +102,7 @@ class FramePoses:
                 fits[i] = min(fits[i], before[i], key=lambda one: one.score)
             report.update()
 
-    def _known(self, fits: dict[int, ModalFit]) -> list[tuple[float, Tensor]]:
+    def _knots(self, fits: dict[int, ModalFit]) -> list[tuple[float, Tensor]]:
         """Times and shapes of frames, and of whole ones, in the order of time."""
         shapes = [*self.whole, *((self.frames[i].time, one.x) for i, one in fits.items())]
         return sorted(shapes, key=lambda one: one[0])
@@ -115,21 +115,19 @@ class FramePoses:
     def _starts(self, t: float, known: list[tuple[float, Tensor]]) -> list[tuple[Tensor, ModalPose]]:
         """Shapes from which a search at a time starts."""
         times, shapes = np.array([time for time, _ in known]), torch.stack([x for _, x in known])
-        if t in times:
-            return [(shapes[int(np.argmin(np.abs(times - t)))], self.bending.still())]
-        if len(known) > 1 and times[0] < t < times[-1]:
-            path = Path(shapes, self.faces, times=times.tolist())
-            after = int(np.searchsorted(times, t))
-            gap = times[after] - times[after - 1]
-            base = path(shapes, t)
-            bases = [base]
-            for shift in SHIFTS:
-                other = path(shapes, float(np.clip(t + shift * gap, times[0], times[-1])))
-                bases.append(best_fit(other, base).apply(other))
-        else:
-            nearest = np.argsort(np.abs(times - t))
-            bases = [shapes[nearest[0]]]
-            if len(known) > 1:
+        nearest = np.argsort(np.abs(times - t))
+        bases = [shapes[nearest[0]]]
+        if t not in times and len(known) > 1:
+            if times[0] < t < times[-1]:
+                path, gap = (
+                    Path(shapes, self.faces, times=times.tolist()),
+                    np.diff(times)[np.searchsorted(times, t) - 1],
+                )
+                bases = [path(shapes, t)]
+                for shift in SHIFTS:
+                    other = path(shapes, float(np.clip(t + shift * gap, times[0], times[-1])))
+                    bases.append(best_fit(other, bases[0]).apply(other))
+            else:
                 bases.append(self._beyond(shapes[nearest[1]], shapes[nearest[0]]))
         return [(x, self.bending.still()) for x in bases]
 
@@ -167,21 +165,21 @@ def times_between(problem: CompletionProblem, shapes: list[Tensor]) -> list[floa
     """
     first = [frame.time for frame in problem.frames]
     times, exact = list(first), problem.times.tolist()
-    for _ in range(TIME_ROUNDS):
-        for i, x in enumerate(shapes):
-            others = [(t, other) for j, (t, other) in enumerate(zip(times, shapes, strict=True)) if j != i]
-            known = sorted([*zip(exact, problem.whole, strict=False), *others], key=lambda one: one[0])
-            axis = np.array([t for t, _ in known])
-            after = int(np.searchsorted(axis, times[i]))
-            if times[i] in exact or not 0 < after < len(axis):
-                continue
-            gap = LATEST * (axis[after] - axis[after - 1])
-            around = slice(max(0, after - 2), after + 2)
-            near = torch.stack([other for _, other in known[around]])
-            path = Path(near, problem.faces, times=axis[around].tolist())
-            cost = partial(_cost_of_time, path, near, x, first[i], gap)
-            bounds = max(axis[after - 1], first[i] - gap), min(axis[after], first[i] + gap)
-            times[i] = float(minimize_scalar(cost, bounds=bounds, method="bounded").x)
+    for i in TIME_ROUNDS * list(range(len(shapes))):
+        known = [*zip(exact, problem.whole, strict=False), *zip(times, shapes, strict=True)]
+        del known[len(exact) + i]
+        known.sort(key=lambda one: one[0])
+        axis = np.array([t for t, _ in known])
+        after = int(np.searchsorted(axis, times[i]))
+        if times[i] in exact or not 0 < after < len(axis):
+            continue
+        gap = LATEST * (axis[after] - axis[after - 1])
+        around = slice(max(0, after - 2), after + 2)
+        near = torch.stack([other for _, other in known[around]])
+        path = Path(near, problem.faces, times=axis[around].tolist())
+        cost = partial(_cost_of_time, path, near, shapes[i], first[i], gap)
+        bounds = max(axis[after - 1], first[i] - gap), min(axis[after], first[i] + gap)
+        times[i] = float(minimize_scalar(cost, bounds=bounds, method="bounded").x)
     return times
 
 

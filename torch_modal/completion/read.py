@@ -71,9 +71,9 @@ def _markers(path: Path, n_vertices: int) -> Iterator[tuple[float, Tensor, Tenso
         raise MeshError(f"{path}: the first line names the columns, {','.join(COLUMNS)}; got {','.join(names)[:80]!r}")
     seen: dict[float, list[list[float]]] = {}
     for number, row in enumerate(rows, 2):
-        given = dict(zip(names, row, strict=False))
+        cells = dict(zip(names, row, strict=False))
         try:
-            time, vertex, *place = (float(given.get(name) or "nan") for name in COLUMNS)
+            time, vertex, *place = (float(cells.get(name) or "nan") for name in COLUMNS)
         except ValueError as error:
             raise MeshError(f"{path}, line {number}: {error}; leave coordinates of lost markers empty") from None
         if all(map(isfinite, place)):

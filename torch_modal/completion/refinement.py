@@ -8,7 +8,7 @@ from torch import Tensor
 from torch_modal.completion.energy import PointEnergy
 from torch_modal.completion.frames import CompletionProblem, Frame
 from torch_modal.completion.gradient import LastSolve
-from torch_modal.completion.pairs import OUTLIERS, Cloud, Pairs, SampledSurface, robust_weights
+from torch_modal.completion.pairs import OUTLIERS, Cloud, SampledSurface, robust_weights
 from torch_modal.contact.active import ContactSearch
 from torch_modal.contact.separate import separate
 from torch_modal.elastic.backend import choose
@@ -66,7 +66,7 @@ class Refinement:
         frames = self.problem.frames
         for i, pose in enumerate(poses):
             surface = SampledSurface(pose.numpy(), self.problem.mesh)
-            frames[i] = frames[i]._replace(samples=[one.with_noise(surface) for one in frames[i].samples])
+            frames[i] = frames[i].with_noise(surface)
         followed = torch.stack([self._follow(frame, pose) for frame, pose in zip(frames, poses, strict=True)])
         (numbers, weights), solves = self._rests(), list[LastSolve]()
         x, of_known = followed, OF_KNOWN
@@ -80,10 +80,9 @@ class Refinement:
             x = torch.cat([solve.x for solve in solves])
             # Points of known places are missed by their noise, neither more nor less (Morozov's discrepancy).
             ratios = [
-                np.mean(np.minimum(one.seen.distances(shape) / one.noise, OUTLIERS) ** 2) / 3
+                np.mean(np.minimum(one.distances(shape) / one.noise, OUTLIERS) ** 2) / 3
                 for frame, shape in zip(frames, x.numpy(), strict=True)
-                for one in frame.samples
-                if isinstance(one.seen, Pairs)
+                for one in frame.markers
             ]
             if ratios:
                 of_known = float(np.clip(of_known * np.clip(np.median(ratios), 0.5, 2.0) ** 2, *STIFFNESSES))
@@ -109,11 +108,11 @@ class Refinement:
     def _relax(self, frame: Frame, x: Tensor, rests: RestShapes, steps: tuple[int, int], of_known: float) -> LastSolve:
         """Steps of all vertices of a frame, with pairs found where they start. *Shape:* ``(1, V, 3)``."""
         surface, springs = SampledSurface(x[0].numpy(), self.problem.mesh), []
-        for seen, rows, noise in frame.samples:
+        for seen in frame.seen:
             pairs, factor = (seen.places(surface), STIFFNESS) if isinstance(seen, Cloud) else (seen, of_known)
-            trust = robust_weights(pairs.distances(surface.vertices), noise)
-            weights = factor / noise**2 * len(seen.points) * pairs.weights * trust
-            springs.append(pairs._replace(weights=weights, numbers=rows.start + pairs.numbers))
+            trust = robust_weights(pairs.distances(surface.vertices), seen.noise)
+            weights = factor / seen.noise**2 * len(seen.points) * pairs.weights * trust
+            springs.append(pairs._replace(weights=weights))
         points = PointEnergy(springs)
         x = self.fine.relax(x, rests, (steps,), lambda *_: [points])
         return LastSolve(x, self.fine.energy, rests, points)

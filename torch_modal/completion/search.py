@@ -1,6 +1,6 @@
 """Poses and amplitudes of modes that bring a shape near to what was seen, from far to near."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -16,7 +16,7 @@ from torch_modal.geometry.connectivity import Connectivity, edge_graph, farthest
 
 # Steps, and the distance from which on pairs lose weight at the first and the last; stiffness of the modes likewise.
 STEPS, FAR, NEAR = 12, 20.0, 2.0
-# Points of a cloud, and visible places of a surface, that take part in a step, and in one of the pose alone.
+# Points of a cloud that take part in a step, and in one of the pose alone.
 N_POINTS, N_RIGID = 800, 200
 STIFF, STIFFER = 1e-2, (1e-4, 1e-3, 1e-2)
 # Stiffness of a turn and a move of the whole.
@@ -60,13 +60,13 @@ class PoseSearch:
         """Part that is left unexplained, and a little of the energy of the modes; 0 or more."""
         surface = self.surface(base, pose)
         total = PRIOR * float(self.stiffness[:-6] @ pose.amplitudes**2)
-        return total + sum(seen.score(surface, frame.unit) for seen in (*frame.clouds, *frame.markers))
+        return total + sum(seen.score(surface, frame.unit) for seen in frame.seen)
 
     def rigid(self, base: Tensor, frame: Frame) -> tuple[ModalPose, float]:
         """The pose alone, from the centroid of what was seen on, and its score."""
-        points = np.concatenate([seen.points for seen in (*frame.clouds, *frame.markers)])
+        points = np.concatenate([seen.points for seen in frame.seen])
         start = self.bending.still()._replace(move=torch.from_numpy(np.median(points, 0)) - base.median(0).values)
-        pose = self.descend(base, start, frame, (2 * FAR, FAR), 1.0, rigid=True)
+        pose = self.descend(base, start, frame._replace(soft=1.0), (2 * FAR, FAR), 1.0, rigid=True)
         return pose, self.score(base, pose, frame)
 
     def descend(
@@ -78,6 +78,7 @@ class PoseSearch:
         stiff: float = STIFF,
         n_steps: int = STEPS,
         released: BoolArray | None = None,
+        springs: Callable[[FloatArray, int], Pairs] | None = None,
         rigid: bool = False,
     ) -> ModalPose:
         """Gauss-Newton steps, each with new pairs, from far to near and from stiff to soft; no vertex moves far."""
@@ -88,7 +89,13 @@ class PoseSearch:
                 x, fields = self.bending.linearise(base, pose, rigid)
             else:  # the derivatives of the step before do nearly as well
                 x = self.bending.shape(base, pose)
-            matrix, slope = self._normal_equations(x, fields, pose, frame, far, stiffness, released)
+            markers = [*frame.markers, springs(x.numpy(), k)] if springs else frame.markers
+            rows = self._rows(x, fields, frame._replace(markers=markers), float(far), released)
+            products, n = (rows.mT @ rows).double(), fields.shape[-1]
+            amplitudes = torch.cat([pose.amplitudes, pose.amplitudes.new_zeros(6)])[-n:]
+            prior = float(stiffness) * self.stiffness[-n:]
+            matrix, slope = products[:n, :n].clone(), products[:n, n] + prior * amplitudes
+            matrix.diagonal().add_(prior + 1e-9 * matrix.diagonal().mean())
             step = -torch.linalg.solve(matrix, slope)
             largest = float((fields @ step).norm(dim=-1).max()) / LARGEST_STEP
             pose = self.bending.step(pose, step / max(1.0, largest), x.mean(0))
@@ -126,7 +133,7 @@ class PoseSearch:
         """Groups of points that nothing explains, each with the end of a limb that might."""
         surface, limbs = self.surface(base, pose), []
         for cloud in frame.clouds:
-            for group in cloud.unexplained_groups(surface, REACH, max(4, len(cloud.points) // PART_OF_GROUP))[:2]:
+            for group in cloud.find_unexplained(surface, REACH, max(4, len(cloud.points) // PART_OF_GROUP))[:2]:
                 points = cloud.points[group]
                 away = np.linalg.norm(surface.vertices[self.tips] - points.mean(0), axis=1)
                 nearest = np.argsort(away)[:N_TRIED]
@@ -140,28 +147,23 @@ class PoseSearch:
         extent = 2 * float(np.percentile(np.linalg.norm(points - points.mean(0), axis=1), 90))
         limb = self.from_tips[tip] < np.clip(extent, *LIMBS)
         vertices = np.flatnonzero(limb)
-        x = self.bending.shape(base, pose).numpy()[vertices]
-        nearest = vertices[cKDTree(x - x.mean(0)).query(points - points.mean(0))[1]]
-        places = sparse.identity(len(limb), format="csr")[nearest]
-        weights = np.full(len(points), WEIGHT / len(cloud.points))
-        target = frame._replace(markers=[*frame.markers, Pairs(places, points, None, weights, np.arange(len(points)))])
-        pose = self.descend(base, pose, target, (MOST_AWAY, MOST_AWAY), frame.soft, STEPS // 2, limb)
+        weights, numbers = np.full(len(points), WEIGHT / len(cloud.points)), np.arange(len(points))
+
+        def springs(x: FloatArray, k: int) -> Pairs:
+            shift = 0 if k else points.mean(0) - x[vertices].mean(0)
+            nearest = vertices[cKDTree(x[vertices] + shift).query(points)[1]]
+            places = sparse.identity(len(limb), format="csr")[nearest]
+            return Pairs(points, None, weights, numbers, 0.0, places)
+
+        distances = MOST_AWAY, MOST_AWAY
+        pose = self.descend(base, pose, frame, distances, frame.soft, STEPS // 2, released=limb, springs=springs)
         return self.descend(base, pose, frame, (FAR / 3, NEAR), 10 * frame.soft, STEPS // 2)
 
-    def _normal_equations(
-        self,
-        x: Tensor,
-        fields: Tensor,
-        pose: ModalPose,
-        frame: Frame,
-        far: float,
-        stiffness: float,
-        released: BoolArray | None,
-    ) -> tuple[Tensor, Tensor]:
-        """Matrix and gradient of a Gauss-Newton step. *Shape:* ``(n, n), (n,)``."""
+    def _rows(self, x: Tensor, fields: Tensor, frame: Frame, far: float, released: BoolArray | None) -> Tensor:
+        """Derivatives of the weighted offsets of all pairs, and last the offsets. *Shape:* ``(m, n + 1)``."""
         n, surface, rows = fields.shape[-1], SampledSurface(x.numpy(), self.mesh), []
         columns = fields.flatten(1).float().numpy()  # products of float32: half the time
-        for pairs in [*(pairs for cloud in frame.clouds for pairs in cloud.pairs(surface, released)), *frame.markers]:
+        for pairs in [*(cloud.places(surface, released) for cloud in frame.clouds), *frame.markers]:
             off = pairs.places @ surface.vertices - pairs.points
             root = (pairs.weights**0.5 / (1 + (off**2).sum(1) / far**2)).astype(np.float32)
             moved = (pairs.places.astype(np.float32) @ columns).reshape(-1, 3, n)
@@ -170,10 +172,4 @@ class PoseSearch:
                 across = torch.from_numpy(pairs.normals).float()[:, None]
                 row = SLIDE**0.5 * row + (1 - SLIDE**0.5) * across.mT * (across @ row)
             rows.append((torch.from_numpy(root)[:, None, None] * row).flatten(0, 1))
-        row = torch.cat(rows)
-        products = (row.mT @ row).double()
-        amplitudes = torch.cat([pose.amplitudes, pose.amplitudes.new_zeros(6)])[-n:]
-        prior = stiffness * self.stiffness[-n:]
-        matrix, slope = products[:n, :n].clone(), products[:n, n] + prior * amplitudes
-        matrix.diagonal().add_(prior + 1e-9 * matrix.diagonal().mean())
-        return matrix, slope
+        return torch.cat(rows)

@@ -15,7 +15,7 @@ from torch_modal.progress import ProgressReport
 from torch_modal.registration.maps import SpectralShape
 from torch_modal.registration.surface import MeshSurface
 
-# Bounds of cotangent weights: those of obtuse triangles are negative, those of slivers huge.
+# Bounds of cotangent weights, which are negative at obtuse angles and huge at slivers.
 _WEIGHTS = (0.05, 10.0)
 # Smoothing of rotations over neighbours resists bending (Levi and Gotsman 2015).
 _SMOOTHING, _SMOOTHING_ROUNDS = 0.5, 2
@@ -28,6 +28,7 @@ Stage = tuple[float, float, int]
 the number of steps."""
 COARSE_STAGES: tuple[Stage, ...] = ((0.05, 6, 4), (0.2, 5, 6), (0.5, 4, 6), (2.0, 3, 4))
 FINE_STAGES: tuple[Stage, ...] = ((0.3, 4, 3), (1.0, 3, 3), (3.0, 3, 3))
+
 _RELEASED, _CAUGHT = (0.3, 5, 4), (0.5, 5, 3)  # without flipped faces, then with them
 
 _MAP_WEIGHTS = (0.02, 0.1)
@@ -36,8 +37,8 @@ _MAP_SHARE = 0.05  # weight of the map relative to closest points
 _LANDMARK_WEIGHT = 5.0
 _FIXING_WEIGHT = 1e-5  # fixes pieces without a counterpart
 _ALIKE = 0.4  # smallest cosine between the normals of closest points
-# Functions of fields along the surface, their least stiffness, that of landmarks and of the distance to the surface,
-# and the weight of curvature relative to strain, in square roots of the area.
+# Functions of fields along the surface, their least stiffness, the stiffness of landmarks and of the distance to the
+# surface, and the weight of curvature relative to strain, in square roots of the area.
 _SLIDING_FUNCTIONS, _SOFTEST, _FIXED, _CURVATURE_SHARE = 20, 1e-3, 1e3, 0.1
 
 
@@ -67,7 +68,7 @@ class ElasticSurface:
         self.stiffness = float(around.mean())
         """Mean weight around a vertex, the unit of the weights of pulls."""
         adjacency = sparse.csr_matrix((self._weights, (self._i, self._j)), shape=(n, n))
-        self._mean = sparse.diags(1 / np.maximum(around, 1e-12)) @ adjacency
+        self.neighbour_mean = sparse.diags(1 / np.maximum(around, 1e-12)) @ adjacency
         m = len(self._i)
         self._gather = sparse.csr_matrix((np.ones(m), (self._i, np.arange(m))), shape=(n, m))
 
@@ -78,14 +79,14 @@ class ElasticSurface:
         products = self._weights[:, None, None] * sides[:, :, None] * self._sides[:, None, :]
         covariance = self._gather @ products.reshape(-1, 9)
         for _ in range(_SMOOTHING_ROUNDS):
-            covariance = (1 - _SMOOTHING) * covariance + _SMOOTHING * (self._mean @ covariance)
+            covariance = (1 - _SMOOTHING) * covariance + _SMOOTHING * (self.neighbour_mean @ covariance)
         rotations = best_rotation(torch.from_numpy(covariance).unflatten(1, (3, 3))).numpy()
         if not self.stretchable:
             return rotations
         # Smoothed ratios of edge lengths to rest lengths.
         squares = self._gather @ np.stack([self._weights * dot(s, s) for s in (sides, self._sides)], axis=1)
         for _ in range(_SCALE_ROUNDS):
-            squares = 0.5 * squares + 0.5 * (self._mean @ squares)
+            squares = 0.5 * squares + 0.5 * (self.neighbour_mean @ squares)
         scales = np.clip(np.sqrt(squares[:, 0] / np.maximum(squares[:, 1], 1e-30)), *_SCALES)
         return rotations * scales[:, None, None]
 
@@ -139,46 +140,47 @@ class TemplateFit:
         self._share = template.vertex_areas / template.vertex_areas.mean()
         self._back_share = back.vertex_areas / back.vertex_areas.mean() * (len(images) / len(back.vertices))
         self._landmarks = self._pull(template.rows(template.closest(landmarks[0])), landmarks[1], _LANDMARK_WEIGHT)
-        self._map: list[Pull] = []
 
     def _pull(self, points: sparse.csr_matrix, places: FloatArray, weights: FloatArray | float) -> Pull:
         return points, places, self.elastic.stiffness * np.broadcast_to(weights, len(places))
 
     def follow_map(self, x: FloatArray, places: FloatArray) -> FloatArray:
-        """Fit to the positions of a map, which keep a small weight in later steps. *Shape:* ``(V, 3), (V, 3)``."""
+        """Fit to the positions of a map. *Shape:* ``(V, 3), (V, 3)``."""
         self.progress.expect(len(_MAP_WEIGHTS))
         for weight in _MAP_WEIGHTS:
             x = self.elastic.follow(x, [self._pull(self._everywhere, places, weight), self._landmarks], _MAP_ROUNDS)
             self.progress.update()
-        self._map = [self._pull(self._everywhere, places, _MAP_SHARE)]
         return x
 
-    def run(self, x: FloatArray, stages: Sequence[Stage], releases: int) -> FloatArray:
-        """Run all stages, then release flipped regions several times. *Shape:* ``(V, 3)``."""
+    def run(
+        self, x: FloatArray, stages: Sequence[Stage], releases: int, places: FloatArray | None = None
+    ) -> FloatArray:
+        """Run all stages, with a small weight of the places of a map; then release flipped regions several times.
+
+        *Shape:* ``(V, 3), (V, 3)``.
+        """
         self.progress.expect(sum(n_steps for *_, n_steps in stages))
         none = np.zeros(len(x), dtype=bool)
         for stage in stages:
-            x = self._steps(x, stage, none)
-        self._map = []
+            x = self._step(x, stage, none, places)
         for _ in range(releases):
-            # Vertices of flipped faces and their neighbours.
-            shape = self.template.moved(x)
-            flipped = none.copy()
-            flipped[shape.faces[self.target.looks_away(x[shape.faces].mean(1), shape.face_normals)]] = True
-            i, j = shape.edges.T
-            released = flipped.copy()
-            released[i[flipped[j]]] = released[j[flipped[i]]] = True
-            if released.any():
-                x = self._steps(self._steps(x, _RELEASED, released), _CAUGHT, none)
+            shape, flipped = self.template.with_vertices(x), none.copy()
+            flipped[shape.faces[self.target.looks_away(shape.face_centres, shape.face_normals)]] = True
+            if flipped.any():
+                released = flipped | (self.elastic.neighbour_mean @ flipped > 0)
+                x = self._step(self._step(x, _RELEASED, released), _CAUGHT, none)
         return x
 
-    def _steps(self, x: FloatArray, stage: Stage, released: BoolArray) -> FloatArray:
+    def _step(self, x: FloatArray, stage: Stage, released: BoolArray, places: FloatArray | None = None) -> FloatArray:
+        """Follow closest points in both directions, but for released vertices."""
         weight, reach, n_steps = stage
         for _ in range(n_steps):
-            shape = self.template.moved(x)
+            shape = self.template.with_vertices(x)
             pulls = [self._to_target(shape, weight, reach, released), self._from_target(shape, weight, reach, released)]
-            pulls += [(points, places, weights * weight) for points, places, weights in self._map]
-            x = self.elastic.follow(x, [*pulls, self._landmarks, self._pull(self._everywhere, x, _FIXING_WEIGHT)])
+            if places is not None:
+                pulls.append(self._pull(self._everywhere, places, _MAP_SHARE * weight))
+            pulls += [self._landmarks, self._pull(self._everywhere, x, _FIXING_WEIGHT)]
+            x = self.elastic.follow(x, pulls)
             self.progress.update()
         return x
 
@@ -190,26 +192,24 @@ class TemplateFit:
         used &= self._coarse.is_near(self._images, places)
         # If another sheet is closer, take the nearest vertex with a similar normal.
         hidden = np.flatnonzero(~used)
-        beside = self.target.nearest_alike(shape.vertices[hidden], normals[hidden])
-        places[hidden] = self.target.vertices[beside]
-        used[hidden] = dot(normals[hidden], self.target.vertex_normals[beside]) > _ALIKE
+        alike = self.target.nearest_alike(shape.vertices[hidden], normals[hidden])
+        places[hidden] = self.target.vertices[alike]
+        used[hidden] = dot(normals[hidden], self.target.vertex_normals[alike]) > _ALIKE
         used[hidden] &= self._coarse.is_near(self._images[hidden], places[hidden])
         used &= np.linalg.norm(places - shape.vertices, axis=1) < reach
         used &= (shape.on_boundary | ~self.target.on_open_edge(closest)) & ~released
-        kept = np.flatnonzero(used)
-        return self._pull(self._everywhere[kept], places[kept], weight * self._share[kept])
+        rows = np.flatnonzero(used)
+        return self._pull(self._everywhere[rows], places[rows], weight * self._share[rows])
 
     def _from_target(self, shape: MeshSurface, weight: float, reach: float, released: BoolArray) -> Pull:
         """Pull the closest points on the template to the target's vertices."""
         closest = shape.closest(self.back.vertices)
-        corners = shape.faces[closest.faces]
         used = dot(self.back.vertex_normals, shape.face_normals[closest.faces]) > _ALIKE
-        used &= closest.distances < reach
-        used &= self.back.on_boundary | ~shape.on_open_edge(closest)
-        used &= self._coarse.is_near(self._images[corners[:, 0]], self.back.vertices)
-        used &= ~released[corners].any(1)
-        kept = np.flatnonzero(used)
-        return self._pull(shape.rows(closest)[kept], self.back.vertices[kept], weight * self._back_share[kept])
+        used &= self._coarse.is_near(self._images[shape.faces[closest.faces, 0]], self.back.vertices)
+        used &= (self.back.on_boundary | ~shape.on_open_edge(closest)) & (closest.distances < reach)
+        used &= ~released[shape.faces[closest.faces]].any(1)
+        rows = np.flatnonzero(used)
+        return self._pull(shape.rows(closest)[rows], self.back.vertices[rows], weight * self._back_share[rows])
 
 
 def sliding_freedom(shape: SpectralShape, fixed: IntArray) -> float:
@@ -231,12 +231,12 @@ def sliding_freedom(shape: SpectralShape, fixed: IntArray) -> float:
     def rows(weights: FloatArray, values: FloatArray, directions: FloatArray) -> FloatArray:
         return (np.sqrt(weights)[:, None, None] * values[:, :, None] * directions[:, None]).reshape(-1, 3 * k)
 
-    parts = [
+    summands = [
         rows(areas, functions[i] - functions[j], sides / np.maximum(dot(sides, sides), 1e-12)[:, None]),
         rows(surface.face_areas, functions[faces].mean(1), _CURVATURE_SHARE * slopes),
         rows(_FIXED * surface.vertex_areas, functions, surface.vertex_normals),
         rows(np.full(3 * len(fixed), _FIXED), functions[fixed].repeat(3, axis=0), np.tile(np.eye(3), (len(fixed), 1))),
     ]
-    matrix = np.concatenate([*parts, np.sqrt(_SOFTEST) * np.eye(3 * k)])
+    matrix = np.concatenate([*summands, np.sqrt(_SOFTEST) * np.eye(3 * k)])
     covariance = np.linalg.inv(matrix.T @ matrix).reshape(k, 3, k, 3).trace(axis1=1, axis2=3)
     return float(np.sqrt(np.median(dot(functions @ covariance, functions))))

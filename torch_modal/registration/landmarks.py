@@ -22,7 +22,7 @@ def landmark_table(landmarks: Any, shapes: Sequence[FloatArray]) -> FloatArray:
     """
     n = len(shapes)
     is_file = isinstance(landmarks, (str, os.PathLike))
-    table: Any = read_landmarks(landmarks, n) if is_file else to_numpy([] if landmarks is None else landmarks)
+    table: Any = read_landmarks(landmarks, n) if is_file else to_numpy(np.zeros(0) if landmarks is None else landmarks)
     if table.size == 0:
         return np.zeros((0, n, 3))
     if table.ndim == 3 and table.shape[1:] == (n, 3) and table.dtype.kind in "iuf" and np.isfinite(table).all():

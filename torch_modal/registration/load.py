@@ -33,8 +33,8 @@ def load_keyframes(
 ) -> Keyframes:
     """Read key-frames from OBJ, PLY, OFF, GLB or GLTF files.
 
-    Vertices keep their order. Faces may differ between the files in order, first corner and winding; those of the first
-    file are used. `check_keyframes` reports flaws of the meshes.
+    Vertices keep their order. Faces may differ between the files in order, first corner and winding; the faces of the
+    first file are used. `check_keyframes` reports flaws of the meshes.
 
     With ``register``, the meshes may have any connectivity: the first one is registered to each, from its predecessor.
     A mesh with the connectivity of the first is not registered.
@@ -92,13 +92,13 @@ def load_keyframes(
 
         options: dict[str, Any] = {"same_subject": same_subject, "cache_dir": cache_dir, "cache": cache}
         options |= {"landmarks": marks[:, k - 1 : k + 1], "progress": progress}
-        found = registered(shapes[-1], faces, there, there_faces, **options)
+        result = registered(shapes[-1], faces, there, there_faces, **options)
         name, origin = os.fspath(paths[k]), os.fspath(paths[k - 1])
-        report(f"{name} registered from {origin}: {found.summary()}")
-        if found.doubtful:
+        report(f"{name} registered from {origin}: {result.summary()}")
+        if result.doubtful:
             raise MeshError(
-                f"the registration of {name} from {origin} is doubtful: {found.summary()}; "
-                f"{'; '.join(found.warnings)}. To help it, {ADVICE}"
+                f"the registration of {name} from {origin} is doubtful: {result.summary()}; "
+                f"{'; '.join(result.warnings)}. To help it, {ADVICE}"
             )
-        shapes.append(found.positions.numpy())
+        shapes.append(result.positions.numpy())
     return Keyframes(torch.from_numpy(np.stack(shapes)), torch.from_numpy(faces))

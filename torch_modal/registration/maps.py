@@ -1,17 +1,16 @@
 """Maps between coarse copies of two shapes, from their spectra or from landmarks.
 
 A map gives each vertex of the first shape a vertex of the second, ``(n_first,)``. It follows from rows of
-eigenfunctions: those of near-isometric shapes agree up to the functional map (Ovsjanikov et al. 2012). Lengths are in
-square roots of the area.
+eigenfunctions, which agree between near-isometric shapes up to the functional map (Ovsjanikov et al. 2012). Lengths are
+in square roots of the area.
 """
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy import sparse
 from scipy.sparse import csgraph
 from scipy.sparse.linalg import eigsh
 from scipy.spatial import cKDTree
@@ -20,16 +19,17 @@ from torch_modal import extras
 from torch_modal.arrays import BoolArray, FloatArray, IntArray
 from torch_modal.geometry import inspect
 from torch_modal.geometry.closest import dot
+from torch_modal.geometry.connectivity import edge_graph, farthest_apart
 from torch_modal.geometry.decimation import decimate
 from torch_modal.progress import ProgressReport
-from torch_modal.registration.surface import DUST, MeshSurface, largest_pieces, main_part, referenced
+from torch_modal.registration.surface import DUST, MeshSurface, drop_unreferenced, largest_pieces, main_part
 
 N_COARSE = 2000  # approximate number of vertices of the coarse copies
 N_FUNCTIONS = 60  # number of eigenfunctions, including the constant one
 COARSE_FUNCTIONS = 20
 FINE_FUNCTIONS = 50
 N_SIGNS, MORE_SIGNS = 4, 6
-"""Number of eigenfunctions with both signs in the initial maps, and in those of a second attempt."""
+"""Number of eigenfunctions with both signs in the initial maps, and in the initial maps of a second attempt."""
 N_REFINED, N_DIFFERENT = 4, 2  # number of fully refined maps: the best ones, and others that differ from them
 SAME = 0.1  # largest difference of equal maps, for a surface of unit area
 N_SAMPLES = 40  # number of samples between which distances are compared
@@ -42,12 +42,10 @@ _ROUND_TRIP = 3.0
 _TORN = (2.5, 0.03)
 # Smallest fraction of the area that is the denominator of the score, if many triangles collapse.
 _LEAST_COUNTED = 0.3
-# Largest error of a consistent distance, and minimum number of consistent samples for a repair.
-_CONSISTENT, _FEWEST = 0.12, 8
 # Tips: their smallest distance, the radius in which no vertex is more distant, and the numbers that are matched.
 _TIPS_APART, _TIP_RADIUS, _FEWEST_TIPS, _MOST_TIPS = 0.35, 0.25, 4, 6
 _N_MATCHINGS = 4  # number of matchings of tips that give maps
-# Weight of differences of limb lengths relative to those of the tree between the limbs.
+# Weight of differences of limb lengths relative to differences of the tree between the limbs.
 _LIMB_LENGTH = 0.2
 _SHORTEST_LIMB = 0.1
 # Weight of orientation relative to distance in coordinates of landmarks, and its number of eigenfunctions.
@@ -65,12 +63,12 @@ class SpectralShape:
             n_faces = int(N_COARSE / len(clean.vertices) * len(clean.faces))
             vertices, faces, _ = decimate(clean.vertices, clean.faces, n_faces)
             faces = faces[~inspect.degenerate_faces(faces)]
-            clean, _ = referenced(vertices, faces[~inspect.repeated_faces(faces)])
+            clean, _ = drop_unreferenced(vertices, faces[~inspect.repeated_faces(faces)])
         #: Coarse copy in the units of the fine surface.
         self.placed = main_part(clean)
         self.scale = np.sqrt(self.placed.area)
         #: Coarse copy of unit area.
-        self.coarse = self.placed.moved(self.placed.vertices / self.scale)
+        self.coarse = self.placed.with_vertices(self.placed.vertices / self.scale)
         mesh, n = (self.coarse.vertices, self.coarse.faces), len(self)
         laplacian, mass = extras.require("robust_laplacian", "register", "registration").mesh_laplacian(*mesh)
         # A small shift: the constant function makes the matrix singular.
@@ -81,6 +79,7 @@ class SpectralShape:
         )
         #: Lumped mass of the Laplacian. *Shape:* ``(n,)``.
         self.mass = mass.diagonal()
+        self._graph = edge_graph(self.coarse.vertices, self.coarse.connectivity)
         self._heat = extras.require("potpourri3d", "register", "registration").MeshHeatMethodDistanceSolver(*mesh)
 
     def __len__(self) -> int:
@@ -93,8 +92,9 @@ class SpectralShape:
 
     @cached_property
     def samples(self) -> tuple[IntArray, FloatArray]:
-        """Farthest-point samples, and the distances to them. *Shape:* ``(m,), (n, m)``."""
-        return self.farthest_points(N_SAMPLES)
+        """Samples far from each other, and the distances to them. *Shape:* ``(m,), (n, m)``."""
+        chosen, _ = farthest_apart(self._graph, np.arange(len(self)), N_SAMPLES)
+        return chosen, self.geodesics_from(chosen)
 
     @cached_property
     def tips(self) -> IntArray:
@@ -114,28 +114,22 @@ class SpectralShape:
         """Coordinates along limbs, relative to the length of each, and around them.
 
         Distances to the tips do not tell a side of the body from its mirror image. The angle between the directions to
-        two tips has a sign, which does (Ren et al. 2018). *Shape:* ``(m,) -> (n, m + m (m - 1) / 2)``.
+        two tips has a sign, which does (Ren et al. 2018): the smoothed sines of the angles between the gradients of the
+        distances are coordinates, too. *Shape:* ``(m,) -> (n, m + m (m - 1) / 2)``.
         """
-        distances = self.geodesics_from(tips)
+        distances, mesh = self.geodesics_from(tips), self.coarse
         lengths = np.maximum(_limb_lengths(distances[tips]), _SHORTEST_LIMB)
-        beyond = np.maximum(distances - lengths, 0)
-        along = np.minimum(distances / lengths, 1) + beyond / lengths.mean()
-        return np.hstack([along, _ORIENTATION * self._orientations(distances)])
-
-    def _orientations(self, values: FloatArray) -> FloatArray:
-        """Smoothed sines of the angles between gradients, for each pair of functions. *Shape:* ``(n, m)``."""
-        mesh = self.coarse
+        along = np.minimum(distances / lengths, 1) + np.maximum(distances - lengths, 0) / lengths.mean()
         corners = mesh.vertices[mesh.faces]
         opposite = np.roll(corners, 1, axis=1) - np.roll(corners, -1, axis=1)
-        gradients = np.einsum("fci,fcm->fmi", np.cross(mesh.face_normals[:, None], opposite), values[mesh.faces])
+        gradients = np.einsum("fci,fcm->fmi", np.cross(mesh.face_normals[:, None], opposite), distances[mesh.faces])
         gradients /= np.maximum(np.linalg.norm(gradients, axis=2, keepdims=True), 1e-12)
-        first, second = np.triu_indices(values.shape[1], 1)
+        first, second = np.triu_indices(len(tips), 1)
         sines = dot(np.cross(gradients[:, first], gradients[:, second]), mesh.face_normals[:, None])
-        share = mesh.face_areas[:, None] * sines / 3
         functions = self.functions[:, :_ORIENTATION_FUNCTIONS]
         # Integrals of products with functions that are linear in each face, by their values at its corners.
-        smoothed: FloatArray = functions @ (functions[mesh.faces].sum(1).T @ share)
-        return smoothed
+        integrals = functions[mesh.faces].sum(1).T @ (mesh.face_areas[:, None] * sines / 3)
+        return np.hstack([along, _ORIENTATION * functions @ integrals])
 
     def curvature(self, n_functions: int = N_FUNCTIONS) -> FloatArray:
         """Twice the mean curvature, of low frequencies, positive where the surface is convex. *Shape:* ``(n,)``."""
@@ -144,30 +138,16 @@ class SpectralShape:
         return dot(functions @ spectrum, mesh.vertex_normals)
 
     def is_near(self, vertices: IntArray, points: FloatArray) -> BoolArray:
-        """Points in space whose nearest coarse vertices are near given ones, as a mask. *Shape:* ``(n,), (n, 3)``."""
-        return self._near[vertices, self._tree.query(points)[1]]  # type: ignore[no-any-return]
+        """Points in space whose nearest coarse vertices are near others along edges, as a mask.
+
+        *Shape:* ``(n,), (n, 3)``.
+        """
+        return self._near[vertices, cKDTree(self.placed.vertices).query(points)[1]]  # type: ignore[no-any-return]
 
     @cached_property
     def _near(self) -> BoolArray:
-        """Pairs of vertices that are near along edges, as a mask. *Shape:* ``(n, n)``."""
-        i, j = self.coarse.edges.T
-        lengths = np.linalg.norm(self.coarse.vertices[i] - self.coarse.vertices[j], axis=1)
-        graph = sparse.csr_matrix((np.maximum(lengths, 1e-12), (i, j)), shape=(len(self),) * 2)
-        near: BoolArray = csgraph.dijkstra(graph, directed=False, limit=_NEAR) <= _NEAR
+        near: BoolArray = csgraph.dijkstra(self._graph, limit=_NEAR) <= _NEAR
         return near
-
-    @cached_property
-    def _tree(self) -> cKDTree:
-        return cKDTree(self.placed.vertices)
-
-    def farthest_points(self, n: int) -> tuple[IntArray, FloatArray]:
-        """Farthest-point samples, ``n`` or all vertices, and the distances to them. *Shape:* ``(m,), (n, m)``."""
-        chosen = [int(self.geodesics_from(np.zeros(1, dtype=np.int64)).argmax())]
-        distances = self.geodesics_from(np.array(chosen))
-        while len(chosen) < min(n, len(self)):
-            chosen.append(int(distances.min(1).argmax()))
-            distances = np.hstack([distances, self.geodesics_from(np.array(chosen[-1:]))])
-        return np.array(chosen), distances
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,7 +171,8 @@ class Map:
     def differs(self, others: Sequence["Map"]) -> bool:
         """True if each of other maps has a different image of some part."""
         places = self.pair.second.coarse.vertices
-        return all(difference(places[self.vertices], places[one.vertices]) > SAME for one in others)
+        offsets = [np.linalg.norm(places[self.vertices] - places[one.vertices], axis=1) for one in others]
+        return all(np.percentile(distances, 98) > SAME for distances in offsets)
 
 
 class CoarsePair:
@@ -199,24 +180,22 @@ class CoarsePair:
 
     def __init__(self, first: SpectralShape, second: SpectralShape) -> None:
         self.first, self.second = first, second
-        self.samples, self.distances = first.samples
 
     # ------------------------------------------------------------------------------------------------ scores and errors
-    def rated(self, vertices: IntArray, k: int = FINE_FUNCTIONS) -> Map:
+    def rate(self, vertices: IntArray, k: int = FINE_FUNCTIONS) -> Map:
         """Scores of a map with ``k`` eigenfunctions. *Shape:* ``(n_first,)``."""
         first, second = self.first, self.second
         k = min(k, first.functions.shape[1], second.functions.shape[1])
         back = nearest_rows(second.functions[:, :k] @ self._functional(vertices, k).T, first.functions[:, :k])
-        areas = _oriented_area(first, second, vertices), _oriented_area(second, first, back)
+        areas = _area_balance(first, second, vertices), _area_balance(second, first, back)
         round_trip = np.linalg.norm(first.coarse.vertices[back[vertices]] - first.coarse.vertices, axis=1).mean()
         score, mirrored_score = (float(area - _ROUND_TRIP * round_trip) for area in (min(areas), -max(areas)))
         return Map(self, vertices, score, mirrored_score)
 
     def errors(self, vertices: IntArray) -> FloatArray:
         """Errors of the distances from vertices to samples. *Shape:* ``(n_first,) -> (n_first, m)``."""
-        images = self.second.geodesics_from(vertices[self.samples])[vertices]
-        found: FloatArray = np.abs(self.distances - images)
-        return found
+        samples, distances = self.first.samples
+        return np.abs(distances - self.second.geodesics_from(vertices[samples])[vertices])
 
     def likeness(self, vertices: IntArray) -> float:
         """Correlation of the curvatures of corresponding vertices; front and back differ. *Shape:* ``(n_first,)``."""
@@ -228,16 +207,15 @@ class CoarsePair:
     def _functional(self, vertices: IntArray, k: int) -> FloatArray:
         """Pull-back of functions from the second shape to the first. *Shape:* ``(k, k)``."""
         weighted = self.first.mass[:, None] * self.second.functions[vertices, :k]
-        found: FloatArray = self.first.functions[:, :k].T @ weighted
-        return found
+        return np.asarray(self.first.functions[:, :k].T @ weighted)
 
-    def refined(self, vertices: IntArray, start: int, stop: int = FINE_FUNCTIONS) -> Map:
+    def refine(self, vertices: IntArray, start: int, stop: int = FINE_FUNCTIONS) -> Map:
         """Refine a map with from ``start`` to ``stop`` eigenfunctions (ZoomOut, Melzi et al. 2019)."""
         most = min(stop, self.first.functions.shape[1], self.second.functions.shape[1])
         for k in [*range(min(start, most), most, _STEP), most]:
             rows = self.second.functions[:, :k] @ self._functional(vertices, k).T
             vertices = nearest_rows(self.first.functions[:, :k], rows)
-        return self.rated(vertices, stop)
+        return self.rate(vertices, stop)
 
     def from_landmarks(self, pairs: IntArray) -> Map:
         """Refined map from geodesic distances to landmarks. *Shape:* ``(n, 2)``, coarse vertices of both."""
@@ -245,7 +223,7 @@ class CoarsePair:
         for shape, sources in zip((self.first, self.second), pairs.T, strict=True):
             distances = shape.geodesics_from(sources)
             signatures.append(distances / distances.max(0))  # proportions differ
-        return self.refined(nearest_rows(*signatures), 8)
+        return self.refine(nearest_rows(*signatures), 8)
 
     def from_tips(self) -> list[Map]:
         """Maps from the best matchings of tips; none if there are few tips.
@@ -269,72 +247,37 @@ class CoarsePair:
 
     def from_limbs(self, pairs: IntArray) -> Map:
         """Map from coordinates along limbs, for any proportions. *Shape:* ``(n, 2)``, coarse vertices of both."""
-        here, there = (
-            shape.limb_coordinates(ends) for shape, ends in zip((self.first, self.second), pairs.T, strict=True)
-        )
-        return self.rated(nearest_rows(here, there))
+        shapes = zip((self.first, self.second), pairs.T, strict=True)
+        return self.rate(nearest_rows(*(shape.limb_coordinates(ends) for shape, ends in shapes)))
 
     def from_spectra(self, n_signs: int, progress: ProgressReport) -> list[Map]:
         """The best maps from spectra, best first; the last is the best map to the mirrored target.
 
-        The initial maps are all ``2**n_signs`` sign patterns of the lowest eigenfunctions, and rigid alignments of
-        principal axes. All are refined with few eigenfunctions, the best with all.
+        The initial maps are all ``2**n_signs`` sign patterns of the lowest eigenfunctions. All are refined with few
+        eigenfunctions, the best with all.
         """
-        starts, coarse = list(self._starts(n_signs)), []
-        progress.expect(len(starts))
-        for vertices, k in starts:
-            coarse.append(self.refined(vertices, k, COARSE_FUNCTIONS))
-            progress.update()
-        coarse.sort(key=lambda found: -found.score)
-        best = coarse[:N_REFINED]
-        for found in coarse[N_REFINED:]:  # the best ones are often the same map
-            if len(best) < N_REFINED + N_DIFFERENT and found.differs(best):
-                best.append(found)
-        best.append(max(coarse, key=lambda found: found.mirrored_score))
-        *fine, mirrored = [self.refined(found.vertices, COARSE_FUNCTIONS) for found in best]
-        return [*sorted(fine, key=lambda found: -found.score), mirrored]
-
-    def _starts(self, n_signs: int) -> Iterator[tuple[IntArray, int]]:
-        """Initial maps, and the number of eigenfunctions for their refinement."""
-        first, second, k = self.first, self.second, n_signs + 1
+        k, coarse = n_signs + 1, []
+        lowest, others = self.first.functions[:, :k], self.second.functions[:, :k]
+        progress.expect(2**n_signs)
         for signs in itertools.product([1.0, -1.0], repeat=n_signs):
-            yield nearest_rows(first.functions[:, :k], second.functions[:, :k] * [1.0, *signs]), k
-        axes, centred_shapes = [], []
-        for surface in (first.coarse, second.coarse):
-            points = surface.vertices - np.average(surface.vertices, 0, surface.vertex_areas)
-            frame = np.linalg.eigh(points.T @ (surface.vertex_areas[:, None] * points))[1]
-            axes.append(frame * [1, 1, np.sign(np.linalg.det(frame))])
-            centred_shapes.append(points)
-        centred, target = centred_shapes
-        flips = ([1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1])
-        goal = np.hstack([target, 0.1 * second.coarse.vertex_normals])
-        for turn in (np.eye(3), *(axes[0] * signs @ axes[1].T for signs in flips)):
-            yield nearest_rows(np.hstack([centred @ turn, 0.1 * first.coarse.vertex_normals @ turn]), goal), 12
-
-    def repaired(self, found: Map) -> Map | None:
-        """A map from the mutually consistent samples of one that may be wrong in parts; None if they are few."""
-        images = found.vertices[self.samples]
-        to_images = self.second.geodesics_from(images)
-        error = np.abs(self.distances[self.samples] - to_images[images])
-        error = np.maximum(error, error.T)
-        kept = np.arange(len(self.samples))
-        while len(kept) >= _FEWEST:
-            against = (error[np.ix_(kept, kept)] > _CONSISTENT).sum(1)
-            if not against.any():
-                break
-            kept = np.delete(kept, against.argmax())
-        if len(kept) < _FEWEST or len(kept) == len(self.samples):
-            return None
-        return self.refined(nearest_rows(self.distances[:, kept], to_images[:, kept]), 26)
+            coarse.append(self.refine(nearest_rows(lowest, others * [1.0, *signs]), k, COARSE_FUNCTIONS))
+            progress.update()
+        coarse.sort(key=lambda one: -one.score)
+        best = coarse[:N_REFINED]
+        for one in coarse[N_REFINED:]:  # the best ones are often the same map
+            if len(best) < N_REFINED + N_DIFFERENT and one.differs(best):
+                best.append(one)
+        best.append(max(coarse, key=lambda one: one.mirrored_score))
+        *fine, mirrored = [self.refine(one.vertices, COARSE_FUNCTIONS) for one in best]
+        return [*sorted(fine, key=lambda one: -one.score), mirrored]
 
 
 def nearest_rows(queries: FloatArray, rows: FloatArray) -> IntArray:
     """Index of the nearest row. Dense: trees are no faster in fifty dimensions. *Shape:* ``(n, k), (m, k) -> (n,)``."""
     queries, rows = queries.astype(np.float32), rows.astype(np.float32)
     half = 0.5 * (rows * rows).sum(1)
-    return np.concatenate(
-        [(part @ rows.T - half).argmax(1) for part in np.array_split(queries, len(queries) // 2048 + 1)]
-    )
+    chunks = np.array_split(queries, len(queries) // 2048 + 1)
+    return np.concatenate([(chunk @ rows.T - half).argmax(1) for chunk in chunks])
 
 
 def _limb_lengths(distances: FloatArray) -> FloatArray:
@@ -344,18 +287,13 @@ def _limb_lengths(distances: FloatArray) -> FloatArray:
     return lengths
 
 
-def difference(points: FloatArray, others: FloatArray) -> float:
-    """98th percentile of the distances of corresponding points. *Shape:* ``(n, 3), (n, 3)``."""
-    return float(np.percentile(np.linalg.norm(points - others, axis=1), 98))
-
-
-def _oriented_area(first: SpectralShape, second: SpectralShape, vertices: IntArray) -> float:
+def _area_balance(first: SpectralShape, second: SpectralShape, vertices: IntArray) -> float:
     """Fraction of the first shape's area with an untorn, outward image minus that with an inward image."""
     faces = first.coarse.faces
-    image, own = second.coarse.vertices[vertices][faces], first.coarse.vertices[faces]
+    image, rest = second.coarse.vertices[vertices][faces], first.coarse.vertices[faces]
     area_vectors = np.cross(image[:, 1] - image[:, 0], image[:, 2] - image[:, 0])
     sign = np.sign(dot(area_vectors, second.coarse.vertex_normals[vertices][faces].mean(1)))
-    before, after = (np.linalg.norm(x - np.roll(x, 1, axis=1), axis=2).max(1) for x in (own, image))
+    before, after = (np.linalg.norm(x - np.roll(x, 1, axis=1), axis=2).max(1) for x in (rest, image))
     whole = after < _TORN[0] * before + _TORN[1]
     # Faces that collapse, because the other mesh is coarser, do not count.
     counted = first.coarse.face_areas[sign != 0].sum()

@@ -28,9 +28,9 @@ from torch_modal.registration.maps import (
     SpectralShape,
 )
 from torch_modal.registration.report import LEAD, SLIDING, TRUSTED, Quality, Registration, judge, measure, ramp
-from torch_modal.registration.surface import MeshSurface, main_part, outward, referenced
+from torch_modal.registration.surface import MeshSurface, drop_unreferenced, main_part, outward
 
-VERSION = 8  # part of the cache key: raise it when the algorithm changes
+VERSION = 9  # part of the cache key: raise it when the algorithm changes
 MIN_VERTICES = MORE_SIGNS + 3  # minimum number of vertices of a surface: two more than eigenfunctions
 MIN_LANDMARKS = 5  # minimum number of landmarks between different subjects: fewer do not determine the map
 _SURE_SCORE = 0.62  # score of a spectral map below which more initial maps are tried
@@ -45,14 +45,12 @@ _SPECTRAL_REFINEMENTS = (True, True, False, False)  # of the map of each repeate
 _STRETCHED = 0.3  # stretch above which a fit between two subjects is repeated
 _CONVERGED = 0.3  # mean displacement of the vertices at convergence, in percent of the diagonal
 _WORSE = 0.05  # accepted increase of a candidate's cost
-_MOST = 0.8  # part of a vertex's distances that are right where the vertex is, though parts are missing
+_MOST = 0.8  # fraction of a vertex's distances that are right where the vertex is, though parts are missing
 _MISPLACED = 0.20, 0.10  # largest error of these, for a surface of unit area: no confidence, full confidence
-_RESCALED = 0.02  # logarithm of the global scale above which the fit is repeated
 
 
 class _Candidate(NamedTuple):
-    found: Map
-    scale: float
+    map: Map
     x: FloatArray
     fit: TemplateFit
     quality: Quality
@@ -61,7 +59,7 @@ class _Candidate(NamedTuple):
     @property
     def cost(self) -> float:
         """Cost of a candidate: fit and distortion minus the score of the map and the likeness of curvatures."""
-        return self.quality.cost + self.found.distortion - _SCORE_SHARE * (self.found.score + self.likeness)
+        return self.quality.cost + self.map.distortion - _SCORE_SHARE * (self.map.score + self.likeness)
 
 
 def register(
@@ -114,26 +112,25 @@ def register(
             f"two different subjects need {MIN_LANDMARKS} landmarks or more, or none, got {len(points)}: so few do not "
             "determine the map; give pairs of vertices, template first"
         )
-    own, other = ((one.keyframes[0].numpy(), one.faces.numpy()) for one in (welded, welded_goal))
+    meshes = [(one.keyframes[0].numpy(), one.faces.numpy()) for one in (welded, welded_goal)]
 
     def compute() -> dict[str, Any]:
         # The matrices are too small for BLAS threads.
         with ProgressReport(0, "register", progress) as report, threadpool_limits(1):
-            return _RegistrationProblem(own, other, points, same_subject, report).solve().arrays()
+            return _RegistrationProblem(*meshes, points, same_subject, report).solve().arrays()
 
-    inputs = {"template": own[0], "faces": own[1], "target": other[0], "target_faces": other[1]}
-    marks = {"here": points[:, 0], "there": points[:, 1]}
+    names = ("template", "faces", "target", "target_faces", "here", "there")
+    inputs = dict(zip(names, (*meshes[0], *meshes[1], points[:, 0], points[:, 1]), strict=True))
     parameters = {"same_subject": same_subject, "version": VERSION}
-    kept = Cache.at(cache_dir, enabled=cache).get("registration", {**inputs, **marks}, parameters, compute)
-    found = Registration.from_arrays(kept)
-    corners = torch.from_numpy(np.unique(welded_goal.vertex_of.numpy(), return_index=True)[1])[found.target_corners]
-    return found._replace(
-        positions=welded.scatter(found.positions).to(checked.keyframes),
-        vertex_confidence=found.vertex_confidence[welded.vertex_of],
-        target_faces=found.target_faces[welded.vertex_of],
-        barycentric=found.barycentric[welded.vertex_of],
+    arrays = Cache.at(cache_dir, enabled=cache).get("registration", inputs, parameters, compute)
+    result = Registration.from_arrays(arrays)
+    corners = torch.from_numpy(np.unique(welded_goal.vertex_of.numpy(), return_index=True)[1])[result.target_corners]
+    return result._replace(
+        positions=welded.scatter(result.positions).to(checked.keyframes),
+        vertex_confidence=result.vertex_confidence[welded.vertex_of],
         target_corners=corners[welded.vertex_of],
-        rivals=welded.scatter(found.rivals).to(checked.keyframes),
+        barycentric=result.barycentric[welded.vertex_of],
+        rivals=welded.scatter(result.rivals).to(checked.keyframes),
     )
 
 
@@ -149,126 +146,117 @@ class _RegistrationProblem:
         progress: ProgressReport,
     ) -> None:
         self.same_subject, self.progress = same_subject, progress
-        rest = template[0]
-        goal, self.target_vertices = referenced(target[0], outward(*target))
-        # Sizes are those of the main body, without stray pieces.
-        own, self.used = referenced(rest, outward(*template))
-        main, body = main_part(own), main_part(goal)
-        for name, part in (("template", main), ("target", body)):
-            if len(part.vertices) < MIN_VERTICES or part.area == 0:
+        (source, self.used), (goal, self.target_vertices) = (
+            drop_unreferenced(vertices, outward(vertices, faces)) for vertices, faces in (template, target)
+        )
+        # The main bodies, without stray pieces, determine the sizes.
+        bodies = {"template": main_part(source), "target": main_part(goal)}
+        for name, body in bodies.items():
+            if len(body.vertices) < MIN_VERTICES or body.area == 0:
                 raise MeshError(
-                    f"the {name}'s largest piece has {len(part.vertices)} vertices and an area of {part.area:.3g}; "
+                    f"the {name}'s largest piece has {len(body.vertices)} vertices and an area of {body.area:.3g}; "
                     f"registration needs {MIN_VERTICES} vertices or more, and an area: give a finer mesh"
                 )
-        self.unit, self.origin = body.diagonal / 100, body.vertices.mean(0)
-        self.target = goal.moved((goal.vertices - self.origin) / self.unit)
-        self.size = np.sqrt(body.area / main.area) / self.unit
-        self.rest = rest * self.size
-        self.template = own.moved(own.vertices * self.size)
+        self.unit, self.origin = bodies["target"].diagonal / 100, bodies["target"].vertices.mean(0)
+        self.target = goal.with_vertices((goal.vertices - self.origin) / self.unit)
+        size = np.sqrt(bodies["target"].area / bodies["template"].area) / self.unit
+        self.rest = template[0] * size
+        self.template = source.with_vertices(source.vertices * size)
         self.first, self.second = SpectralShape(self.template), SpectralShape(self.target)
         self.pair = CoarsePair(self.first, self.second)
-        self.marks = points[:, 0] * self.size
-        self.mark_places = (points[:, 1] - self.origin) / self.unit
-        both = ((self.first, self.template, self.marks), (self.second, self.target, self.mark_places))
-        found = [
-            shape.placed.nearest_alike(at, surface.face_normals[surface.closest(at).faces])
-            for shape, surface, at in both
+        self.marks = points[:, 0] * size, (points[:, 1] - self.origin) / self.unit
+        shapes = (self.first, self.template), (self.second, self.target)
+        vertices = [
+            shape.placed.nearest_alike(places, surface.face_normals[surface.closest(places).faces])
+            for (shape, surface), places in zip(shapes, self.marks, strict=True)
         ]
         #: Landmarks as coarse vertices. *Shape:* ``(n, 2)``.
-        self.mark_vertices = np.stack(found, axis=1)
+        self.mark_vertices = np.stack(vertices, axis=1)
         #: Score minus distortion of the best map onto the mirrored target.
         self.mirrored = -np.inf
 
     def solve(self) -> Registration:
-        candidates = sorted((self._coarse(found) for found in self._rivals(self._maps())), key=lambda one: one.cost)
-        close = [self._refined(one) for one in candidates if one.cost < candidates[0].cost + _CLOSE]
+        candidates = sorted(map(self._fit_coarse, self._rivals(self._maps())), key=lambda one: one.cost)
+        close = [self._refine(one) for one in candidates if one.cost < candidates[0].cost + _CLOSE]
         best, *others = sorted(close, key=lambda one: one.cost)
         # Advantage of the best fit over another one; most fits along other maps end at the best one.
         apart = [(one.cost - best.cost, np.linalg.norm(one.x - best.x, axis=1) / self.second.scale) for one in others]
         # Differences of small parts lower the confidence of their vertices only.
         leads = [lead if np.percentile(distances, _WHOLE) > SAME else np.inf for lead, distances in apart]
         alike = [one for one, lead in zip(others, leads, strict=True) if ramp(lead, *LEAD) < TRUSTED]
-        rivals = [self._fine(one)[1] for one in alike]
-        #: Confidence in the place of each coarse vertex beside other fits. *Shape:* ``(n,)``.
+        #: Confidence in the place of each coarse vertex compared with other fits. *Shape:* ``(n,)``.
         self.unique = np.ones(len(self.first))
         for lead, distances in apart:
             self.unique[distances > SAME] = np.minimum(self.unique[distances > SAME], ramp(lead, *LEAD))
-        best = self._rescaled(best)
-        return self._report(*self._fine(best), best, min(leads, default=np.inf), rivals)
+        return self._report(best, min(leads, default=np.inf), [self._fit_fine(one) for one in alike])
 
     # ------------------------------------------------------------------------------------------------------------- maps
     def _maps(self) -> list[Map]:
-        if len(self.marks):
+        if len(self.mark_vertices):
             maps = [self.pair.from_landmarks(self.mark_vertices)]
             if not self.same_subject:
                 return [*maps, self.pair.from_limbs(self.mark_vertices)]
-            return maps + [one for one in self._spectral(N_SIGNS) if self._agrees(one)]
-        maps = self._spectral(N_SIGNS)
+            places, (here, there) = self.second.coarse.vertices, self.mark_vertices.T
+            for one in self._spectral_maps(N_SIGNS):
+                errors = np.linalg.norm(places[one.vertices[here]] - places[there], axis=1)
+                maps += [one] if (errors < _NEAR_LANDMARK).all() else []
+            return maps
+        maps = self._spectral_maps(N_SIGNS)
         sure = maps[0].score >= _SURE_SCORE
         if sure and self.same_subject:
             return maps
         tips = self.pair.from_tips()
-        maps += [self.pair.refined(found.vertices, COARSE_FUNCTIONS) for found in tips]
+        maps += [self.pair.refine(one.vertices, COARSE_FUNCTIONS) for one in tips]
         if not (self.same_subject or sure):  # proportions may differ so much that spectra do not match
             maps += tips
-        return maps if sure or tips else maps + self._spectral(MORE_SIGNS)
+        return maps if sure or tips else maps + self._spectral_maps(MORE_SIGNS)
 
-    def _spectral(self, n_signs: int) -> list[Map]:
+    def _spectral_maps(self, n_signs: int) -> list[Map]:
         *maps, other = self.pair.from_spectra(n_signs, self.progress)
         self.mirrored = max(self.mirrored, other.mirrored_score - other.distortion)
         return maps
 
-    def _agrees(self, found: Map) -> bool:
-        """Test whether a map agrees with all landmarks."""
-        places, (here, target) = self.second.coarse.vertices, self.mark_vertices.T
-        errors = np.linalg.norm(places[found.vertices[here]] - places[target], axis=1)
-        return bool((errors < _NEAR_LANDMARK).all())
-
     def _rivals(self, maps: list[Map]) -> list[Map]:
-        """Different maps that will be fitted, found and repaired ones."""
-        repaired = [self.pair.repaired(found) for found in maps] if self.same_subject else []
-        everything = [*maps, *(found for found in repaired if found is not None and self._agrees(found))]
-        best, *others = sorted(everything, key=lambda one: one.distortion - one.score)
-        kept = [best]
-        for found in others:
-            lead = (found.score - found.distortion) - (best.score - best.distortion)
-            if len(kept) < _RIVALS and lead > -_RIVAL_SCORE[self.same_subject] and found.differs(kept):
-                kept.append(found)
-        return kept
+        """Different maps that will be fitted."""
+        best, *others = sorted(maps, key=lambda one: one.distortion - one.score)
+        rivals = [best]
+        for one in others:
+            lead = (one.score - one.distortion) - (best.score - best.distortion)
+            if len(rivals) < _RIVALS and lead > -_RIVAL_SCORE[self.same_subject] and one.differs(rivals):
+                rivals.append(one)
+        return rivals
 
     # ------------------------------------------------------------------------------------------------------------- fits
-    def _coarse(self, found: Map, scale: float = 1.0, x: FloatArray | None = None) -> _Candidate:
-        template = self.first.placed.moved(scale * self.first.placed.vertices)
-        back = self.second.placed
-        fit = self._fit(template, back, found.vertices, scale)
-        places = back.vertices[found.vertices]
-        if x is None:
-            rest, goal, areas = map(torch.from_numpy, (template.vertices, places, template.vertex_areas))
-            with torch.no_grad():
-                placed = best_fit(rest, goal, areas).apply(rest).numpy()
-            x = fit.follow_map(placed, places)
-        x = fit.run(x, COARSE_STAGES, releases=2)
-        return _Candidate(found, scale, x, fit, measure(template, x, back)[0], self.pair.likeness(self._images(fit, x)))
+    def _fit_coarse(self, one: Map) -> _Candidate:
+        template, back = self.first.placed, self.second.placed
+        fit = self._fit(template, back, one.vertices)
+        places = back.vertices[one.vertices]
+        rest, goal, areas = map(torch.from_numpy, (template.vertices, places, template.vertex_areas))
+        with torch.no_grad():
+            placed = best_fit(rest, goal, areas).apply(rest).numpy()
+        x = fit.run(fit.follow_map(placed, places), COARSE_STAGES, 2, places)
+        likeness = self.pair.likeness(self._images(template.with_vertices(x)))
+        return _Candidate(one, x, fit, measure(template, x, back)[0], likeness)
 
-    def _images(self, fit: TemplateFit, x: FloatArray) -> IntArray:
-        """Coarse vertices of the target nearest to those of a fitted template. *Shape:* ``(n, 3) -> (n,)``."""
-        return self.second.placed.nearest_alike(x, fit.template.moved(x).vertex_normals)
+    def _images(self, shape: MeshSurface) -> IntArray:
+        """Coarse vertices of the target nearest to the vertices of a fitted template. *Shape:* ``(n,)``."""
+        return self.second.placed.nearest_alike(shape.vertices, shape.vertex_normals)
 
-    def _fit(self, template: MeshSurface, back: MeshSurface, images: IntArray, scale: float) -> TemplateFit:
-        marks = self.marks * scale, self.mark_places
-        return TemplateFit(
-            template, self.target, back, self.second, images, marks, self.progress, stretchable=not self.same_subject
-        )
+    def _fit(self, template: MeshSurface, back: MeshSurface, images: IntArray) -> TemplateFit:
+        coarse, stretchable = self.second, not self.same_subject
+        arguments = template, self.target, back, coarse, images, self.marks, self.progress
+        return TemplateFit(*arguments, stretchable=stretchable)
 
-    def _refined(self, candidate: _Candidate) -> _Candidate:
+    def _refine(self, candidate: _Candidate) -> _Candidate:
         """Repeat the fit from the start with the map of its result, which accumulates no sliding, until convergence."""
         if not self.same_subject and candidate.quality.stretch < _STRETCHED:
             return candidate
         most = candidate.cost + _WORSE
         for spectral in _SPECTRAL_REFINEMENTS if self.same_subject else (False,):
-            vertices = self._images(candidate.fit, candidate.x)
-            found = self.pair.refined(vertices, FINE_FUNCTIONS) if spectral else self.pair.rated(vertices)
-            again = self._coarse(found)
+            vertices = self._images(self.first.placed.with_vertices(candidate.x))
+            again = self._fit_coarse(
+                self.pair.refine(vertices, FINE_FUNCTIONS) if spectral else self.pair.rate(vertices)
+            )
             if again.cost > most:
                 break
             if np.linalg.norm(again.x - candidate.x, axis=1).mean() < _CONVERGED:
@@ -276,42 +264,30 @@ class _RegistrationProblem:
             candidate = again
         return candidate
 
-    def _rescaled(self, candidate: _Candidate) -> _Candidate:
-        """Repeat the fit with its scale on the target: the ratio of areas is wrong if parts are missing."""
-        template = candidate.fit.template
-        i, j = template.edges.T
-        now, rest = (np.linalg.norm(p[i] - p[j], axis=1) for p in (candidate.x, template.vertices))
-        change = float(np.median(np.log(np.maximum(now, 1e-12) / np.maximum(rest, 1e-12))))
-        if not self.same_subject or abs(change) < _RESCALED:
-            return candidate
-        again = self._coarse(candidate.found, float(np.exp(change)), candidate.x)
-        return again if again.quality.cost <= candidate.quality.cost else candidate
-
-    def _fine(self, candidate: _Candidate) -> tuple[FloatArray, FloatArray]:
-        """Positions after the last stages of the referenced vertices, and of all vertices."""
-        coarse, x = candidate.fit.template, candidate.x
-        template = self.template.moved(self.template.vertices * candidate.scale)
+    def _fit_fine(self, candidate: _Candidate) -> FloatArray:
+        """Positions of all vertices after the last stages."""
+        coarse, x = self.first.placed, candidate.x
         frames = candidate.fit.elastic.local_frames(x)
-        start = _carried(template.vertices, coarse, x, frames)
-        images = self.second.placed.nearest_alike(start, template.moved(start).vertex_normals)
-        fit = self._fit(template, self.target, images, candidate.scale)
-        found = fit.run(start, FINE_STAGES, releases=1)
-        everything = _carried(self.rest * candidate.scale, coarse, x, frames)
-        everything[self.used] = found
-        return found, everything
+        # Each vertex by the barycentric mean of the affine maps of the corners of the closest coarse face.
+        rows: sparse.csr_matrix = coarse.rows(coarse.closest(self.rest))
+        turns = (rows @ frames.reshape(len(frames), 9)).reshape(-1, 3, 3)
+        moved = rows @ (x - np.einsum("vij,vj->vi", frames, coarse.vertices))
+        everything: FloatArray = moved + np.einsum("nij,nj->ni", turns, self.rest)
+        images = self._images(self.template.with_vertices(everything[self.used]))
+        everything[self.used] = self._fit(self.template, self.target, images).run(everything[self.used], FINE_STAGES, 1)
+        return everything
 
     # ----------------------------------------------------------------------------------------------------------- report
-    def _report(
-        self, x: FloatArray, everything: FloatArray, best: _Candidate, lead: float, rivals: list[FloatArray]
-    ) -> Registration:
+    def _report(self, best: _Candidate, lead: float, rivals: list[FloatArray]) -> Registration:
+        everything = self._fit_fine(best)
+        x = everything[self.used]
         quality, supported = measure(self.template, x, self.target)
-        images = self._images(best.fit, best.x)
-        rated = self.pair.rated(images)
+        images = self._images(self.first.placed.with_vertices(best.x))
+        rated = self.pair.rate(images)
         # Where sheets touch, the image of a sample may lie on the wrong one; the map has no such errors.
-        score, distortion = rated.score, min(best.found.distortion, rated.distortion)
-        rows = self.template.rows(self.template.closest(self.marks))
-        errors = np.linalg.norm(rows @ x - self.mark_places, axis=1)
-        mirrored = float(self.mirrored - (score - distortion))
+        score, distortion = rated.score, min(best.map.distortion, rated.distortion)
+        rows = self.template.rows(self.template.closest(self.marks[0]))
+        errors = np.linalg.norm(rows @ x - self.marks[1], axis=1)
         near = self.first.placed.nearest_alike(self.template.vertices, self.template.vertex_normals)
         if self.same_subject:
             # Of a vertex in a wrong place, many distances are wrong; of the others, the few to such vertices.
@@ -320,34 +296,24 @@ class _RegistrationProblem:
         lost = float(self.template.vertex_areas[supported < TRUSTED].sum() / self.template.area)
         quality = quality._replace(unsupported_area=max(quality.unsupported_area, lost))
         freedom = sliding_freedom(self.first, self.mark_vertices[:, 0])
-        confidence, said = judge(quality, score, best.likeness, errors, mirrored, lead, freedom, self.same_subject)
+        mirrored = float(self.mirrored - (score - distortion))
+        confidence, warnings = judge(quality, score, best.likeness, errors, mirrored, lead, freedom, self.same_subject)
+        vertex_confidence = np.full(len(everything), confidence)
         unique = np.minimum(self.unique[near], ramp(freedom, *SLIDING))
-        of_vertices = np.full(len(everything), confidence)
-        of_vertices[self.used] = np.minimum(supported, unique)
+        vertex_confidence[self.used] = np.minimum(supported, unique)
         closest = self.target.closest(everything)
         corners = self.target_vertices[self.target.faces[closest.faces]]
         return Registration(
             positions=torch.from_numpy(everything * self.unit + self.origin),
             confidence=confidence,
-            vertex_confidence=torch.from_numpy(of_vertices),
+            vertex_confidence=torch.from_numpy(vertex_confidence),
             map_score=score,
             distortion=distortion,
             **quality._asdict(),
-            mirrored_lead=mirrored,
             likeness=best.likeness,
             landmark_errors=torch.from_numpy(errors),
-            target_faces=torch.from_numpy(closest.faces),
-            barycentric=torch.from_numpy(closest.barycentric),
             target_corners=torch.from_numpy(corners),
+            barycentric=torch.from_numpy(closest.barycentric),
             rivals=torch.from_numpy(np.array(rivals).reshape(-1, *everything.shape) * self.unit + self.origin),
-            warnings=said,
+            warnings=warnings,
         )
-
-
-def _carried(points: FloatArray, coarse: MeshSurface, x: FloatArray, frames: FloatArray) -> FloatArray:
-    """Deformation of points near a coarse surface at rest. *Shape:* ``(n, 3)``."""
-    rows: sparse.csr_matrix = coarse.rows(coarse.closest(points))
-    # Barycentric mean of the affine maps of the corners.
-    offsets = np.einsum("vij,vj->vi", frames, coarse.vertices)
-    turn = (rows @ frames.reshape(len(frames), 9)).reshape(-1, 3, 3)
-    return rows @ (x - offsets) + np.einsum("nij,nj->ni", turn, points)

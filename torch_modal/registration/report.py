@@ -9,9 +9,8 @@ from numpy.typing import NDArray
 
 from torch_modal.arrays import FloatArray
 from torch_modal.errors import MeshError
-from torch_modal.geometry.closest import dot
 from torch_modal.io.write import to_numpy
-from torch_modal.registration.surface import MeshSurface, referenced
+from torch_modal.registration.surface import MeshSurface, keep_pieces
 
 TRUSTED = 0.5  # confidence below which a result is doubtful
 
@@ -19,9 +18,9 @@ SLIDING = 0.9, 0.65  # freedom to slide along the target: no confidence, full co
 LEAD = 0.0, 0.1  # advantage over the best fit along another map: no confidence, full confidence
 MIRRORED = 0.18, 0.06  # advantage of the best map onto the mirrored target: no confidence, full confidence
 LOG_ODDS = 7.0
-"""Log-odds that a map is right whose score, likeness of curvatures and stretch are those of most right maps."""
+"""Log-odds that a map is right whose score, likeness of curvatures and stretch are usual for right maps."""
 # Loss of log-odds per unit that each is worse, and the value where the loss begins. All are from a logistic regression
-# on pairs with known truth, of one subject and of two, apart from those of tests/benchmarks/people.py.
+# on pairs with known truth, of one subject and of two, apart from the pairs of tests/benchmarks/people.py.
 SCORE, LIKENESS, STRETCH = (16.0, 0.85), (14.5, 0.92), (7.0, 0.08)
 _FAR = 0.01  # distance from the target above which a face is unsupported, in diagonals
 _SHRUNK = 0.2  # area change relative to the median below which a face is unsupported: missing parts collapse
@@ -32,15 +31,13 @@ class Distances(NamedTuple):
     """Distances from vertices to the other surface, in percent of the target's diagonal; the mean is by area."""
 
     mean: float
-    percentile_95: float
     max: float
 
     @classmethod
     def between(cls, surface: MeshSurface, other: MeshSurface, diagonal: float) -> "Distances":
         """From ``surface`` to ``other``."""
         distances = 100 / diagonal * other.closest(surface.vertices).distances
-        weights = surface.vertex_areas / surface.vertex_areas.sum()
-        return cls(float(weights @ distances), float(np.percentile(distances, 95)), float(distances.max()))
+        return cls(float(np.average(distances, weights=surface.vertex_areas)), float(distances.max()))
 
 
 class Quality(NamedTuple):
@@ -50,7 +47,6 @@ class Quality(NamedTuple):
     from_target: Distances
     stretch: float
     flipped_area: float
-    folds: int
     unsupported_area: float
 
     @property
@@ -59,50 +55,42 @@ class Quality(NamedTuple):
         return self.stretch + 0.1 * (self.to_target.mean + self.from_target.mean) + self.flipped_area
 
 
+def edge_stretch(template: MeshSurface, x: FloatArray) -> FloatArray:
+    """Logarithms of the changes of edge lengths, without edges of no length. *Shape:* ``(V, 3) -> (n,)``."""
+    i, j = template.edges.T
+    now, rest = (np.linalg.norm(points[i] - points[j], axis=1) for points in (x, template.vertices))
+    usable = (now > 0) & (rest > 0)
+    return np.asarray(np.log(now[usable] / rest[usable]))
+
+
 def measure(template: MeshSurface, x: FloatArray, target: MeshSurface) -> tuple[Quality, FloatArray]:
-    """Quality of a fitted template, and the part of the area around each vertex that has a counterpart on the target.
+    """Quality of a fitted template, and the fraction of the area around each vertex with a counterpart on the target.
 
     *Shape:* ``(V, 3) -> (V,)``.
     """
-    shape = template.moved(x)
-    target = _without_strays(target, shape)
-    i, j = shape.edges.T
-    now, rest = (np.linalg.norm(p[i] - p[j], axis=1) for p in (x, template.vertices))
-    usable = (now > 0) & (rest > 0)
-    logs = np.log(now[usable] / rest[usable])
-    centres = x[shape.faces].mean(1)
-    against = target.looks_away(centres, shape.face_normals)
-    pairs = shape.connectivity.face_neighbours
-    cosines = [dot(n[pairs[:, 0]], n[pairs[:, 1]]) for n in (template.face_normals, shape.face_normals)]
+    shape = template.with_vertices(x)
+    # Pieces of the target far from the template do not count.
+    pieces = target.connectivity.vertex_pieces
+    nearest = np.full(pieces.max() + 1, np.inf)
+    np.minimum.at(nearest, pieces, shape.closest(target.vertices).distances)
+    target = keep_pieces(target, nearest <= max(_STRAY * shape.diagonal, nearest.min()))
+    logs = edge_stretch(template, x)
+    against = target.looks_away(shape.face_centres, shape.face_normals)
     # Faces without a counterpart are far from the target, at one of its holes, or collapsed.
-    closest = target.closest(centres)
+    closest = target.closest(shape.face_centres)
     change = shape.face_areas / np.maximum(template.face_areas, 1e-30)
-    missing = (closest.distances > _FAR * target.diagonal) | (
-        change < _SHRUNK * np.median(change[template.face_areas > 0])
-    )
+    missing = closest.distances > _FAR * target.diagonal
+    missing |= change < _SHRUNK * np.median(change[template.face_areas > 0])
     missing |= target.on_open_edge(closest) & ~shape.on_boundary[shape.faces].any(1)
-    corners, whole = template.faces.reshape(-1), template.face_areas
-    own, every = (np.bincount(corners, np.repeat(areas, 3), len(x)) for areas in (whole * ~missing, whole))
+    supported = np.bincount(template.faces.reshape(-1), np.repeat(template.face_areas / 3 * ~missing, 3), len(x))
     quality = Quality(
         Distances.between(shape, target, target.diagonal),
         Distances.between(target, shape, target.diagonal),
         float(np.sqrt(np.mean((logs - np.median(logs)) ** 2))) if len(logs) else 0.0,
-        float(whole[against].sum() / template.area),
-        int(((cosines[0] > 0) & (cosines[1] < -0.5)).sum()),
-        float(whole[missing].sum() / template.area),
+        float(template.face_areas[against].sum() / template.area),
+        float(template.face_areas[missing].sum() / template.area),
     )
-    return quality, own / np.maximum(every, np.finfo(np.float64).tiny)
-
-
-def _without_strays(target: MeshSurface, shape: MeshSurface) -> MeshSurface:
-    """Remove pieces of the target far from the fitted template, unless all are far."""
-    pieces = target.connectivity.vertex_pieces
-    if pieces.max() == 0:
-        return target
-    nearest = np.full(pieces.max() + 1, np.inf)
-    np.minimum.at(nearest, pieces, shape.closest(target.vertices).distances)
-    kept = (nearest <= _STRAY * shape.diagonal)[pieces[target.faces[:, 0]]]
-    return referenced(target.vertices, target.faces[kept])[0] if kept.any() else target
+    return quality, supported / np.maximum(template.vertex_areas, np.finfo(np.float64).tiny)
 
 
 class Registration(NamedTuple):
@@ -129,22 +117,16 @@ class Registration(NamedTuple):
     """Root mean square of the edges' logarithmic change of length, relative to its median."""
     flipped_area: float
     """Fraction of the template's area with normals opposed to the target."""
-    folds: int
-    """Edges at which the angle between the normals grew from below 90 to above 120 degrees."""
     unsupported_area: float
     """Fraction of the template's area without a counterpart, such as a limb missing on the target."""
-    mirrored_lead: float
-    """Advantage of a mirrored map, in score minus distortion; minus infinity if none was computed."""
     likeness: float
     """Correlation of the curvatures of the template and of the target where it lies; at most 1."""
     landmark_errors: torch.Tensor
     """Distance of each landmark from its target. *Shape:* ``(n,)``."""
-    target_faces: torch.Tensor
-    """Closest face of the target for each vertex. *Shape:* ``(V,)``."""
+    target_corners: torch.Tensor
+    """Vertices of the target's face closest to each vertex. *Shape:* ``(V, 3)``."""
     barycentric: torch.Tensor
     """Barycentric coordinates in that face. *Shape:* ``(V, 3)``."""
-    target_corners: torch.Tensor
-    """Vertices of the target at those corners. *Shape:* ``(V, 3)``."""
     rivals: torch.Tensor
     """Positions of other results that fit nearly as well, such as a mirrored one. *Shape:* ``(n, V, 3)``."""
     warnings: tuple[str, ...]
@@ -163,15 +145,9 @@ class Registration(NamedTuple):
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> "Registration":
         """Inverse of `arrays`."""
-        fields: dict[str, Any] = {"warnings": tuple(arrays["warnings"].tobytes().decode().splitlines())}
-        for name in arrays.keys() - fields.keys():
-            if cls.__annotations__[name] in (float, int):
-                fields[name] = arrays[name].item()
-            elif cls.__annotations__[name] is Distances:
-                fields[name] = Distances(*arrays[name].tolist())
-            else:
-                fields[name] = torch.from_numpy(arrays[name])
-        return cls(**fields)
+        fields: dict[str, Any] = {name: x.item() if x.ndim == 0 else torch.from_numpy(x) for name, x in arrays.items()}
+        fields["warnings"] = tuple(arrays["warnings"].tobytes().decode().splitlines())
+        return cls(**fields | {name: Distances(*arrays[name].tolist()) for name in ("to_target", "from_target")})
 
     def sample(self, values: Any) -> torch.Tensor:
         """Transfer attributes from the target's vertices to the template's vertices.
@@ -208,7 +184,7 @@ class Registration(NamedTuple):
             f"confidence {self.confidence:.2f}, distance {self.to_target.mean:.3f} % there and "
             f"{self.from_target.mean:.3f} % back (at most {max(self.to_target.max, self.from_target.max):.1f} %), "
             f"stretch {100 * self.stretch:.0f} %, flipped area {100 * self.flipped_area:.1f} %, "
-            f"{self.folds} folds, without target {100 * self.unsupported_area:.1f} %{marks}"
+            f"without target {100 * self.unsupported_area:.1f} %{marks}"
         )
 
 
@@ -228,17 +204,14 @@ def judge(
     same_subject: bool,
 ) -> tuple[float, tuple[str, ...]]:
     """Confidence, the minimum of several criteria, and a message for each criterion that fails."""
-    distance = max(quality.to_target.mean, quality.from_target.mean)
-    criteria = [
-        (ramp(distance, 1.0, 0.3), f"the mean distance of the surfaces is {distance:.2f} % of the diagonal"),
-        (ramp(quality.flipped_area, 0.10, 0.01), f"{100 * quality.flipped_area:.1f} % of the area are flipped"),
-        (
-            ramp(quality.unsupported_area, 0.05, 0.02),
-            f"{100 * quality.unsupported_area:.1f} % of the area have no target beside them",
-        ),
-        (ramp(freedom, *SLIDING), "the template is so smooth that it can slide along the target"),
-        (ramp(lead, *LEAD), "another map fits nearly as well"),
-    ]
+    distance, missing = max(quality.to_target.mean, quality.from_target.mean), quality.unsupported_area
+    criteria = {
+        f"the mean distance of the surfaces is {distance:.2f} % of the diagonal": ramp(distance, 1.0, 0.3),
+        f"{100 * quality.flipped_area:.1f} % of the area are flipped": ramp(quality.flipped_area, 0.10, 0.01),
+        f"{100 * missing:.1f} % of the area have no target next to them": ramp(missing, 0.05, 0.02),
+        "the template is so smooth that it can slide along the target": ramp(freedom, *SLIDING),
+        "another map fits nearly as well": ramp(lead, *LEAD),
+    }
     if same_subject or not len(landmark_errors):
         losses = {
             f"the map scores {map_score:.2f}, right ones mostly 0.6 and more": SCORE[0] * (SCORE[1] - map_score),
@@ -246,18 +219,13 @@ def judge(
             "as front and back": LIKENESS[0] * (LIKENESS[1] - likeness),
             f"edges change by {100 * quality.stretch:.0f} % in the mean": STRETCH[0] * (quality.stretch - STRETCH[1]),
         }
-        probability = 1 / (1 + np.exp(sum(max(loss, 0) for loss in losses.values()) - LOG_ODDS))
         reasons = "; ".join(what for what, loss in losses.items() if 2 * loss > max(losses.values()))
-        criteria += [
-            (probability, reasons),
-            (ramp(mirrored_lead, *MIRRORED), "the target looks like a mirror image of the template"),
-        ]
+        criteria[reasons] = 1 / (1 + np.exp(sum(max(loss, 0) for loss in losses.values()) - LOG_ODDS))
+        criteria["the target looks like a mirror image of the template"] = ramp(mirrored_lead, *MIRRORED)
+    advice = "look at the result, and give landmarks (five or more) on both meshes"
     if len(landmark_errors):
-        worst = int(landmark_errors.argmax())
-        error = landmark_errors[worst]
-        criteria.append((ramp(error, 8.0, 2.0), f"landmark {worst} is {error:.1f} % off its place"))
-    advice = "look at the result, and give landmarks (five or more) on both meshes" + (
-        ", or more of them" if len(landmark_errors) else ""
-    )
-    said = tuple(f"{what}; {advice}" for value, what in criteria if value < TRUSTED)
-    return float(min(value for value, _ in criteria)), said
+        worst, error = int(landmark_errors.argmax()), float(landmark_errors.max())
+        criteria[f"landmark {worst} is {error:.1f} % off its place"] = ramp(error, 8.0, 2.0)
+        advice += ", or more of them"
+    warnings = tuple(f"{what}; {advice}" for what, value in criteria.items() if value < TRUSTED)
+    return float(min(criteria.values())), warnings

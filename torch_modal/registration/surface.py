@@ -42,16 +42,16 @@ def places_between(corners: IntArray, barycentric: FloatArray, n_vertices: int) 
 class MeshSurface(Surface):
     """A triangle mesh with closest-point queries. *Shape:* ``(V, 3)``, and ``(F, 3)`` or a connectivity."""
 
-    def moved(self, vertices: FloatArray) -> "MeshSurface":
+    def with_vertices(self, vertices: FloatArray) -> "MeshSurface":
         """Surface of the same connectivity with other positions."""
         return MeshSurface(vertices, self.connectivity)
 
     @cached_property
     def on_boundary(self) -> BoolArray:
         """Vertices on the boundary, as a mask. *Shape:* ``(V,)``."""
-        found = np.zeros(len(self.vertices), dtype=bool)
-        found[self.connectivity.boundary_edges] = True
-        return found
+        mask = np.zeros(len(self.vertices), dtype=bool)
+        mask[self.connectivity.boundary_edges] = True
+        return mask
 
     # --------------------------------------------------------------------------------------------------- closest points
     @cached_property
@@ -64,10 +64,10 @@ class MeshSurface(Surface):
     def closest(self, points: FloatArray) -> Closest:
         """Closest point on the surface to each query. *Shape:* ``(n, 3)``."""
         points = np.ascontiguousarray(points, dtype=np.float64)
-        _, faces, found = self._tree.squared_distance(self.vertices, self.faces, points)
+        _, faces, closest = self._tree.squared_distance(self.vertices, self.faces, points)
         faces = np.asarray(faces).reshape(-1).astype(np.int64)
         barycentric, distances = closest_on_triangles(points, self.vertices[self.faces[faces]])
-        return Closest(distances, faces, np.asarray(found).reshape(-1, 3), barycentric)
+        return Closest(distances, faces, np.asarray(closest).reshape(-1, 3), barycentric)
 
     def rows(self, closest: Closest) -> sparse.csr_matrix:
         """Interpolation matrix from vertices to closest points. *Shape:* ``(n, V)``."""
@@ -77,8 +77,7 @@ class MeshSurface(Surface):
         """Closest points on the boundary, as a mask: their true counterpart may be missing. *Shape:* ``(n,)``."""
         is_open = (self.connectivity.counts == 1)[self.connectivity.sides].reshape(3, -1).T[closest.faces]
         # The edge opposite to a corner starts at the next one.
-        found: BoolArray = ((closest.barycentric < 1e-6) & np.roll(is_open, -1, axis=1)).any(1)
-        return found
+        return np.asarray(((closest.barycentric < 1e-6) & np.roll(is_open, -1, axis=1)).any(1))
 
     @cached_property
     def _tree_with_normals(self) -> cKDTree:
@@ -90,7 +89,7 @@ class MeshSurface(Surface):
         return self._tree_with_normals.query(rows)[1].astype(np.int64)
 
     def looks_away(self, points: FloatArray, normals: FloatArray) -> BoolArray:
-        """True where normals oppose the closest face and any sheet beside it. *Shape:* ``(n, 3), (n, 3) -> (n,)``."""
+        """True where normals oppose the closest face and any sheet next to it. *Shape:* ``(n, 3), (n, 3) -> (n,)``."""
         away = dot(normals, self.face_normals[self.closest(points).faces]) < 0
         some = np.flatnonzero(away)
         away[some] = dot(normals[some], self.vertex_normals[self.nearest_alike(points[some], normals[some])]) < 0
@@ -105,45 +104,43 @@ def outward(vertices: FloatArray, faces: IntArray) -> IntArray:
     return faces[:, ::-1].copy() if closed and signed_volume(centred, faces) < 0 else faces
 
 
-def referenced(vertices: FloatArray, faces: IntArray) -> tuple[MeshSurface, IntArray]:
+def drop_unreferenced(vertices: FloatArray, faces: IntArray) -> tuple[MeshSurface, IntArray]:
     """Surface without unreferenced vertices, and the indices of the others. *Shape of the second:* ``(V',)``."""
     used, renumbered = np.unique(faces, return_inverse=True)
     return MeshSurface(vertices[used], renumbered.reshape(-1, 3)), used
 
 
+def keep_pieces(surface: MeshSurface, kept: BoolArray) -> MeshSurface:
+    """Some of the connected pieces of a surface. *Shape:* ``(n_pieces,)``."""
+    faces = surface.faces[kept[surface.connectivity.vertex_pieces[surface.faces[:, 0]]]]
+    return surface if kept.all() else drop_unreferenced(surface.vertices, faces)[0]
+
+
 def largest_pieces(surface: MeshSurface, share: float = 1.0) -> MeshSurface:
-    """The largest connected piece, with those of at least a share of the whole area."""
-    pieces = surface.connectivity.vertex_pieces
-    if pieces.max() == 0:
-        return surface
-    of_faces = pieces[surface.faces[:, 0]]
-    areas = np.bincount(of_faces, surface.face_areas, minlength=pieces.max() + 1)
-    kept = areas >= share * surface.area
-    kept[areas.argmax()] = True
-    return referenced(surface.vertices, surface.faces[kept[of_faces]])[0]
+    """The largest connected piece, with all pieces of at least a share of the whole area."""
+    pieces = surface.connectivity.vertex_pieces[surface.faces[:, 0]]
+    areas = np.bincount(pieces, surface.face_areas, minlength=surface.connectivity.vertex_pieces.max() + 1)
+    return keep_pieces(surface, (areas >= share * surface.area) | (areas == areas.max()))
 
 
-def sewn(surface: MeshSurface, reach: float = CUT) -> MeshSurface:
+def sew(surface: MeshSurface, reach: float = CUT) -> MeshSurface:
     """Surface with strips of triangles that close cuts between its pieces, up to a width in diagonals."""
     mesh = surface.connectivity
     pieces = mesh.vertex_pieces
     open_sides = np.flatnonzero((mesh.counts == 1)[mesh.sides])
-    if pieces.max() == 0 or not len(open_sides):
-        return surface
     start, end = mesh.start[open_sides], mesh.end[open_sides]
-    strips = []
+    strips = [surface.faces]
     for piece in np.unique(pieces[start]):
-        own = pieces[start] == piece
-        others = np.unique(start[~own])
-        if not len(others):
-            break
-        middle = 0.5 * (surface.vertices[start[own]] + surface.vertices[end[own]])
-        distances, found = cKDTree(surface.vertices[others]).query(middle)
-        near = distances < reach * surface.diagonal
-        strips.append(np.column_stack([end[own], start[own], others[found]])[near])
-    return MeshSurface(surface.vertices, np.concatenate([surface.faces, *strips]))
+        here = pieces[start] == piece
+        others = np.unique(start[~here])
+        if len(others):
+            middle = 0.5 * (surface.vertices[start[here]] + surface.vertices[end[here]])
+            distances, nearest = cKDTree(surface.vertices[others]).query(middle)
+            near = distances < reach * surface.diagonal
+            strips.append(np.column_stack([end[here], start[here], others[nearest]])[near])
+    return MeshSurface(surface.vertices, np.concatenate(strips))
 
 
 def main_part(surface: MeshSurface) -> MeshSurface:
-    """The largest piece, with those separated from it by a cut."""
-    return largest_pieces(sewn(largest_pieces(surface, DUST)))
+    """The largest piece, with pieces separated from it by a cut."""
+    return largest_pieces(sew(largest_pieces(surface, DUST)))
