@@ -1,6 +1,6 @@
 """Pairs of observed points and places on a surface: by position and normal, in both directions, robust."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy import sparse
@@ -116,7 +116,9 @@ class Cloud(NamedTuple):
         chosen = np.random.default_rng(0).permutation(len(self.points))[:n]
         return Cloud(*self._select(chosen, self.weights[chosen] / self.weights[chosen].sum()), self.view)
 
-    def _select(self, rows: IntArray, weights: FloatArray) -> tuple[Any, ...]:
+    def _select(
+        self, rows: IntArray, weights: FloatArray
+    ) -> tuple[FloatArray, FloatArray | None, FloatArray, IntArray, float]:
         """The first fields of some of the points, with other weights."""
         normals = None if self.normals is None else self.normals[rows]
         return self.points[rows], normals, weights, self.numbers[rows], self.noise

@@ -11,8 +11,8 @@ from torch_modal.geometry.closest import dot
 from torch_modal.geometry.connectivity import half_cotangents
 from torch_modal.geometry.rigid import best_rotation
 from torch_modal.geometry.sparse import SparseSolver, graph_laplacian
-from torch_modal.progress import ProgressReport
 from torch_modal.registration.maps import SpectralShape
+from torch_modal.registration.pair import MeshPair
 from torch_modal.registration.surface import MeshSurface
 
 # Bounds of cotangent weights, which are negative at obtuse angles and huge at slivers.
@@ -107,59 +107,41 @@ class ElasticSurface:
 
 
 class TemplateFit:
-    """Iterative fit of a template to a target.
+    """Iterative fit of a template to the target of two meshes.
 
     Args:
+        meshes: Has the target, its coarse shape and the landmarks.
         template: The rest shape, in the target's scale.
-        target: The target, with a diagonal of 100.
         back: The target or a coarse copy, whose vertices are matched to the template.
-        coarse: The target's coarse shape.
-        images: Vertex of that for each template vertex; closest points must be near, so that touching fingers do not
-            mix. *Shape:* ``(V,)``.
-        landmarks: Points on the template and their target positions. *Shape:* ``(n, 3), (n, 3)``.
-        progress: Counts the steps.
-        stretchable: Allow parts to grow and shrink.
+        images: Vertex of the target's coarse shape for each template vertex; closest points must be near, so that
+            touching fingers do not mix. *Shape:* ``(V,)``.
     """
 
-    def __init__(
-        self,
-        template: MeshSurface,
-        target: MeshSurface,
-        back: MeshSurface,
-        coarse: SpectralShape,
-        images: IntArray,
-        landmarks: tuple[FloatArray, FloatArray],
-        progress: ProgressReport,
-        *,
-        stretchable: bool,
-    ) -> None:
-        self.template, self.target, self.back, self.progress = template, target, back, progress
-        self.elastic = ElasticSurface(template, stretchable=stretchable)
-        self._coarse, self._images = coarse, images
+    def __init__(self, meshes: MeshPair, template: MeshSurface, back: MeshSurface, images: IntArray) -> None:
+        self.template, self.target, self.back, self.progress = template, meshes.target, back, meshes.progress
+        self.elastic = ElasticSurface(template, stretchable=not meshes.same_subject)
+        self._coarse, self._images = meshes.second, images
         self._everywhere = sparse.identity(len(images), format="csr")
         self._share = template.vertex_areas / template.vertex_areas.mean()
         self._back_share = back.vertex_areas / back.vertex_areas.mean() * (len(images) / len(back.vertices))
-        self._landmarks = self._pull(template.rows(template.closest(landmarks[0])), landmarks[1], _LANDMARK_WEIGHT)
+        here, there = meshes.marks
+        self._landmarks = self._pull(template.rows(template.closest(here)), there, _LANDMARK_WEIGHT)
 
     def _pull(self, points: sparse.csr_matrix, places: FloatArray, weights: FloatArray | float) -> Pull:
         return points, places, self.elastic.stiffness * np.broadcast_to(weights, len(places))
 
-    def follow_map(self, x: FloatArray, places: FloatArray) -> FloatArray:
-        """Fit to the positions of a map. *Shape:* ``(V, 3), (V, 3)``."""
-        self.progress.expect(len(_MAP_WEIGHTS))
-        for weight in _MAP_WEIGHTS:
-            x = self.elastic.follow(x, [self._pull(self._everywhere, places, weight), self._landmarks], _MAP_ROUNDS)
-            self.progress.update()
-        return x
-
     def run(
         self, x: FloatArray, stages: Sequence[Stage], releases: int, places: FloatArray | None = None
     ) -> FloatArray:
-        """Run all stages, with a small weight of the places of a map; then release flipped regions several times.
+        """Follow the places of a map, then closest points in all stages; then release flipped regions several times.
 
-        *Shape:* ``(V, 3), (V, 3)``.
+        The places keep a small weight in the stages. *Shape:* ``(V, 3), (V, 3)``.
         """
-        self.progress.expect(sum(n_steps for *_, n_steps in stages))
+        map_weights = () if places is None else _MAP_WEIGHTS
+        self.progress.expect(len(map_weights) + sum(n_steps for *_, n_steps in stages))
+        for weight in map_weights:
+            x = self.elastic.follow(x, [self._pull(self._everywhere, places, weight), self._landmarks], _MAP_ROUNDS)
+            self.progress.update()
         none = np.zeros(len(x), dtype=bool)
         for stage in stages:
             x = self._step(x, stage, none, places)

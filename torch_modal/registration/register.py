@@ -23,15 +23,13 @@ from torch_modal.registration.maps import (
     MORE_SIGNS,
     N_SIGNS,
     SAME,
-    CoarsePair,
     Map,
-    SpectralShape,
 )
+from torch_modal.registration.pair import MeshPair
 from torch_modal.registration.report import LEAD, SLIDING, TRUSTED, Quality, Registration, judge, measure, ramp
-from torch_modal.registration.surface import MeshSurface, drop_unreferenced, main_part, outward
+from torch_modal.registration.surface import MeshSurface
 
 VERSION = 9  # part of the cache key: raise it when the algorithm changes
-MIN_VERTICES = MORE_SIGNS + 3  # minimum number of vertices of a surface: two more than eigenfunctions
 MIN_LANDMARKS = 5  # minimum number of landmarks between different subjects: fewer do not determine the map
 _SURE_SCORE = 0.62  # score of a spectral map below which more initial maps are tried
 _SCORE_SHARE = 0.5  # weight of a map's score and likeness relative to the stretch of its fit
@@ -117,7 +115,7 @@ def register(
     def compute() -> dict[str, Any]:
         # The matrices are too small for BLAS threads.
         with ProgressReport(0, "register", progress) as report, threadpool_limits(1):
-            return _RegistrationProblem(*meshes, points, same_subject, report).solve().arrays()
+            return _RegistrationProblem(meshes[0], meshes[1], points, same_subject, report).solve().arrays()
 
     names = ("template", "faces", "target", "target_faces", "here", "there")
     inputs = dict(zip(names, (*meshes[0], *meshes[1], points[:, 0], points[:, 1]), strict=True))
@@ -134,46 +132,9 @@ def register(
     )
 
 
-class _RegistrationProblem:
-    """Both meshes in percent of the target's diagonal, the target centred, the template with equal area."""
-
-    def __init__(
-        self,
-        template: tuple[FloatArray, IntArray],
-        target: tuple[FloatArray, IntArray],
-        points: FloatArray,
-        same_subject: bool,
-        progress: ProgressReport,
-    ) -> None:
-        self.same_subject, self.progress = same_subject, progress
-        (source, self.used), (goal, self.target_vertices) = (
-            drop_unreferenced(vertices, outward(vertices, faces)) for vertices, faces in (template, target)
-        )
-        # The main bodies, without stray pieces, determine the sizes.
-        bodies = {"template": main_part(source), "target": main_part(goal)}
-        for name, body in bodies.items():
-            if len(body.vertices) < MIN_VERTICES or body.area == 0:
-                raise MeshError(
-                    f"the {name}'s largest piece has {len(body.vertices)} vertices and an area of {body.area:.3g}; "
-                    f"registration needs {MIN_VERTICES} vertices or more, and an area: give a finer mesh"
-                )
-        self.unit, self.origin = bodies["target"].diagonal / 100, bodies["target"].vertices.mean(0)
-        self.target = goal.with_vertices((goal.vertices - self.origin) / self.unit)
-        size = np.sqrt(bodies["target"].area / bodies["template"].area) / self.unit
-        self.rest = template[0] * size
-        self.template = source.with_vertices(source.vertices * size)
-        self.first, self.second = SpectralShape(self.template), SpectralShape(self.target)
-        self.pair = CoarsePair(self.first, self.second)
-        self.marks = points[:, 0] * size, (points[:, 1] - self.origin) / self.unit
-        shapes = (self.first, self.template), (self.second, self.target)
-        vertices = [
-            shape.placed.nearest_alike(places, surface.face_normals[surface.closest(places).faces])
-            for (shape, surface), places in zip(shapes, self.marks, strict=True)
-        ]
-        #: Landmarks as coarse vertices. *Shape:* ``(n, 2)``.
-        self.mark_vertices = np.stack(vertices, axis=1)
-        #: Score minus distortion of the best map onto the mirrored target.
-        self.mirrored = -np.inf
+class _RegistrationProblem(MeshPair):
+    #: Score minus distortion of the best map onto the mirrored target.
+    mirrored = -np.inf
 
     def solve(self) -> Registration:
         candidates = sorted(map(self._fit_coarse, self._rivals(self._maps())), key=lambda one: one.cost)
@@ -229,23 +190,18 @@ class _RegistrationProblem:
     # ------------------------------------------------------------------------------------------------------------- fits
     def _fit_coarse(self, one: Map) -> _Candidate:
         template, back = self.first.placed, self.second.placed
-        fit = self._fit(template, back, one.vertices)
+        fit = TemplateFit(self, template, back, one.vertices)
         places = back.vertices[one.vertices]
         rest, goal, areas = map(torch.from_numpy, (template.vertices, places, template.vertex_areas))
         with torch.no_grad():
             placed = best_fit(rest, goal, areas).apply(rest).numpy()
-        x = fit.run(fit.follow_map(placed, places), COARSE_STAGES, 2, places)
+        x = fit.run(placed, COARSE_STAGES, 2, places)
         likeness = self.pair.likeness(self._images(template.with_vertices(x)))
         return _Candidate(one, x, fit, measure(template, x, back)[0], likeness)
 
     def _images(self, shape: MeshSurface) -> IntArray:
         """Coarse vertices of the target nearest to the vertices of a fitted template. *Shape:* ``(n,)``."""
         return self.second.placed.nearest_alike(shape.vertices, shape.vertex_normals)
-
-    def _fit(self, template: MeshSurface, back: MeshSurface, images: IntArray) -> TemplateFit:
-        coarse, stretchable = self.second, not self.same_subject
-        arguments = template, self.target, back, coarse, images, self.marks, self.progress
-        return TemplateFit(*arguments, stretchable=stretchable)
 
     def _refine(self, candidate: _Candidate) -> _Candidate:
         """Repeat the fit from the start with the map of its result, which accumulates no sliding, until convergence."""
@@ -274,7 +230,8 @@ class _RegistrationProblem:
         moved = rows @ (x - np.einsum("vij,vj->vi", frames, coarse.vertices))
         everything: FloatArray = moved + np.einsum("nij,nj->ni", turns, self.rest)
         images = self._images(self.template.with_vertices(everything[self.used]))
-        everything[self.used] = self._fit(self.template, self.target, images).run(everything[self.used], FINE_STAGES, 1)
+        fit = TemplateFit(self, self.template, self.target, images)
+        everything[self.used] = fit.run(everything[self.used], FINE_STAGES, 1)
         return everything
 
     # ----------------------------------------------------------------------------------------------------------- report

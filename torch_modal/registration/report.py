@@ -145,9 +145,11 @@ class Registration(NamedTuple):
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> "Registration":
         """Inverse of `arrays`."""
-        fields: dict[str, Any] = {name: x.item() if x.ndim == 0 else torch.from_numpy(x) for name, x in arrays.items()}
-        fields["warnings"] = tuple(arrays["warnings"].tobytes().decode().splitlines())
-        return cls(**fields | {name: Distances(*arrays[name].tolist()) for name in ("to_target", "from_target")})
+        fields: dict[str, Any] = {"warnings": tuple(arrays["warnings"].tobytes().decode().splitlines())}
+        fields |= {name: Distances(*arrays[name].tolist()) for name in ("to_target", "from_target")}
+        for name in arrays.keys() - fields.keys():
+            fields[name] = torch.from_numpy(arrays[name]) if arrays[name].ndim else arrays[name].item()
+        return cls(**fields)
 
     def sample(self, values: Any) -> torch.Tensor:
         """Transfer attributes from the target's vertices to the template's vertices.
