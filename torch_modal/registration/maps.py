@@ -42,6 +42,8 @@ _ROUND_TRIP = 3.0
 _TORN = (2.5, 0.03)
 # Smallest fraction of the area that is the denominator of the score, if many triangles collapse.
 _LEAST_COUNTED = 0.3
+# Largest error of a consistent distance, and minimum number of consistent samples for a repair.
+_CONSISTENT, _FEWEST = 0.12, 8
 # Tips: their smallest distance, the radius in which no vertex is more distant, and the numbers that are matched.
 _TIPS_APART, _TIP_RADIUS, _FEWEST_TIPS, _MOST_TIPS = 0.35, 0.25, 4, 6
 _N_MATCHINGS = 4  # number of matchings of tips that give maps
@@ -270,6 +272,19 @@ class CoarsePair:
         best.append(max(coarse, key=lambda one: one.mirrored_score))
         *fine, mirrored = [self.refine(one.vertices, COARSE_FUNCTIONS) for one in best]
         return [*sorted(fine, key=lambda one: -one.score), mirrored]
+
+    def repair(self, vertices: IntArray) -> Map | None:
+        """A map from the mutually consistent samples of one that may be wrong in parts; None if they are few."""
+        samples, distances = self.first.samples
+        images = vertices[samples]
+        to_images = self.second.geodesics_from(images)
+        errors = np.abs(distances[samples] - to_images[images])
+        wrong, kept = np.maximum(errors, errors.T) > _CONSISTENT, np.arange(len(samples))
+        while len(kept) >= _FEWEST and (conflicts := wrong[np.ix_(kept, kept)].sum(1)).any():
+            kept = np.delete(kept, conflicts.argmax())
+        if len(kept) < _FEWEST or len(kept) == len(samples):
+            return None
+        return self.refine(nearest_rows(distances[:, kept], to_images[:, kept]), 26)
 
 
 def nearest_rows(queries: FloatArray, rows: FloatArray) -> IntArray:

@@ -157,11 +157,7 @@ class _RegistrationProblem(MeshPair):
             maps = [self.pair.from_landmarks(self.mark_vertices)]
             if not self.same_subject:
                 return [*maps, self.pair.from_limbs(self.mark_vertices)]
-            places, (here, there) = self.second.coarse.vertices, self.mark_vertices.T
-            for one in self._spectral_maps(N_SIGNS):
-                errors = np.linalg.norm(places[one.vertices[here]] - places[there], axis=1)
-                maps += [one] if (errors < _NEAR_LANDMARK).all() else []
-            return maps
+            return maps + [one for one in self._spectral_maps(N_SIGNS) if self._agrees(one)]
         maps = self._spectral_maps(N_SIGNS)
         sure = maps[0].score >= _SURE_SCORE
         if sure and self.same_subject:
@@ -177,9 +173,17 @@ class _RegistrationProblem(MeshPair):
         self.mirrored = max(self.mirrored, other.mirrored_score - other.distortion)
         return maps
 
+    def _agrees(self, one: Map) -> bool:
+        """Test whether a map agrees with all landmarks."""
+        places, (here, there) = self.second.coarse.vertices, self.mark_vertices.T
+        errors = np.linalg.norm(places[one.vertices[here]] - places[there], axis=1)
+        return bool((errors < _NEAR_LANDMARK).all())
+
     def _rivals(self, maps: list[Map]) -> list[Map]:
         """Different maps that will be fitted."""
-        best, *others = sorted(maps, key=lambda one: one.distortion - one.score)
+        repaired = [self.pair.repair(one.vertices) for one in maps] if self.same_subject else []
+        everything = [*maps, *(one for one in repaired if one is not None and self._agrees(one))]
+        best, *others = sorted(everything, key=lambda one: one.distortion - one.score)
         rivals = [best]
         for one in others:
             lead = (one.score - one.distortion) - (best.score - best.distortion)
