@@ -137,11 +137,12 @@ class TemplateFit:
 
         The places keep a small weight in the stages. *Shape:* ``(V, 3), (V, 3)``.
         """
-        map_weights = () if places is None else _MAP_WEIGHTS
-        self.progress.expect(len(map_weights) + sum(n_steps for *_, n_steps in stages))
-        for weight in map_weights:
-            x = self.elastic.follow(x, [self._pull(self._everywhere, places, weight), self._landmarks], _MAP_ROUNDS)
-            self.progress.update()
+        self.progress.expect(sum(n_steps for *_, n_steps in stages))
+        if places is not None:
+            self.progress.expect(len(_MAP_WEIGHTS))
+            for weight in _MAP_WEIGHTS:
+                x = self.elastic.follow(x, [self._pull(self._everywhere, places, weight), self._landmarks], _MAP_ROUNDS)
+                self.progress.update()
         none = np.zeros(len(x), dtype=bool)
         for stage in stages:
             x = self._step(x, stage, none, places)
