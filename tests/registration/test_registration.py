@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from scipy.spatial import cKDTree
 
 import torch_modal as tm
 from torch_modal import extras
@@ -98,15 +99,14 @@ def test_missing_parts_have_low_confidence(found: tm.Registration) -> None:
 
 
 def test_report_measures_what_it_says(pair: tuple[Mesh, Mesh, np.ndarray], found: tm.Registration) -> None:
+    """The places on the target are exact, and the report has their largest distance."""
     there = trimesh.Trimesh(*pair[1], process=False)
-    # The library's closest points against the nearest of many samples of the target: an upper bound, nearly met.
-    samples = trimesh.sample.sample_surface(there, 200_000, seed=0)[0]
-    distance = np.linalg.norm(found.positions.numpy()[:50, None] - samples[None, :], axis=2).min(1)
-    size = np.linalg.norm(np.ptp(pair[1][0], axis=0))
-    corners = pair[1][0][found.target_corners.numpy()]
-    below = (found.barycentric.numpy()[..., None] * corners).sum(1)
+    below = (found.barycentric.numpy()[..., None] * pair[1][0][found.target_corners.numpy()]).sum(1)
     exact = np.linalg.norm(found.positions.numpy() - below, axis=1)
-    assert (exact[:50] <= distance + 1e-9).all() and (distance < exact[:50] + 0.01 * size).all()
+    # The nearest of many samples of the target is an upper bound, nearly met.
+    sampled = cKDTree(trimesh.sample.sample_surface(there, 200_000, seed=0)[0]).query(found.positions.numpy())[0]
+    size = np.linalg.norm(np.ptp(pair[1][0], axis=0))
+    assert (exact <= sampled + 1e-9).all() and (sampled < exact + 0.01 * size).all()
     assert found.to_target.max == pytest.approx(100 * exact.max() / size)
 
 
@@ -140,18 +140,17 @@ def test_the_second_time_is_from_the_cache(
         options = {"landmarks": marks, "cache_dir": tmp_path, "progress": False}
         return register(own, faces, target, there_faces, **options)
 
-    first = again(there)
-    second = again(there, dtype=np.float32)
+    first, second = again(there), again(there, dtype=np.float32)
     assert calls == [0] and second.positions.dtype == torch.float32 and first.positions.dtype == torch.float64
     assert second.warnings == ("one, with a comma", "two") and second.doubtful
     assert second.to_target == found.to_target and isinstance(second.to_target, type(found.to_target))
     for name in ("barycentric", "target_corners", "landmark_errors"):
         assert torch.equal(getattr(second, name), getattr(found, name)), name
-    assert len(again(there + 1e-9).positions) == len(rest) and calls == [0, 1]
+    again(there + 1e-9)
+    assert calls == [0, 1]
     marks = np.array([[3, 5], [40, 70]])
     again(there, marks)
     again(there, np.stack([rest.astype(np.float32)[marks[:, 0]].astype(np.float64), there[marks[:, 1]]], axis=1))
-    assert calls == [0, 1, 2]
     register(rest, faces, there, there_faces, cache=False, progress=False)
     assert calls == [0, 1, 2, 3]
 
@@ -319,8 +318,6 @@ def test_spectrum_of_the_sphere() -> None:
     np.testing.assert_allclose(shape.eigenvalues[:9], expected, rtol=0.02, atol=1e-6)
     gram = shape.functions.T @ (shape.mass[:, None] * shape.functions)
     np.testing.assert_allclose(gram, np.eye(len(gram)), atol=1e-6)
-    far = shape.geodesics_from(np.array([0]))[:, 0].max()
-    assert far == pytest.approx(np.pi * np.sqrt(1 / (4 * np.pi)), rel=0.03)
 
 
 def test_measures_of_a_turned_flap() -> None:

@@ -82,17 +82,16 @@ def load_keyframes(
     for k, (there, there_faces) in enumerate(meshes[1:], 1):
         try:
             require_same_mesh(paths[0], meshes[0], paths[k], (there, there_faces))
+            shapes.append(there)
+            continue
         except MeshError:
             if not register:
                 raise
-        else:
-            shapes.append(there)
-            continue
-        from torch_modal.registration.register import register as registered
+        from torch_modal.registration.register import register as register_pair
 
         options: dict[str, Any] = {"same_subject": same_subject, "cache_dir": cache_dir, "cache": cache}
         options |= {"landmarks": marks[:, k - 1 : k + 1], "progress": progress}
-        result = registered(shapes[-1], faces, there, there_faces, **options)
+        result = register_pair(shapes[-1], faces, there, there_faces, **options)
         name, origin = os.fspath(paths[k]), os.fspath(paths[k - 1])
         report(f"{name} registered from {origin}: {result.summary()}")
         if result.doubtful:

@@ -43,6 +43,7 @@ _SPECTRAL_REFINEMENTS = (True, True, False, False)  # of the map of each repeate
 _STRETCHED = 0.3  # stretch above which a fit between two subjects is repeated
 _CONVERGED = 0.3  # mean displacement of the vertices at convergence, in percent of the diagonal
 _WORSE = 0.05  # accepted increase of a candidate's cost
+_RESCALED = 0.02  # logarithm of the global scale above which the fit is repeated
 _MOST = 0.8  # fraction of a vertex's distances that are right where the vertex is, though parts are missing
 _MISPLACED = 0.20, 0.10  # largest error of these, for a surface of unit area: no confidence, full confidence
 
@@ -149,7 +150,8 @@ class _RegistrationProblem(MeshPair):
         self.unique = np.ones(len(self.first))
         for lead, distances in apart:
             self.unique[distances > SAME] = np.minimum(self.unique[distances > SAME], ramp(lead, *LEAD))
-        return self._report(best, min(leads, default=np.inf), [self._fit_fine(one) for one in alike])
+        rivals = [self._fit_fine(one) for one in alike]
+        return self._report(self._rescale(best), min(leads, default=np.inf), rivals)
 
     # ------------------------------------------------------------------------------------------------------------- maps
     def _maps(self) -> list[Map]:
@@ -192,14 +194,17 @@ class _RegistrationProblem(MeshPair):
         return rivals
 
     # ------------------------------------------------------------------------------------------------------------- fits
-    def _fit_coarse(self, one: Map) -> _Candidate:
+    def _fit_coarse(self, one: Map, x: FloatArray | None = None) -> _Candidate:
+        """Fit of the coarse template along a map, or from positions near the target."""
         template, back = self.first.placed, self.second.placed
-        fit = TemplateFit(self, template, back, one.vertices)
-        places = back.vertices[one.vertices]
-        rest, goal, areas = map(torch.from_numpy, (template.vertices, places, template.vertex_areas))
-        with torch.no_grad():
-            placed = best_fit(rest, goal, areas).apply(rest).numpy()
-        x = fit.run(placed, COARSE_STAGES, 2, places)
+        fit, places = TemplateFit(self, template, back, one.vertices), back.vertices[one.vertices]
+        if x is None:
+            rest, goal, areas = map(torch.from_numpy, (template.vertices, places, template.vertex_areas))
+            with torch.no_grad():
+                placed = best_fit(rest, goal, areas).apply(rest).numpy()
+            x = fit.run(placed, COARSE_STAGES, 2, places)
+        else:
+            x = fit.run(x, COARSE_STAGES, 2)
         likeness = self.pair.likeness(self._images(template.with_vertices(x)))
         return _Candidate(one, x, fit, measure(template, x, back)[0], likeness)
 
@@ -223,6 +228,19 @@ class _RegistrationProblem(MeshPair):
                 return min(candidate, again, key=lambda one: one.cost)
             candidate = again
         return candidate
+
+    def _rescale(self, candidate: _Candidate) -> _Candidate:
+        """Repeat the fit with the template's scale on the target: the ratio of areas is wrong if parts are missing."""
+        coarse = self.first.placed
+        i, j = coarse.edges.T
+        now, rest = (np.maximum(np.linalg.norm(x[i] - x[j], axis=1), 1e-12) for x in (candidate.x, coarse.vertices))
+        change = float(np.median(now / rest))
+        if not self.same_subject or abs(np.log(change)) < _RESCALED:
+            return candidate
+        self.rest, self.marks = change * self.rest, (change * self.marks[0], self.marks[1])
+        self.template = self.template.with_vertices(change * self.template.vertices)
+        self.first.placed = coarse.with_vertices(change * coarse.vertices)
+        return self._fit_coarse(candidate.map, candidate.x)
 
     def _fit_fine(self, candidate: _Candidate) -> FloatArray:
         """Positions of all vertices after the last stages."""

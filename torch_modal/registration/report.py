@@ -55,14 +55,6 @@ class Quality(NamedTuple):
         return self.stretch + 0.1 * (self.to_target.mean + self.from_target.mean) + self.flipped_area
 
 
-def edge_stretch(template: MeshSurface, x: FloatArray) -> FloatArray:
-    """Logarithms of the changes of edge lengths, without edges of no length. *Shape:* ``(V, 3) -> (n,)``."""
-    i, j = template.edges.T
-    now, rest = (np.linalg.norm(points[i] - points[j], axis=1) for points in (x, template.vertices))
-    usable = (now > 0) & (rest > 0)
-    return np.asarray(np.log(now[usable] / rest[usable]))
-
-
 def measure(template: MeshSurface, x: FloatArray, target: MeshSurface) -> tuple[Quality, FloatArray]:
     """Quality of a fitted template, and the fraction of the area around each vertex with a counterpart on the target.
 
@@ -74,7 +66,9 @@ def measure(template: MeshSurface, x: FloatArray, target: MeshSurface) -> tuple[
     nearest = np.full(pieces.max() + 1, np.inf)
     np.minimum.at(nearest, pieces, shape.closest(target.vertices).distances)
     target = keep_pieces(target, nearest <= max(_STRAY * shape.diagonal, nearest.min()))
-    logs = edge_stretch(template, x)
+    i, j = template.edges.T
+    now, rest = (np.linalg.norm(points[i] - points[j], axis=1) for points in (x, template.vertices))
+    logs = np.log(now[(now > 0) & (rest > 0)] / rest[(now > 0) & (rest > 0)])
     against = target.looks_away(shape.face_centres, shape.face_normals)
     # Faces without a counterpart are far from the target, at one of its holes, or collapsed.
     closest = target.closest(shape.face_centres)
