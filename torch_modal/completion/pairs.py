@@ -136,6 +136,25 @@ class Cloud(NamedTuple):
         places = places_between(surface.faces[face[kept]], barycentric[kept], len(surface.vertices))
         return Pairs(*self._select(kept, self.weights[kept]), places)
 
+    def pairs(self, surface: SampledSurface, released: BoolArray | None = None) -> list[Pairs]:
+        """Places for the points, and, where the view is known, points for the visible places."""
+        pairs = [self.places(surface, released)]
+        if self.view is None or self.normals is None:
+            return pairs
+        seen = surface.visible(self.view)
+        seen = seen[:: max(1, len(seen) // len(self.points))]
+        faces = surface.sample_faces[seen]
+        tree = cKDTree(join_features(self.points, self.normals))
+        nearest = tree.query(join_features(surface.samples[seen], surface.face_normals[faces]))[1]
+        agree = dot(surface.face_normals[faces], self.normals[nearest]) > ALIKE
+        if released is not None:
+            agree &= ~released[surface.faces[faces]].any(1)
+        seen, faces, nearest = seen[agree], faces[agree], nearest[agree]
+        if len(seen):
+            places = places_between(surface.faces[faces], _PLACES[seen % len(_PLACES)], len(surface.vertices))
+            pairs.append(Pairs(*self._select(nearest, np.full(len(seen), 1 / len(seen))), places))
+        return pairs
+
     def score(self, surface: SampledSurface, unit: float) -> float:
         """Part of the cloud that the surface leaves out, and of the visible surface that the cloud leaves out."""
         distances, agree = self.misses(surface)

@@ -16,7 +16,7 @@ from torch_modal.geometry.connectivity import Connectivity, edge_graph, farthest
 
 # Steps, and the distance from which on pairs lose weight at the first and the last; stiffness of the modes likewise.
 STEPS, FAR, NEAR = 12, 20.0, 2.0
-# Points of a cloud that take part in a step, and in one of the pose alone.
+# Points of a cloud, and visible places of a surface, that take part in a step, and in one of the pose alone.
 N_POINTS, N_RIGID = 800, 200
 STIFF, STIFFER = 1e-2, (1e-4, 1e-3, 1e-2)
 # Stiffness of a turn and a move of the whole.
@@ -163,7 +163,7 @@ class PoseSearch:
         """Derivatives of the weighted offsets of all pairs, and last the offsets. *Shape:* ``(m, n + 1)``."""
         n, surface, rows = fields.shape[-1], SampledSurface(x.numpy(), self.mesh), []
         columns = fields.flatten(1).float().numpy()  # products of float32: half the time
-        for pairs in [*(cloud.places(surface, released) for cloud in frame.clouds), *frame.markers]:
+        for pairs in [*(pairs for cloud in frame.clouds for pairs in cloud.pairs(surface, released)), *frame.markers]:
             off = pairs.places @ surface.vertices - pairs.points
             root = (pairs.weights**0.5 / (1 + (off**2).sum(1) / far**2)).astype(np.float32)
             moved = (pairs.places.astype(np.float32) @ columns).reshape(-1, 3, n)
