@@ -19,7 +19,7 @@ from torch_modal import extras
 from torch_modal.arrays import BoolArray, FloatArray, IntArray
 from torch_modal.geometry import inspect
 from torch_modal.geometry.closest import dot
-from torch_modal.geometry.connectivity import edge_graph, farthest_apart
+from torch_modal.geometry.connectivity import edge_graph
 from torch_modal.geometry.decimation import decimate
 from torch_modal.progress import ProgressReport
 from torch_modal.registration.surface import DUST, MeshSurface, drop_unreferenced, largest_pieces, main_part
@@ -95,8 +95,12 @@ class SpectralShape:
     @cached_property
     def samples(self) -> tuple[IntArray, FloatArray]:
         """Samples far from each other, and the distances to them. *Shape:* ``(m,), (n, m)``."""
-        chosen, _ = farthest_apart(self._graph, np.arange(len(self)), N_SAMPLES)
-        return chosen, self.geodesics_from(chosen)
+        chosen = [int(self.geodesics_from(np.zeros(1, dtype=np.int64)).argmax())]
+        distances = self.geodesics_from(np.array(chosen))
+        while len(chosen) < min(N_SAMPLES, len(self)):
+            chosen.append(int(distances.min(1).argmax()))
+            distances = np.hstack([distances, self.geodesics_from(np.array(chosen[-1:]))])
+        return np.array(chosen), distances
 
     @cached_property
     def tips(self) -> IntArray:
