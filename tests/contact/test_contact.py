@@ -374,15 +374,6 @@ def test_what_contact_needs_is_said_before_any_work(hand: Shapes, monkeypatch: p
             make()
 
 
-def test_counting_finds_what_searching_finds(hand: Shapes) -> None:
-    with torch.no_grad():
-        x = 100 * tm.InBetween(hand.bases, hand.faces)(*hand.keyframes, torch.tensor([0.25, 0.875], dtype=DOUBLE))
-    search = ContactSearch(Mesh.of(hand.faces, x.shape[1]), 100 * hand.keyframes, torch.ones(x.shape[1]), 2)
-    contacts, n_far = search(x, torch.arange(2))
-    assert contacts.shapes.unique().tolist() == [1] and int(n_far[0]) == 0 < int(n_far[1])
-    assert search.count(x).tolist() == n_far.tolist()
-
-
 # ------------------------------------------------------------------------------------------------ steps of each shape
 def test_kernels_and_torch_step_alike(hand: Shapes) -> None:
     pytest.importorskip("warp")

@@ -479,17 +479,3 @@ def test_an_inserted_key_frame_borrows_the_modes_around_it(motion: Shapes) -> No
     for shape, ends, other in zip(found, ((x[1], pinned), (pinned, x[2])), (1, 2), strict=True):
         bases = [motion.bases[1], borrowed] if other == 1 else [borrowed, motion.bases[2]]
         torch.testing.assert_close(shape, tm.InBetween(bases, motion.faces)(*ends, 0.5), rtol=0, atol=1e-9)
-
-
-def test_a_path_scheme_outlasts_an_insert(motion: Shapes) -> None:
-    """One in which every key-frame is a rest."""
-
-    def still(speeds: Tensor, durations: Tensor, cyclic: bool, squared: Squared) -> Tensor:
-        return torch.cat([torch.zeros_like(speeds), torch.zeros_like(speeds[:1])])
-
-    path = Path(motion.bases, motion.faces, smooth=still)
-    keyframes = torch.cat([motion.keyframes[:2], path(motion.keyframes, 1.5)[None], motion.keyframes[2:]])
-    near = path.insert(1.5)(keyframes, times(1.5, 1.5 + 1e-3, 2.0, 2.0 + 1e-3))
-    assert largest(near[1::2] - near[::2]) < 1e-4
-    away = Path(motion.bases, motion.faces).insert(1.5)(keyframes, times(1.5, 1.5 + 1e-3))
-    assert largest(away[1] - away[0]) > 3e-4, "without it, the motion goes on"

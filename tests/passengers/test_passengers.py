@@ -1,7 +1,5 @@
 """Points that follow a shape: rigid motions, the surface, fingers, gradients, dtypes, errors."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
@@ -58,17 +56,6 @@ def test_points_of_the_surface_stay_near_it(bars: Shapes) -> None:
     assert float(off.max()) < 0.1 * float(edges.mean())
     corners = tm.Passengers(x, bars.faces, x)
     torch.testing.assert_close(corners(y), y, rtol=0, atol=1e-12)
-
-
-def test_own_vertices_of_animals(data_dir: Path) -> None:
-    """A vertex follows its own triangles, though the centroids of others may be nearer than those of long ones."""
-    for name in ("frog", "trex", "velociraptor"):
-        with np.load(data_dir / "animals" / f"{name}.npz") as body:
-            frames, faces = (torch.from_numpy(body[key]) for key in ("frames", "faces"))
-        x, y = frames[[0, len(frames) // 2]].double()
-        carried = tm.Passengers(x, faces, x)
-        for shape in (x, y):
-            assert float((carried(shape) - shape).abs().max()) < 1e-9
 
 
 def test_closest_faces_are_exact() -> None:

@@ -178,14 +178,6 @@ def test_near_dots_are_darker_and_hide_far_ones():
         assert image[40, 40] == 0 and 0 < image[20, 60] < 200 and image[60, 60] == 255
 
 
-def test_many_points_and_none_are_drawn():
-    half, pixels = np.array([1.0, 1.0]), np.array([40, 30])
-    many = np.random.default_rng(0).uniform(-2, 2, (300_000, 3))
-    image = drawing.draw_points(many, (0.5, 0, 0), half, pixels)
-    assert image.shape == (30, 40, 3) and (image[..., 1] < 200).mean() > 0.9
-    assert (drawing.draw_points(np.zeros((0, 3)), (0.5, 0, 0), half, pixels) == 255).all()
-
-
 def test_automatic_camera():
     """Which way is up, and from where a flat shape is seen, in three worlds."""
     plate = np.asarray(trimesh.creation.box((4, 6, 0.5)).vertices)  # stands in a Y-up world, faces Z
