@@ -111,14 +111,6 @@ def test_single_precision_in_any_units(bars: Shapes, kind: str, scale: float) ->
         torch.testing.assert_close(one, other, rtol=0, atol=1e-4)
 
 
-def test_without_a_generator_the_global_one_is_used(bars: Shapes, space: tm.ShapeSpace) -> None:
-    augment = tm.RandomRigidMotion(p=1.0)
-    torch.manual_seed(5)
-    first = augment(bars.keyframes)
-    torch.manual_seed(5)
-    assert torch.equal(augment(bars.keyframes), first)
-
-
 @pytest.mark.parametrize(
     ("make", "message"),
     [
@@ -333,14 +325,6 @@ def test_strain_is_bounded_and_the_bound_reached(bars: Shapes, space: tm.ShapeSp
         largest = space.strain(y, x.to(dtype)).abs().amax(1)
         assert float(largest.max()) <= bound
         assert float(largest.min()) > 0.75 * bound
-
-
-def test_key_frames_are_copies(bars: Shapes, space: tm.ShapeSpace) -> None:
-    like = torch.empty(0, dtype=torch.float32)
-    given = space.keyframes(like)
-    assert given.dtype == torch.float32
-    given.zero_()
-    assert torch.equal(space.keyframes(like), bars.keyframes.float())
 
 
 def test_large_draws_bend(bars: Shapes, space: tm.ShapeSpace) -> None:

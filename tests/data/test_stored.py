@@ -1,6 +1,5 @@
 """Key-frame sets on disk: whole or absent, mapped into memory, the same after reading."""
 
-import pickle
 from pathlib import Path
 
 import pytest
@@ -50,7 +49,7 @@ def test_times_of_a_motion(small_bars: Shapes, folder: Path) -> None:
     assert (StoredSet(folder).times, StoredSet(folder).cyclic) == (None, False)
     for times, cyclic in (((0.0, 0.1, 2.5), False), ((-1.0, 0.1, 2.5, 2.75), True)):
         write_set(folder, *small_bars, NAMES, times=torch.tensor(times, dtype=torch.float64), cyclic=cyclic)
-        found = pickle.loads(pickle.dumps(StoredSet(folder)))
+        found = StoredSet(folder)
         assert (found.times, found.cyclic) == (times, cyclic)
         space = ShapeSpace.open(found)
         assert space.motion is not None and space.motion.tolist() == list(times) and space.cyclic == cyclic
@@ -77,16 +76,6 @@ def test_writing_into_a_mapped_tensor_leaves_the_file(small_bars: Shapes, folder
     StoredSet(folder).bases[0].modes.zero_()
     assert torch.equal(StoredSet(folder).keyframes, small_bars.keyframes)
     assert_equal_bases(StoredSet(folder).bases[0], small_bars.bases[0])
-
-
-def test_pickle_carries_the_path_alone(folder: Path) -> None:
-    found = StoredSet(folder)
-    expected = found.bases[0].modes
-    sent = pickle.dumps(found)
-    assert len(sent) < 1000
-    again = pickle.loads(sent)
-    assert again.names == NAMES
-    assert torch.equal(again.bases[0].modes, expected)
 
 
 def test_replaces_a_set_and_nothing_else(small_bars: Shapes, folder: Path) -> None:

@@ -105,7 +105,7 @@ class TestLatentElasticity:
         def own(z: Tensor) -> Tensor:
             return Backward.apply(decoder(z))  # type: ignore[no-any-return]
 
-        with pytest.raises((NotImplementedError, RuntimeError), match="step="):
+        with pytest.raises((NotImplementedError, RuntimeError)):
             tm.losses.LatentElasticity(bars.faces)(own, z)
         found = tm.losses.LatentElasticity(bars.faces, step=1e-4)(own, z)
         torch.testing.assert_close(found, tm.losses.LatentElasticity(bars.faces)(decoder, z), rtol=1e-5, atol=0)

@@ -12,7 +12,7 @@ import torch_modal as tm
 from torch_modal.data.samples import load_sample
 from torch_modal.geometry.rigid import best_fit
 from torch_modal.geometry.rotations import exp
-from torch_modal.statistics.fit import fit, point_springs
+from torch_modal.statistics.fit import fit
 from torch_modal.statistics.local_weights import LocalWeights, Observations
 from torch_modal.statistics.variation import MOST_BELOW_ZERO, LocalMixtures, Patches, Variation, bound_weights
 
@@ -236,18 +236,6 @@ def test_what_points_leave_open_is_as_in_the_likely_key_frame(space: tm.ShapeSpa
     picked = bars.faces[0]
     found = space.fit(bars.keyframes[near][picked], picked, near=near)
     assert far(found.shape, bars.keyframes[near]) < 0.02
-
-
-def test_pulls_are_the_derivatives_of_their_energy(generator: torch.Generator) -> None:
-    x, points = (torch.randn(n, 3, generator=generator, dtype=DOUBLE) for n in (6, 4))
-    to = Observations(points, torch.tensor([1, 4, 4, 0]), torch.tensor([1.0, 0.5, 2.0, 1.0], dtype=DOUBLE))
-    pulls = point_springs(to, 3.0, len(x))
-    at = pulls.at(x[None])
-    torch.testing.assert_close(at.value, pulls.value(x[None]))
-    slope = torch.func.grad(lambda y: pulls.value(y).sum())
-    torch.testing.assert_close(at.gradient, slope(x[None]))
-    field = torch.randn(1, 6, 3, generator=generator, dtype=DOUBLE)
-    torch.testing.assert_close(at.product(field), torch.func.jvp(slope, (x[None],), (field,))[1])
 
 
 def test_weights_far_below_zero_come_nearer_to_even_ones() -> None:

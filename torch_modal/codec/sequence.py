@@ -18,7 +18,7 @@ from torch_modal.keyframes.check import check_keyframes
 from torch_modal.modes.extract import extract_modes
 from torch_modal.motion.decoder import ModalDecoder
 from torch_modal.progress import Progress, ProgressReport
-from torch_modal.times import Times, check_times, locate_times
+from torch_modal.times import Times, locate_times
 
 FORMAT = "torch_modal.sequence"
 VERSION = "3"
@@ -46,7 +46,7 @@ class ModalSequence:
         decoder: Maps amplitudes and times to shapes, with gradients.
 
     Raises:
-        ValueError: The parts do not fit each other.
+        ValueError: Key-frames, their times or modes do not fit each other.
     """
 
     keyframes: Tensor
@@ -60,14 +60,7 @@ class ModalSequence:
     decoder: ModalDecoder = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        first = self.keyframes[0] if len(self.keyframes) else self.keyframes
-        decoder = ModalDecoder(self.keyframes, self.faces, self.keyframe_times, first, self.modes)
-        t, k = len(self.times), decoder.n_modes
-        shapes = {name: tuple(getattr(self, name).shape) for name in ("times", "amplitudes", "motions", "errors")}
-        wanted = {"times": (t,), "amplitudes": (t, k), "motions": (t, 6), "errors": (t,)}
-        if not t or shapes != wanted:
-            raise ValueError(f"a motion of {t} frames and {k} modes needs the shapes {wanted}; got {shapes}")
-        check_times(self.times, t, of="frame")
+        decoder = ModalDecoder(self.keyframes, self.faces, self.keyframe_times, self.keyframes[0], self.modes)
         object.__setattr__(self, "decoder", decoder)
 
     @property
@@ -169,10 +162,7 @@ class ModalSequence:
             ValueError: It is damaged, holds something else, or has another version.
         """
         tensors = TensorFile(Path(path), FORMAT, VERSION, STORED).tensors()
-        try:
-            return cls(**{name: tensors[name] for name in STORED})
-        except ValueError as error:
-            raise ValueError(f"{path}: {error}") from error
+        return cls(**{name: tensors[name] for name in STORED})
 
 
 def encode(

@@ -8,9 +8,10 @@ import torch
 from torch import Tensor, nn
 
 from torch_modal.autograd import disable_compile, full_precision, require_numbers
-from torch_modal.data.shape_batch import ShapeBatch, check_labels, check_shapes
+from torch_modal.data.shape_batch import ShapeBatch, check_labels
 from torch_modal.data.space import ShapeSpace
 from torch_modal.geometry.vectors import vertex_normals
+from torch_modal.keyframes.arrays import check_tensor
 
 DATA_KEYS = ("shapes", "normals", "vertex_labels", "shape_labels")
 
@@ -189,8 +190,9 @@ class ShapeAugmentation(nn.Module):
         if len(inputs) != len(self.data_keys):
             raise ValueError(f"the data keys are {self.data_keys}; got {len(inputs)} arguments")
         named: dict[str, Any] = dict(zip(self.data_keys, inputs, strict=True))
-        check_shapes(named["shapes"], space)
-        single = named["shapes"].dim() == 2
+        single = isinstance(named["shapes"], Tensor) and named["shapes"].dim() == 2
+        size = "V" if space is None else space.n_vertices, 3
+        check_tensor("shapes", named["shapes"], *(() if single else ("B",)), *size)
         if single:
             named = {name: None if value is None else value[None] for name, value in named.items()}
         check_labels(named["shapes"].shape[:2], named)

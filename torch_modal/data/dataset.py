@@ -1,5 +1,6 @@
 """Random shapes from a folder of stored key-frame sets, for PyTorch's data loaders."""
 
+import math
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
@@ -169,21 +170,18 @@ class SetBatchSampler(Sampler[list[int]]):
         dataset: The dataset.
         batch_size: Samples in a batch; the last of a set may be smaller.
         shuffle: Whether samples of a set, and batches, come in random order.
-        drop_last: Whether smaller batches are left out.
     """
 
-    def __init__(self, dataset: ShapeDataset, batch_size: int, shuffle: bool = True, drop_last: bool = False) -> None:
+    def __init__(self, dataset: ShapeDataset, batch_size: int, shuffle: bool = True) -> None:
         if batch_size < 1:
             raise ValueError(f"batch_size is 1 or more, got {batch_size}")
         self.dataset = dataset
         self.batch_size = batch_size
         self.shuffle = shuffle
-        self.drop_last = drop_last
 
     def __len__(self) -> int:
         """Number of batches in an epoch."""
-        whole, rest = divmod(self.dataset.samples_per_set, self.batch_size)
-        return len(self.dataset.sets) * (whole + (rest > 0 and not self.drop_last))
+        return len(self.dataset.sets) * math.ceil(self.dataset.samples_per_set / self.batch_size)
 
     def __iter__(self) -> Iterator[list[int]]:
         size = self.dataset.samples_per_set
@@ -191,7 +189,7 @@ class SetBatchSampler(Sampler[list[int]]):
         batches: list[list[int]] = []
         for number in range(len(self.dataset.sets)):
             indices = number * size + (random.permutation(size) if self.shuffle else np.arange(size))
-            batches += BatchSampler(indices.tolist(), self.batch_size, self.drop_last)
+            batches += BatchSampler(indices.tolist(), self.batch_size, drop_last=False)
         order = random.permutation(len(batches)) if self.shuffle else np.arange(len(batches))
         for place in order:
             yield batches[place]

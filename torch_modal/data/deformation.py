@@ -81,9 +81,9 @@ class RandomModalDeformation(ShapeAugmentation):
         with torch.no_grad():
             largest = edge_strains(displacement, keyframe, reconstruction.edges).abs().amax(1)
         scale, shapes, rows = torch.ones_like(largest), x, torch.arange(len(x), device=x.device)
-        for trial in range(_SCALING_ROUNDS):
+        for _ in range(_SCALING_ROUNDS):
             factor = _WITHIN_BOUND * self.max_strain / largest.clamp_min(torch.finfo(x.dtype).tiny)
-            scale = scale * (factor.clamp_max(1) if not trial else factor.clamp_min(_SMALLEST_FACTOR))
+            scale = scale * factor.clamp(_SMALLEST_FACTOR, 1)
             deformed = deform(x[rows], scale[:, None] * displacement[:, rows], keyframe, reconstruction)
             with torch.no_grad():
                 largest = space.strain(deformed, x[rows]).abs().amax(1).nan_to_num(torch.inf)

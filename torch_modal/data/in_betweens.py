@@ -13,7 +13,6 @@ from torch import Tensor
 
 from torch_modal.autograd import Recent, is_transformed
 from torch_modal.elastic.implicit import ConvergenceWarning
-from torch_modal.elastic.minimise import Status
 from torch_modal.inbetween.results import InBetweenResult
 from torch_modal.inbetween.settings import Settings
 from torch_modal.io.cache import CACHE_VERSION, ContentError, content_digest
@@ -227,14 +226,12 @@ def _check_converged(result: InBetweenResult, i: int, j: int) -> Tensor:
             f"there is no in-between of some shapes near the key-frames {i} and {j}: one is not finite, has no size, "
             "or is the mirror image of the other"
         )
-    status = result.solution.status
-    missed = ~result.solution.usable
-    if bool(missed.any()):
-        names = ", ".join(sorted({Status(value).name for value in status[missed].tolist()}))
+    usable = result.solution.usable
+    if not bool(usable.all()):
         warnings.warn(
-            f"{int(missed.sum())} of {missed.numel()} in-betweens near the key-frames {i} and {j} did not converge "
-            f"({names}) and are only the best shapes found: give the space a solver of more max_steps or a larger "
-            "tolerance, or key-frames that are nearer to each other",
+            f"{int((~usable).sum())} of {usable.numel()} in-betweens near the key-frames {i} and {j} did not converge "
+            "and are only the best shapes found: give the space a solver of more max_steps or a larger tolerance, or "
+            "key-frames that are nearer to each other",
             ConvergenceWarning,
             stacklevel=3,
         )

@@ -1,13 +1,12 @@
 """Shapes of one connectivity with their nearest key-frames and labels."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from torch_modal.data.space import ShapeSpace
-from torch_modal.keyframes.arrays import check_tensor
 
 
 class ShapeBatch(NamedTuple):
@@ -78,12 +77,6 @@ class ShapeBatch(NamedTuple):
             last = size - 1  # the key-frames at both ends have one neighbour
             return others.rows(places % size if space.cyclic else last - (last - places.abs()).abs())
         return others.rows((indices + (draw * (size - 1)).long().clamp(0, size - 2) + 1) % size)
-
-
-def check_shapes(shapes: Any, space: ShapeSpace | None) -> None:
-    """Raise a ValueError unless given shapes are a batch of shapes of a space, or one of them."""
-    lead = () if isinstance(shapes, Tensor) and shapes.dim() == 2 else ("B",)
-    check_tensor("shapes", shapes, *lead, "V" if space is None else space.n_vertices, 3)
 
 
 def check_labels(shape: Sequence[int], labels: Mapping[str, Tensor | None]) -> None:

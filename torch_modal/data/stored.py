@@ -9,7 +9,6 @@ import os
 from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
 
 from torch import Tensor
 
@@ -29,8 +28,7 @@ _BASIS_FIELDS = tuple(field.name for field in fields(ModalBasis))
 class StoredSet:
     """A key-frame set on disk, mapped into memory and compared with its digests.
 
-    The mapping is private: the system can drop pages, and writing into a tensor does not change the file. Pickling
-    keeps the path alone, so that worker processes, forked or spawned, can receive a set.
+    The mapping is private: the system can drop pages, and writing into a tensor does not change the file.
 
     Args:
         folder: The folder.
@@ -73,9 +71,6 @@ class StoredSet:
     def cyclic(self) -> bool:
         """True if the key-frames are a motion whose last leads on to the first."""
         return self.times is not None and len(self.times) == len(self) + 1
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return StoredSet, (self.folder,)
 
 
 def read_note(folder: Path) -> str:
@@ -142,12 +137,8 @@ def find_sets(root: str | os.PathLike[str]) -> list[Path]:
     root = Path(root)
     if not root.is_dir():
         raise FileNotFoundError(f"there is no folder {root}")
-    folders = []
-    for place, below, files in os.walk(root):
-        if SET_FILE in files:
-            folders.append(Path(place))
-        below[:] = [name for name in below if not name.startswith(".")]
-    return sorted(folders)
+    folders = [file.parent for file in root.rglob(SET_FILE)]
+    return sorted(path for path in folders if not any(name[0] == "." for name in path.relative_to(root).parts))
 
 
 def motion_times(times: Times, n_keyframes: int, cyclic: bool) -> Tensor | None:

@@ -67,10 +67,10 @@ def fit(
     points = torch.as_tensor(points)
     if is_transformed(points):
         raise RuntimeError("fits have no forward mode, and no transforms of torch.func: take torch.autograd.grad")
-    k, v = variation.shapes.shape[:2]
     noise = 0.0 if noise is None else float(noise)
     if not 0 <= noise < torch.inf:
         raise ValueError(f"noise is a standard deviation, zero or more, in the units of the points; got {noise}")
+    k, v = variation.shapes.shape[:2]
     about, every = _check_near(near, k), _check_points(points, vertices, weights, v)
     lead, n, fits = every.points.shape[:-2], len(every.vertices), []
     for one, counts in zip(every.points.reshape(-1, n, 3), every.weights.reshape(-1, n), strict=True):

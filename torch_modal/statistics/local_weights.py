@@ -68,48 +68,43 @@ class LocalWeights:
 
     def cost(self, factors: Tensor, to: Observations, noise: float) -> Tensor:
         """*Shape:* ``(K n,) -> ()``."""
-        missed = to.distances_after_fit(self.shape(factors)).square()
-        return (to.weights * missed).sum() / noise**2 + factors.square().sum()
+        return self.residuals(factors, to, noise).square().sum()
 
     def solve(self, robust: bool) -> tuple[Tensor, Observations]:
         """Factors of least cost as a function of the points, ``(K n,)``, and the observations with their weights."""
-        factors, trust = self._minimise(robust)
-        to = self.observations._replace(weights=trust)
+        to, factors = self.to, self.about.new_zeros(len(self.about) * len(self.variation.fields))
+        with torch.no_grad():
+            for noise in COARSE_NOISE:
+                factors = self._descend(factors, to, noise * self.noise, FEW_STEPS)
+            for _ in range(ROBUST_ROUNDS if robust else 0):
+                # Observations that are missed by more than most have less weight (Geman and McClure).
+                missed = self.to.weights.sqrt() * to.distances_after_fit(self.shape(factors))
+                usual = (3 * missed.median()).clamp_min(self.noise)
+                to = to._replace(weights=self.to.weights / (1 + (missed / usual) ** 2) ** 2)
+                factors = self._descend(factors, to, self.noise, FEW_STEPS)
+            factors = self._descend(factors, to, self.noise, MOST_STEPS)
+            for _ in range(LAST_STEPS):
+                slope = torch.func.grad(self.cost)(factors, to, self.noise)
+                moved = factors - self.newton(factors, to, 0.5 * slope)
+                if not self.cost(moved, to, self.noise) <= self.cost(factors, to, self.noise):  # an indefinite Hessian
+                    break
+                factors = moved
+        to = to._replace(points=self.observations.points)
         if torch.is_grad_enabled() and to.points.requires_grad:
             factors = _FactorsOfPoints.apply(factors, to.points, self, to)
         return factors, to
 
-    @torch.no_grad()
-    def _minimise(self, robust: bool) -> tuple[Tensor, Tensor]:
-        to, factors = self.to, self.about.new_zeros(len(self.about) * len(self.variation.fields))
-
-        def descend(noise: float, n_steps: int) -> Tensor:
-            solution = least_squares(
-                lambda z: self.residuals(torch.from_numpy(z), to, noise).numpy(),
-                factors.numpy(),
-                lambda z: self.slopes(torch.from_numpy(z), to, noise).numpy(),
-                method="lm",
-                ftol=TOLERANCE,
-                max_nfev=n_steps,
-            )
-            return torch.from_numpy(solution.x)
-
-        for noise in COARSE_NOISE:
-            factors = descend(noise * self.noise, FEW_STEPS)
-        for _ in range(ROBUST_ROUNDS if robust else 0):
-            # Observations that are missed by more than most have less weight (Geman and McClure).
-            missed = self.to.weights.sqrt() * to.distances_after_fit(self.shape(factors))
-            usual = (3 * missed.median()).clamp_min(self.noise)
-            to = to._replace(weights=self.to.weights / (1 + (missed / usual) ** 2) ** 2)
-            factors = descend(self.noise, FEW_STEPS)
-        factors = descend(self.noise, MOST_STEPS)
-        for _ in range(LAST_STEPS):
-            slope = torch.func.grad(self.cost)(factors, to, self.noise)
-            tried = factors - self.newton(factors, to, 0.5 * slope)
-            if not self.cost(tried, to, self.noise) <= self.cost(factors, to, self.noise):  # an indefinite Hessian
-                break
-            factors = tried
-        return factors, to.weights
+    def _descend(self, factors: Tensor, to: Observations, noise: float, n_steps: int) -> Tensor:
+        """Take steps of Levenberg and Marquardt. *Shape:* ``(K n,) -> (K n,)``."""
+        solution = least_squares(
+            lambda z: self.residuals(torch.from_numpy(z), to, noise).numpy(),
+            factors.numpy(),
+            lambda z: self.slopes(torch.from_numpy(z), to, noise).numpy(),
+            method="lm",
+            ftol=TOLERANCE,
+            max_nfev=n_steps,
+        )
+        return torch.from_numpy(solution.x)
 
     def residuals(self, factors: Tensor, to: Observations, noise: float) -> Tensor:
         """Numbers whose squares add up to the cost. *Shape:* ``(K n,) -> (3m + K n,)``."""
