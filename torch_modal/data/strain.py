@@ -26,10 +26,10 @@ def mode_scales(basis: ModalBasis, faces: Tensor) -> Tensor:
     modes, edges = basis.modes.double() * scales[:, None, None], torch.tensor(mesh.edges)
     strains = edge_strains(modes.movedim(-1, 0).contiguous(), x, edges)
     lengths = (x[edges[:, 1]] - x[edges[:, 0]]).square().sum(-1)
-    expected = _expected_strain(strains, torch.ones_like(lengths))
+    expected = _rms_strain(strains, torch.ones_like(lengths))
     bending, areas = _bending_strains(modes, x, mesh)
-    by_bending = _expected_strain(bending, areas)
-    if by_bending > _expected_strain(strains, lengths):  # a sheet, which bends without a change of length
+    by_bending = _rms_strain(bending, areas)
+    if by_bending > _rms_strain(strains, lengths):  # a sheet, which bends without a change of length
         expected = by_bending
     return scales / expected.clamp_min(torch.finfo(torch.float64).tiny)
 
@@ -42,7 +42,7 @@ def edge_strains(displacement: Tensor, x: Tensor, edges: Tensor) -> Tensor:
     return along / side.square().sum(0).clamp_min(torch.finfo(side.dtype).tiny)
 
 
-def _expected_strain(strains: Tensor, weights: Tensor) -> Tensor:
+def _rms_strain(strains: Tensor, weights: Tensor) -> Tensor:
     """Expected root mean square for standard normal amplitudes. *Shape:* ``(k, n), (n,) -> ()``."""
     return (strains.square() @ weights / weights.sum()).sum().sqrt()
 
