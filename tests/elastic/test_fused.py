@@ -4,6 +4,7 @@ import importlib.util
 import subprocess
 import sys
 import warnings
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -491,28 +492,26 @@ def test_what_a_kernel_would_read_wrongly_is_refused() -> None:
 
 
 class TestBackend:
+    @pytest.fixture(autouse=True)
+    def tried_anew(self) -> Iterator[None]:
+        backend.WarpBackend.works.cache_clear()
+        yield
+        backend.WarpBackend.works.cache_clear()
+
     def test_not_installed(self, monkeypatch: pytest.MonkeyPatch, small_bars: Shapes) -> None:
         there = importlib.util.find_spec
         monkeypatch.setattr("importlib.util.find_spec", lambda name: None if name == "warp" else there(name))
-        backend.WarpBackend.works.cache_clear()
-        try:
-            assert type(tm.InBetween(small_bars.bases[:2], small_bars.faces).core.fine) is FineEnergy
-            with pytest.raises(MissingPackageError, match="pip install warp-lang"):
-                tm.InBetween(small_bars.bases[:2], small_bars.faces, solver=tm.Solver(backend="warp"))
-        finally:
-            backend.WarpBackend.works.cache_clear()
+        assert type(tm.InBetween(small_bars.bases[:2], small_bars.faces).core.fine) is FineEnergy
+        with pytest.raises(MissingPackageError, match="pip install warp-lang"):
+            tm.InBetween(small_bars.bases[:2], small_bars.faces, solver=tm.Solver(backend="warp"))
 
     def test_not_usable(self, monkeypatch: pytest.MonkeyPatch) -> None:
         def broken(name: str) -> None:
             raise OSError("the cache folder is not writable")
 
         monkeypatch.setattr(backend, "kernels", broken)
-        backend.WarpBackend.works.cache_clear()
-        try:
-            with pytest.warns(UserWarning, match="the cache folder is not writable"):
-                assert type(choose("auto")) is TorchBackend
-        finally:
-            backend.WarpBackend.works.cache_clear()
+        with pytest.warns(UserWarning, match="the cache folder is not writable"):
+            assert type(choose("auto")) is TorchBackend
 
     def test_one_module_is_loaded_without_the_others_and_without_a_word(self) -> None:
         code = (

@@ -16,16 +16,14 @@ from torch import Tensor
 import torch_modal as tm
 from torch_modal.elastic.bend import Bend
 from torch_modal.elastic.energy import Energy, Reference, RestShapes
-from torch_modal.elastic.kernel_energy import KernelEnergy, _MergeRests
+from torch_modal.elastic.kernel_energy import KernelEnergy
 from torch_modal.elastic.kernel_steps import _Relaxation
 from torch_modal.elastic.modal import KernelModalEnergy, _GradientAndValue
-from torch_modal.elastic.procrustes import mean_pose
 from torch_modal.elastic.rotations import WarpRotations
 from torch_modal.elastic.stretch import Stretch
 from torch_modal.elastic.term import Mesh, Term
 from torch_modal.elastic.volume import Volume
 from torch_modal.geometry.connectivity import Connectivity
-from torch_modal.geometry.local_rotations import Trajectory
 from torch_modal.geometry.poisson import Poisson
 from torch_modal.geometry.rotations import exp
 
@@ -96,43 +94,16 @@ def test_gradients_of_what_is_degenerate_are_finite(small_bars: Shapes, kind: st
         assert gradients(run, [shapes, torch.tensor([[0.7, 0.3]], dtype=DOUBLE)])[0][0].isnan().any()
 
 
-def test_on_a_trajectory(small_bars: Shapes) -> None:
-    rotations = WarpRotations(Connectivity(small_bars.faces.numpy()), small_bars.keyframes[:2])
-    n, which = len(small_bars.faces), torch.tensor([0, 1, 1])
-    frame = exp(noise(2, n, 3)).movedim((2, 3), (0, 1))
-    size = torch.tensor([1.0, 0.0, 1.0], dtype=DOUBLE)[:, None, None] + 0.2 * noise(3, 2, n)
-    given = [*frame, size, *(0.3 * noise(6, 2, n, seed=seed) for seed in (1, 2, 3)), noise(3).sigmoid()]
-
-    def run(*given: Tensor) -> Tensor:
-        return rotations.edges_along(Trajectory(*given[:-1]), which, given[-1])
-
-    assert_differences(run, given)
-
-
-@pytest.mark.parametrize("index", [0, 1], ids=["turns", "pose"])
-def test_gradients_of_mean_poses(index: int) -> None:
-    x = noise(1, 20, 3) * torch.tensor([3.0, 2.0, 1.0]) + 0.3 * noise(3, 2, 20, 3, seed=1)
-    x = x @ exp(noise(3, 2, 3, seed=2)).mT
-    t = torch.tensor([0.0, 0.3, 1.0], dtype=DOUBLE)
-    given = [x[0, 0].mT @ x, x[:, :, None].mT @ x[:, None], torch.stack([1 - t, t], 1)]
-    assert_differences(lambda *given: mean_pose(*given)[index], given)
-
-
 class Elastic:
-    """Terms between two rest shapes, away from both, with a needle where steps start."""
+    """Terms between two rest shapes, away from both."""
 
     def __init__(self, bars: Shapes, terms: list[Term]) -> None:
-        self.mesh = Mesh.of(bars.faces, bars.keyframes.shape[1])
-        self.energy = Energy(self.mesh, terms)
-        self.kernels = KernelEnergy.of(self.energy, self.mesh)
+        mesh = Mesh.of(bars.faces, bars.keyframes.shape[1])
+        self.kernels = KernelEnergy.of(Energy(mesh, terms), mesh)
         x = 40 * bars.keyframes
         self.shapes = x[None, :2] + noise(2, 1, *x.shape[1:])
         self.weights = torch.tensor([[0.4, 0.6], [0.7, 0.3]], dtype=DOUBLE)
         self.stiffness = [3.0 + noise(2, 1, seed=i).abs() for i in range(len(terms))]
-        self.start = self.shapes.mean(1) + 0.3 * noise(2, *x.shape[1:], seed=3)
-        i, j, *tips = self.mesh.hinges[0].tolist()
-        middle = 0.5 * (self.start[:, [i]] + self.start[:, [j]])
-        self.start[:, tips] = middle + 0.02 * (self.start[:, tips] - middle)
 
     def reference(self) -> Reference:
         return self.kernels.reference(RestShapes(self.shapes, self.weights, self.stiffness))
@@ -146,18 +117,8 @@ def elastic(request: pytest.FixtureRequest, small_bars: Shapes) -> Elastic:
     return Elastic(bars, [Stretch(), Bend(), Volume()])
 
 
-@pytest.mark.parametrize("relative", [False, True])
-def test_merged_rest_shapes(elastic: Elastic, relative: bool) -> None:
-    for i in elastic.kernels.weighed:
-        operation, given = _MergeRests(elastic.kernels, [i], relative), [elastic.shapes, elastic.weights]
-        start = [] if elastic.kernels.parts[i].functions.fullness is None else [elastic.start]
-        given += [elastic.stiffness[i], *start]
-        sizes = operation.by_torch(*given)[0].abs().amax((0, 1))
-        assert_differences(lambda *x, own=operation, sizes=sizes: own(*x)[0] / sizes, given)
-
-
 def test_gradients_in_amplitudes(elastic: Elastic) -> None:
-    modal = KernelModalEnergy(elastic.kernels, noise(4, *elastic.start.shape[1:]))
+    modal = KernelModalEnergy(elastic.kernels, noise(4, *elastic.shapes.shape[2:]))
     given = [0.1 * noise(2, 4), elastic.shapes.mean(1), *elastic.reference().records]
     assert_differences(lambda *x: _GradientAndValue(modal)(*x)[0], given)
     placement, a, direction, h = modal.place(given[1], elastic.reference()), given[0], noise(2, 4, seed=5), 1e-4

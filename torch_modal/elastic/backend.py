@@ -72,7 +72,12 @@ class WarpBackend(TorchBackend):
         MissingPackageError: Warp is not installed.
     """
 
-    mean_pose, quasi_newton = staticmethod(mean_pose_by_kernel), staticmethod(update)
+    load = staticmethod(load_kernels)
+    mean_pose = staticmethod(mean_pose_by_kernel)
+    rotations = staticmethod(WarpRotations)
+    fine_energy = staticmethod(KernelFineEnergy)
+    distortion = staticmethod(KernelDistortion)
+    quasi_newton = staticmethod(update)
 
     def __init__(self) -> None:
         if importlib.util.find_spec("warp") is None:
@@ -95,28 +100,12 @@ class WarpBackend(TorchBackend):
             return False
         return True
 
-    def load(self) -> None:
-        """Load the kernels of in-betweens."""
-        load_kernels()
-
-    def rotations(self, mesh: Connectivity, references: Tensor) -> WarpRotations:
-        """Overrides the base class."""
-        return WarpRotations(mesh, references)
-
     def modal_energy(self, energy: Energy, mesh: Mesh, columns: Tensor) -> ModalEnergy:
         """Overrides the base class."""
         by_kernel = KernelEnergy.of(energy, mesh)
         if by_kernel is None or not by_kernel.exact:
             return super().modal_energy(energy, mesh, columns)
         return KernelModalEnergy(by_kernel, columns)
-
-    def fine_energy(self, mesh: Mesh, terms: Sequence[Term]) -> FineEnergy:
-        """Overrides the base class."""
-        return KernelFineEnergy(mesh, terms)
-
-    def distortion(self, mesh: Mesh, further: Energy | None) -> Distortion:
-        """Overrides the base class."""
-        return KernelDistortion(mesh, further)
 
     def crossings(self, mesh: Connectivity, shape: FloatArray) -> Callable[[FloatArray], IntArray]:
         """Overrides the base class."""
