@@ -285,11 +285,6 @@ class KernelEnergy(nn.Module):
         energy = torch.addcmul(energy, moment, off, value=0.5)
         return KernelPoint(energy, gradient, diagonal, factors, normal, moment, stiffness)
 
-    def value_and_gradient(self, x: Tensor, to: Reference) -> tuple[Tensor, Tensor]:
-        """The energy but for its constant, and its gradient. *Shape:* ``(B, V, 3) -> (B,), (B, V, 3)``."""
-        at = self.at(x, to, 1)
-        return at.value, at.gradient.addcmul_(at.moment[:, None, None], at.normal)
-
     def product(
         self, factors: Sequence[Any], dim: tuple[int, int], fields: Tensor, start: int, out: Tensor, out_start: int,
         scalars: Tensor | None = None, first: int = 0,

@@ -108,8 +108,8 @@ class _RightHandSide(Operation):
 
     def _stiffness(self) -> Tensor:
         """Stiffnesses of the sides of each triangle: its parts of the stiffnesses of edges. *Shape:* ``(F, 3)``."""
-        weights = self.poisson.weights.double()[self.rotations.triangle_sides.flatten()]
-        return self.rotations.shares.double() * weights
+        sides = self.rotations.triangle_sides.flatten()
+        return self.rotations.shares.double() * self.poisson.weights.double().index_select(0, sides)
 
 
 @dataclass(frozen=True, eq=False)

@@ -65,16 +65,11 @@ def pierces(p: vec3, q: vec3, r: vec3, a: vec3, b: vec3, c: vec3) -> bool:
     p_height = wp.dot(p - a, normal)
     q_height = wp.dot(q - a, normal)
     r_height = wp.dot(r - a, normal)
-    lowest = wp.min(p_height, wp.min(q_height, r_height))
-    highest = wp.max(p_height, wp.max(q_height, r_height))
-    result = lowest < margin and highest > -margin
-    if result:
-        result = (
-            through(p, q, p_height, q_height, margin, a, b, c)
-            or through(q, r, q_height, r_height, margin, a, b, c)
-            or through(r, p, r_height, p_height, margin, a, b, c)
-        )
-    return result
+    return (
+        through(p, q, p_height, q_height, margin, a, b, c)
+        or through(q, r, q_height, r_height, margin, a, b, c)
+        or through(r, p, r_height, p_height, margin, a, b, c)
+    )
 
 
 @wp.func

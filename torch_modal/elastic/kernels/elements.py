@@ -150,20 +150,7 @@ def _kernel(f: KernelFunctions, module: "wp.Module") -> Callable[[Callable[..., 
 def _rider(f: KernelFunctions | None) -> SimpleNamespace:
     """Functions of a term of edges that rides on one of larger elements, on their first edge vectors; or of none."""
     if f is None:
-
-        @wp.func
-        def energy(e: vec3, rests: wp.array[real], at: int):
-            return real(0.0)
-
-        @wp.func
-        def linearise(e: vec3, rests: wp.array[real], at: int, factors: wp.array[real], to: int):
-            return real(0.0), vec3(), symmetric()
-
-        @wp.func
-        def product(factors: wp.array[real], at: int, e: vec3):
-            return vec3(), real(0.0)
-
-        return SimpleNamespace(record=real, Factors=real, energy=energy, linearise=linearise, product=product)
+        return SimpleNamespace(record=real, Factors=real)
     c, potential = _common(f), f.potential
     record, Factors = potential.record, c.Factors
 
@@ -172,14 +159,14 @@ def _rider(f: KernelFunctions | None) -> SimpleNamespace:
         return potential.energy(f.measure(wp.matrix_from_rows(e)), rests[at])
 
     @wp.func
-    def linearise(e: vec3, rests: wp.array[record], at: int, factors: wp.array[Factors], to: int):
+    def linearise(e: vec3, rests: wp.array[record], at: int, factors: wp.array[Factors]):
         m, g = f.linearise(wp.matrix_from_rows(e))
         rest = rests[at]
         slope = potential.slope(m, rest)
         square = symmetric()
         if factors:
             along, across = c.stiffness(m, slope, real(2.0) * rest[0])
-            factors[to] = c.factors_of(g, along, across)
+            factors[at] = c.factors_of(g, along, across)
             square = block(along, g[0], across)
         return potential.energy(m, rest), slope * g[0], square
 
@@ -198,7 +185,7 @@ def convex(f: KernelFunctions, rider: KernelFunctions | None) -> SimpleNamespace
     Where both read and write the same vertices, one pass takes two thirds of the time of two. The elements are then
     those of the rider; ``own`` has the number of the term's element, or -1 where there is none.
     """
-    c, potential, other, n = _common(f), f.potential, _rider(rider), f.n
+    c, potential, other, n, rides = _common(f), f.potential, _rider(rider), f.n, rider is not None
     vectors, corners, edge_vectors, add = c.vectors, c.corners, c.edge_vectors, c.add
     Factors, record = c.Factors, potential.record
     module = _module(f, "convex" if rider is None else f"convex.{rider.name}")
@@ -225,10 +212,13 @@ def convex(f: KernelFunctions, rider: KernelFunctions | None) -> SimpleNamespace
             if own:
                 at = own[place(k, 0)]
             e = edge_vectors(x, v, q)
+            edge = place(s * elements.shape[0], k)
             if gradient:
-                energy, ridden, square = other.linearise(
-                    e[0], others, place(s * elements.shape[0], k), other_factors, place(s * elements.shape[0], k)
-                )
+                energy = real(0.0)
+                ridden = vec3()
+                square = symmetric()
+                if wp.static(rides):
+                    energy, ridden, square = other.linearise(e[0], others, edge, other_factors)
                 summed += energy
                 received = vectors()
                 g = vectors()
@@ -253,7 +243,8 @@ def convex(f: KernelFunctions, rider: KernelFunctions | None) -> SimpleNamespace
                         wp.atomic_add(diagonal, place(v, q[j + 1]), block(along, g[j], across))
                     wp.atomic_add(diagonal, place(v, q[0]), square + block(along, whole, across))
             else:
-                summed += other.energy(e[0], others, place(s * elements.shape[0], k))
+                if wp.static(rides):
+                    summed += other.energy(e[0], others, edge)
                 if at >= 0:
                     summed += potential.energy(f.measure(e), rests[place(s * n_own, at)])
         wp.atomic_add(total, s, summed)
@@ -277,8 +268,11 @@ def convex(f: KernelFunctions, rider: KernelFunctions | None) -> SimpleNamespace
             if own:
                 at = own[place(k, 0)]
             e = edge_vectors(fields, start + s * n_vertices, q)
-            ridden, form = other.product(other_factors, place(s * elements.shape[0], k), e[0])
-            total += form
+            ridden = vec3()
+            form = real(0.0)
+            if wp.static(rides):
+                ridden, form = other.product(other_factors, place(s * elements.shape[0], k), e[0])
+                total += form
             received = vectors()
             if at >= 0:
                 received, form = c.product(factors[place(s * n_own, at)], e)
