@@ -27,8 +27,7 @@ EXTRAS = {
     "usd": ["usd-core>=24.5"],
     # Meshes of different connectivity; libigl's AABB tree came to Python with 2.6.
     "register": ["robust_laplacian>=1.0", "potpourri3d>=1.2", "libigl>=2.6"],
-    # Parts that pass through each other; earlier versions of ipctk have another interface, and were not tried.
-    "contact": ["ipctk>=1.6", "libigl>=2.6"],
+    "contact": ["libigl>=2.6.3"],  # parts that pass through each other
     "dask": ["distributed>=2024.5"],
 }
 HAS_WARP = (

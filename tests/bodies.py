@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from solids import as_mesh, box
 
-from torch_modal.geometry.inspect import signed_volume
+from torch_modal.geometry.inspect import volume_of
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -99,7 +99,7 @@ def turned_surface(profile: FloatArray, spacing: float, closed: bool = False) ->
     pairs = zip(rings, [*rings[1:], rings[0]] if closed else rings[1:], strict=False)
     faces = np.concatenate([_stitched(a, b) for a, b in pairs])
     points = np.concatenate(vertices)
-    return points, faces if signed_volume(points, faces) > 0 else faces[:, ::-1].copy()
+    return points, faces if volume_of(points, faces) > 0 else faces[:, ::-1].copy()
 
 
 def _stitched(a: IntArray, b: IntArray) -> IntArray:

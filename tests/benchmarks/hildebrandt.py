@@ -50,8 +50,8 @@ class WarpedModes:
 
     def amplitudes(self, shapes: Tensor) -> Tensor:
         """Amplitudes whose gradients are nearest to those of shapes. *Shape:* ``(B, V, 3) -> (B, k)``."""
-        own, turns = self.own, self.rotations.quaternions(self.basis.reference.expand_as(shapes), shapes)
-        turn, strain = bending_between(own, frames_of(shapes, self.faces), turns)
+        own, frames = self.own, frames_of(shapes, self.faces)
+        turn, strain = bending_between(own, frames, self.rotations.quaternions(own, frames))
         moved = []
         for (x, y), rest in zip(stretch(strain, *own[3:]), self.sides, strict=True):
             moved.append(own.world(x, y) - rest + cross(turn, rest.expand_as(turn)))

@@ -14,7 +14,7 @@ from timing import limit_threads
 import torch_modal as tm
 from torch_modal.data.samples import SAMPLES, Sample, load_sample
 from torch_modal.geometry.connectivity import Connectivity
-from torch_modal.geometry.inspect import signed_volume
+from torch_modal.geometry.inspect import volume_of
 
 LEVELS = 2
 
@@ -31,7 +31,7 @@ def errors(sample: Sample, frames: torch.Tensor, levels: int) -> torch.Tensor:
             x = frames[int(when * 2**levels)]
             length, true_length = ((shape[i] - shape[j]).norm(dim=-1) for shape in (x, true))
             off = float(((length - true_length).abs() / true_length).mean())
-            rows.append((off, signed_volume(x.numpy(), faces) / signed_volume(true.numpy(), faces)))
+            rows.append((off, volume_of(x.numpy(), faces) / volume_of(true.numpy(), faces)))
     return torch.tensor(rows)
 
 

@@ -357,7 +357,7 @@ def test_terms_take_part_in_the_coordinates_of_the_caller(tube, unit):
 
 
 def test_fingers_are_pushed_apart():
-    pytest.importorskip("ipctk")
+    pytest.importorskip("igl")
     sample = tm.load_sample("hand")
     rests, faces = sample.keyframes.double(), sample.faces
     crossing = tm.Path(rests, faces)(rests, 0.875)

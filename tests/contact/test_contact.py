@@ -26,7 +26,7 @@ from torch_modal.elastic.term import Mesh
 from torch_modal.inbetween.results import Samples
 from torch_modal.motion import path as path_module
 
-pytest.importorskip("ipctk")
+pytest.importorskip("igl")
 DOUBLE = torch.float64
 
 
@@ -130,7 +130,7 @@ def test_gradients_are_exact_with_the_set_held(hand: Shapes, monkeypatch: pytest
     def shape(x_a: Tensor, x_b: Tensor, t: Tensor) -> Tensor:
         nonlocal calls
         calls = 0
-        mu, stiffness = layer.mu_of(t, t.shape), layer.stiffness_of(t, t.shape)
+        mu, stiffness = torch.ones_like(t), layer.stiffness_of(t, t.shape)
         samples = Samples(torch.stack([x_a, x_b])[None], torch.stack([1 - t, t], -1), mu, stiffness)
         return layer.core(samples).shapes[0]
 
@@ -363,14 +363,14 @@ def test_what_contact_needs_is_said_before_any_work(hand: Shapes, monkeypatch: p
     with pytest.raises(ValueError, match="joint"):
         tm.Objective(space="paired", contact=True)
     real = extras.importlib.util.find_spec
-    monkeypatch.setattr(extras.importlib.util, "find_spec", lambda name: None if name == "ipctk" else real(name))
+    monkeypatch.setattr(extras.importlib.util, "find_spec", lambda name: None if name == "igl" else real(name))
     for make in (
         lambda: tm.InBetween(hand.bases, hand.faces, contact=True),
         lambda: tm.Path(hand.bases, hand.faces, contact=True),
         lambda: tm.ShapeSpace(hand.bases, hand.faces, contact=True),
         lambda: tm.subdivide(hand.keyframes, hand.faces, contact=True),
     ):
-        with pytest.raises(ImportError, match=r"contact needs ipctk.*torch_modal\[contact\]"):
+        with pytest.raises(ImportError, match=r"contact needs igl.*torch_modal\[contact\]"):
             make()
 
 

@@ -16,9 +16,9 @@ from torch_modal.cli import main as cli
 from torch_modal.data.samples import load_sample, sample_files
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.crossings import Crossings
-from torch_modal.geometry.triangle_pairs import pierce_nearly, triangles_cross
+from torch_modal.geometry.triangle_pairs import triangles_cross
 
-pytest.importorskip("ipctk")
+pytest.importorskip("igl")
 
 
 def two_boxes(overlap: float, levels: int = 2, width: float = 0.613) -> tuple[torch.Tensor, torch.Tensor]:
@@ -89,8 +89,7 @@ def test_triangles_on_a_grid_cross_as_fractions_say() -> None:
     # Small whole numbers: vertices lie in planes and on edges, edges meet edges, and triangles share planes.
     one, other = rng.integers(-2, 3, (2, 1500, 3, 3)).astype(float)
     wanted = np.array([cross_by_fractions(a, b) for a, b in zip(one, other, strict=True)])
-    touching = (pierce_nearly(one, other) | pierce_nearly(other, one)) & ~wanted
-    assert wanted.sum() > 150 and touching.sum() > 100
+    assert wanted.sum() > 150
     np.testing.assert_array_equal(triangles_cross(one, other), wanted)
     np.testing.assert_array_equal(triangles_cross(other[:, [1, 0, 2]], one[:, [2, 0, 1]]), wanted)
     # Coordinates that no longer are exact: a tenth of them rounds differently at each vertex.
@@ -100,7 +99,7 @@ def test_triangles_on_a_grid_cross_as_fractions_say() -> None:
 
 
 @pytest.mark.parametrize("apart", [0.0, 0.25], ids=["face on face", "edge on face"])
-@pytest.mark.parametrize("search", ["ipctk", "warp"])
+@pytest.mark.parametrize("search", ["igl", "warp"])
 def test_what_only_touches_does_not_cross(apart: float, search: str) -> None:
     # Two boxes with a common plane: their faces touch, partly in one plane, and edges meet edges.
     box = trimesh.creation.box((1, 1, 1)).subdivide()
@@ -125,21 +124,16 @@ def test_what_only_touches_does_not_cross(apart: float, search: str) -> None:
 @pytest.mark.parametrize("n_faces", [1, 2, 3, 20, 500])
 def test_kernels_find_the_triangles_that_cross(n_faces: int, generator: torch.Generator) -> None:
     pytest.importorskip("warp")
-    from torch_modal.elastic import crossings as fused_crossings
+    from torch_modal.elastic.crossings import ROOM, WarpPairs
 
     corners = torch.stack([torch.randperm(n_faces + 3, generator=generator)[:3] for _ in range(n_faces)]).numpy()
     mesh = Connectivity(corners, n_faces + 3)
     first, x = torch.rand(2, n_faces + 3, 3, dtype=torch.float64, generator=generator).numpy()
-    one, other = np.triu_indices(n_faces, 1)
-    apart = ~(mesh.faces[one][:, :, None] == mesh.faces[other][:, None]).any((1, 2))
-    one, other = one[apart], other[apart]
-    a, b = x[mesh.faces[one]], x[mesh.faces[other]]
-    crossing = pierce_nearly(a, b) | pierce_nearly(b, a)
-    assert np.array_equal(crossing, triangles_cross(a, b))  # nothing is nearly flat here
-    wanted = set(zip(one[crossing].tolist(), other[crossing].tolist(), strict=True))
-    assert n_faces < 500 or len(wanted) > fused_crossings.ROOM  # which has to be made larger
-    found = fused_crossings.WarpPairs(mesh, first[None])(x)
-    assert len(found) == len(wanted) and {tuple(pair) for pair in np.sort(found, 1).tolist()} == wanted
+    wanted = Crossings(mesh, first[None]).pairs(x)
+    assert n_faces < 500 or len(wanted) > ROOM  # which has to be made larger
+    np.testing.assert_array_equal(Crossings(mesh, first[None], search=WarpPairs(mesh, first[None])).pairs(x), wanted)
+    if n_faces < 500:
+        assert set(map(tuple, wanted.tolist())) == pairs_by_fractions(x, corners)
 
 
 def test_pairs_do_not_depend_on_pose_and_size(generator: torch.Generator) -> None:
@@ -233,7 +227,7 @@ def test_what_cannot_be_is_said(change: object, said: str) -> None:
 
 
 def test_missing_package_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "ipctk", None)
+    monkeypatch.setitem(sys.modules, "igl", None)
     with pytest.raises(ImportError, match=r"pip install 'torch_modal\[contact\]'"):
         tm.self_contacts(*two_boxes(0.2))
 

@@ -11,7 +11,13 @@ import torch
 from torch_modal import keyframe_places, linear_sequence, load_keyframes
 from torch_modal.data.samples import FOLDER, SAMPLES, load_sample, sample_files
 from torch_modal.geometry.connectivity import Connectivity
-from torch_modal.geometry.inspect import consistent_winding, degenerate_faces, flat_faces, repeated_faces, signed_volume
+from torch_modal.geometry.inspect import (
+    consistent_winding,
+    degenerate_faces,
+    find_repeated_faces,
+    flat_faces,
+    volume_of,
+)
 
 ROOT = Path(__file__).parents[2]
 
@@ -26,11 +32,11 @@ def test_one_closed_manifold_surface_wound_outwards(name: str) -> None:
     n_vertices = sample.keyframes.shape[1]
     assert np.array_equal(np.unique(faces), np.arange(n_vertices))  # every vertex is used
     assert n_vertices - len(edges) + len(faces) == 2  # Euler: one sphere, so also one fan of faces a vertex
-    assert not degenerate_faces(faces).any() and not repeated_faces(faces).any()
+    assert not degenerate_faces(faces).any() and not find_repeated_faces(faces).any()
     assert len(consistent_winding(mesh)[1]) == 0
     shapes = torch.cat([sample.keyframes, sample.truth]).numpy()
     assert not any(flat_faces(shape, faces, 1e-6).any() for shape in shapes)
-    volumes = [signed_volume(shape, faces) for shape in shapes]
+    volumes = [volume_of(shape, faces) for shape in shapes]
     assert min(volumes) > 0 and np.ptp(volumes) < 2e-3 * np.mean(volumes)
     for file in sorted(FOLDER.glob(f"{name}/*.ply")):  # corner by corner, not only as sets
         assert torch.equal(load_keyframes([file]).faces, sample.faces)

@@ -149,7 +149,7 @@ def test_layers_stay_on_the_gpu(small_bars: Shapes, kind: str, preset: Any, back
         layer: Any = tm.MidShape(bases, faces, preset=preset, solver=solver).in_between
     else:
         if "contact" in kind:
-            pytest.importorskip("ipctk")
+            pytest.importorskip("igl")
         layer = tm.InBetween(bases, faces, preset, solver=solver, contact="contact" in kind or None)
     with gpu() as mode, torch.no_grad():
         on_gpu(layer, mode)

@@ -26,7 +26,7 @@ def parts(*shapes: np.ndarray, mesh: Connectivity) -> list[list[int]]:
     return [sorted({int(v) // 8 for v in everything[own]}) for own, _ in found]
 
 
-@pytest.mark.parametrize("unit", [1e-200, 1.0, 1e200])
+@pytest.mark.parametrize("unit", [1e-60, 1.0, 1e60])
 def test_far_is_beyond_the_mean_of_the_diagonals(unit: float) -> None:
     for gap, far in ((0.99 * DIAGONAL, False), (1.01 * DIAGONAL, True)):
         x, mesh = boxes((0, 0, 0), (0, 0, 1 + gap))

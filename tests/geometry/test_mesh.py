@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from torch_modal.geometry import connectivity
-from torch_modal.geometry.connectivity import Connectivity, connected_pieces
+from torch_modal.geometry.connectivity import Connectivity, label_pieces
 
 SQUARE = np.array([[0, 1, 2], [0, 2, 3]])  # open, one interior edge
 TETRAHEDRON = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])  # closed
@@ -101,7 +101,7 @@ def test_hinge_of_faces_that_wind_against_each_other() -> None:
 def test_vertices_are_grouped_by_connected_pieces() -> None:
     mesh = Connectivity(np.concatenate([TETRAHEDRON + 1, SQUARE + 6]), n_vertices=11)
     assert mesh.vertex_pieces.tolist() == [0, 1, 1, 1, 1, 2, 3, 3, 3, 3, 4]
-    assert connected_pieces(np.zeros((0, 2), dtype=np.int64), 3).tolist() == [0, 1, 2]
+    assert label_pieces(np.zeros((0, 2), dtype=np.int64), 3).tolist() == [0, 1, 2]
 
 
 def test_vertex_areas() -> None:

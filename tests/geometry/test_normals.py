@@ -46,7 +46,7 @@ def test_cardinality_and_types(shape: tuple[Tensor, Tensor]) -> None:
     np.testing.assert_array_equal(of_arrays, vertex_normals(x, faces))
 
 
-@pytest.mark.parametrize(("dtype", "scales"), [(F64, (1e-150, 1e-80, 1e80)), (torch.float32, (1e-18, 1e-10, 1e15))])
+@pytest.mark.parametrize(("dtype", "scales"), [(F64, (1e-60, 1e60)), (torch.float32, (1e-8, 1e8))])
 def test_size_does_not_matter(shape: tuple[Tensor, Tensor], dtype: torch.dtype, scales: tuple[float, ...]) -> None:
     x, faces = shape
     truth = vertex_normals(x, faces).to(dtype)

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.autograd import gradcheck, gradgradcheck
 
 import torch_modal as tm
-from torch_modal.geometry.rigid import RigidMotion, best_fit, best_rotation, blend, centroid, signed_volumes
+from torch_modal.geometry.rigid import RigidMotion, best_fit, best_rotation, blend, centroid, volumes_of
 from torch_modal.geometry.rotations import exp
 
 EYE = torch.eye(3, dtype=torch.float64)
@@ -238,4 +238,4 @@ def test_signed_volumes_of_ellipsoids_and_their_mirror_images() -> None:
     scales = torch.tensor([[1.0, 2, 3], [1, -2, 3], [2, 2, 0]], dtype=torch.float64)
     shapes = (x * scales[:, None]) @ about([1, 2, 3], 0.7).mT + torch.tensor([1.0, 2, 3])
     expected = mesh.volume * scales.prod(1)
-    torch.testing.assert_close(signed_volumes(shapes[None], faces), expected[None], rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(volumes_of(shapes[None], faces), expected[None], rtol=1e-12, atol=1e-12)

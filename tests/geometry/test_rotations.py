@@ -20,6 +20,7 @@ from torch_modal.geometry.local_rotations import LocalRotations
 from torch_modal.geometry.poisson import Poisson
 from torch_modal.geometry.rigid import best_rotation
 from torch_modal.geometry.rotations import exp
+from torch_modal.geometry.triangle_frames import frames_of
 from torch_modal.inbetween.blend import RotationBlend
 from torch_modal.motion.spline import Spline
 
@@ -134,7 +135,7 @@ def test_most_of_the_area_of_a_piece_says_which_way_it_turns(fused: bool) -> Non
     wanted = torch.cat([angles, angles, angles.flip(0), angles.flip(0)])
     roots = wanted[rotations.ancestors[0] == torch.arange(len(wanted))]
     assert len(roots) == 2 and float(roots.min()) < math.pi < float(roots.max())
-    found = rotations.quaternions(first[None], second[None])[0, 0]
+    found = rotations.quaternions(*(frames_of(x[None], rotations.faces) for x in (first, second)))[0, 0]
     torch.testing.assert_close(found, (0.5 * wanted).cos(), rtol=0, atol=1e-12)
 
 
@@ -261,8 +262,8 @@ def strip_mesh() -> Connectivity:
 
 
 def test_below_a_turn_there_are_none(strip_mesh: Connectivity) -> None:
-    assert LocalRotations(strip_mesh, torch.stack([strip(0), strip(1)])).clusters is None
-    assert LocalRotations(strip_mesh, torch.stack([strip(0), strip(TURNS)])).clusters is not None
+    assert not LocalRotations(strip_mesh, torch.stack([strip(0), strip(1)])).beyond_a_turn
+    assert LocalRotations(strip_mesh, torch.stack([strip(0), strip(TURNS)])).beyond_a_turn
 
 
 @pytest.mark.parametrize("turns, torn", [(0, False), (1, True)])
@@ -296,7 +297,7 @@ def test_the_pose_of_a_key_frame_does_not_matter(strip_mesh: Connectivity) -> No
         rotations = LocalRotations(strip_mesh, torch.stack([strip(0), second]))
         lengths.append(rotations(*pair(strip(0)[None], second[None], half)).norm(dim=0))
     torch.testing.assert_close(*lengths, rtol=1e-11, atol=0)
-    assert LocalRotations(strip_mesh, torch.stack([strip(0), strip(0.9) @ turn])).clusters is None
+    assert LocalRotations(strip_mesh, torch.stack([strip(0), strip(0.9) @ turn])).beyond_a_turn is False
 
 
 @pytest.mark.parametrize("kind", [LocalRotations, WarpRotations])
@@ -329,4 +330,4 @@ def test_intervals_of_a_motion_have_clusters_of_their_own(strip_mesh: Connectivi
     shapes, times = torch.stack([strip(0), strip(0.5), strip(TURNS)]), torch.arange(3).double()
     for order, wanted in (([0, 1, 2], [False, True]), ([2, 0, 1], [True, False])):
         spline = Spline(strip_mesh, shapes[order], times, None, TorchBackend())
-        assert [rotations.clusters is not None for rotations in spline.rotations] == wanted
+        assert [rotations.beyond_a_turn for rotations in spline.rotations] == wanted

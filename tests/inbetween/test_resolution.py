@@ -13,7 +13,7 @@ from shapes import edge_lengths
 
 import torch_modal as tm
 from torch_modal.elastic.term import Mesh
-from torch_modal.geometry.connectivity import Connectivity, connected_pieces
+from torch_modal.geometry.connectivity import Connectivity, label_pieces
 from torch_modal.inbetween import coarse as coarse_mesh
 from torch_modal.inbetween.coarse import ENOUGH_FACES
 from torch_modal.modes.coarsening import FACES_OF_PIECE, coarsen
@@ -88,7 +88,7 @@ def test_pieces_keep_faces() -> None:
     whole = trimesh.util.concatenate(parts)
     faces = np.asarray(whole.faces)
     coarse = coarsen(whole.vertices[None], faces, 200)
-    piece = connected_pieces(np.concatenate([coarse.faces[:, :2], coarse.faces[:, 1:]]), coarse.n_vertices)
+    piece = label_pieces(np.concatenate([coarse.faces[:, :2], coarse.faces[:, 1:]]), coarse.n_vertices)
     counts = np.bincount(piece[coarse.faces[:, 0]])
     assert len(counts) == len(parts)
     assert counts.min() >= FACES_OF_PIECE - 4

@@ -158,7 +158,7 @@ def test_a_path_goes_through_a_roll() -> None:
 
 def test_layers_of_a_sheet_that_are_close_are_no_contact() -> None:
     """Neighbours in a narrow fold are not held apart, and nothing becomes NaN."""
-    pytest.importorskip("ipctk")
+    pytest.importorskip("igl")
     flat, end = fold(0), fold(1, 175, 0.4)
     made = [tm.InBetween(bases(flat, end), faces(), contact=contact) for contact in (False, True)]
     free, held = (layer.solve(flat, end, torch.tensor([0.5, 0.9])) for layer in made)

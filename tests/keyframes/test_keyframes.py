@@ -14,7 +14,7 @@ from bodies import twisted_plate
 
 from torch_modal import open_asset, save_animation
 from torch_modal.geometry import inspect
-from torch_modal.geometry.inspect import signed_volume
+from torch_modal.geometry.inspect import volume_of
 from torch_modal.geometry.rigid import looks_mirrored
 from torch_modal.keyframes.arrays import check_tensor
 from torch_modal.keyframes.check import Keyframes, MeshError, MeshWarning, check_keyframes
@@ -550,7 +550,7 @@ def test_non_orientable_is_warned_and_left():
 @pytest.mark.parametrize("thickness", [1e-4, 1e-3])
 def test_a_thin_plate_whose_volume_turns_over_is_not_mirrored(thickness):
     flat, twisted, faces = twisted_plate(thickness)
-    volumes = [signed_volume(x, faces) / inspect.diagonals(x[None])[0] ** 3 for x in (flat, twisted)]
+    volumes = [volume_of(x, faces) / inspect.diagonals(x[None])[0] ** 3 for x in (flat, twisted)]
     assert volumes[0] > 1e-6 and volumes[1] < -1e-6
     both = check_keyframes(np.stack([flat, twisted]), faces)
     assert not looks_mirrored(both.keyframes[:1], both.keyframes[1:], both.faces).any()

@@ -1,6 +1,5 @@
 """Weighted in-betweens of several key-frames: invariances, gradients, what goes in and comes out."""
 
-import math
 import warnings
 from pathlib import Path
 from typing import Literal
@@ -15,10 +14,7 @@ from torch import Tensor
 
 import torch_modal as tm
 from torch_modal.data.samples import load_sample
-from torch_modal.elastic.bend import Bend
-from torch_modal.elastic.energy import Energy, Rest
 from torch_modal.elastic.minimise import Status
-from torch_modal.elastic.term import Mesh, Term
 from torch_modal.geometry.rigid import best_fit
 from torch_modal.geometry.rotations import about, arc, conjugate, mean, product
 from torch_modal.geometry.triangle_frames import sides
@@ -84,22 +80,12 @@ class TestTwo:
             assert apart(blend(bars.keyframes[1:], pulls(1 - t, t)), x) < 1e-9
 
 
-def test_key_frames_in_the_place_of_bases_leave_out_the_modal_solve(bars: Shapes, poses: Tensor) -> None:
-    plain, w = Blend(bars.keyframes, bars.faces), pulls(0.5, 0.2, 0.3)
-    none = Blend(bars.bases, bars.faces, solver=tm.Solver(max_steps=0))
-    assert apart(plain(poses, w), none.solve(poses, w).shapes) < 1e-12
-    assert torch.equal(plain(poses, torch.eye(3, dtype=DOUBLE)), poses)
-
-
 class TestInvariances:
     def test_all_the_weight_gives_the_key_frame_bit_for_bit(self, layer: Blend, poses: Tensor) -> None:
         for dtype in (DOUBLE, torch.float32):
             x = layer(poses.to(dtype), torch.eye(3, dtype=dtype))
             assert x.dtype == dtype
             assert torch.equal(x, poses.to(dtype))
-
-    def test_neither_order_nor_ties_count_where_poses_are_far_apart(self, layer: Blend, poses: Tensor) -> None:
-        assert_no_order(layer, poses)
 
     @pytest.mark.filterwarnings("ignore::torch_modal.MeshWarning")
     @pytest.mark.parametrize("name", [pytest.param("cow", marks=pytest.mark.slow), "hand"])
@@ -322,18 +308,6 @@ class TestParts:
         for t in (-0.1, 0.2, 0.5, 0.9):
             expected = about(t * arc(rotations[:, 1]))
             torch.testing.assert_close(mean(rotations, pulls(1 - t, t)[:, None]), expected, rtol=0, atol=1e-12)
-
-    def test_parabolas_add_up_to_one(self, generator: torch.Generator) -> None:
-        w, q = (torch.rand(4, 3, generator=generator, dtype=DOUBLE) for _ in range(2))
-        (whole, value), least = Term().merge_rests(q, w)
-        at = pulls(0.3, -2.0, 5.0)
-        torch.testing.assert_close(whole * (at - value) ** 2 + least, (w * (at - q) ** 2).sum(0))
-
-    def test_angles_come_round(self) -> None:
-        angles = pulls(3.1, -3.1, 3.0)[:, None]
-        energy = Energy(Mesh.of(torch.tensor([[0, 1, 2], [1, 0, 3]]), 4), [Bend()])
-        mixed = energy.mix_rests(Rest((angles,), (torch.ones_like(angles),)), torch.full((3, 4), 1 / 3).double())
-        assert abs(abs(float(mixed.measures[0])) - math.pi) < 0.1
 
 
 def turned_over(x: Tensor, faces: Tensor) -> float:

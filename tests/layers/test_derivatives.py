@@ -263,7 +263,6 @@ def test_the_tangent_of_what_backward_receives(small_bars: Shapes) -> None:
 @either
 @pytest.mark.parametrize("kind", [tm.InBetween, tm.Path])
 def test_contact_is_refused_also_where_the_time_alone_has_a_tangent(small_bars: Shapes, kind: Any, run: Any) -> None:
-    pytest.importorskip("ipctk")
     pytest.importorskip("igl")
     layer, pair = kind(small_bars.bases[:2], small_bars.faces, contact=True), small_bars.keyframes[:2]
     given = tuple(pair) if kind is tm.InBetween else (pair,)

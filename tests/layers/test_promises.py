@@ -67,7 +67,6 @@ def known(small_bars: Shapes) -> Callable[[str], Made]:
 @pytest.fixture
 def made(name: str, known: Callable[[str], Made]) -> Made:
     if name in {*CONTACT, "self_contacts"}:
-        pytest.importorskip("ipctk")
         pytest.importorskip("igl")
     return known(name)
 

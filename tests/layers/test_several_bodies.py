@@ -182,7 +182,6 @@ def test_what_may_be_between_bodies_is_one_problem(kind: str, both: Shapes) -> N
 @pytest.mark.parametrize("kind", ["pair", "path of pairs", "smooth path"])
 def test_contact_is_of_all_bodies(kind: str, bars: Shapes) -> None:
     """Two bodies that exchange their places, and would pass through each other on the way."""
-    pytest.importorskip("ipctk")
     pytest.importorskip("igl")
     first, n = bars.keyframes[0], bars.keyframes.shape[1]
     faces = torch.cat([bars.faces, bars.faces + n])

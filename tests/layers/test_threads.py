@@ -78,20 +78,6 @@ def test_results_and_gradients_are_the_same_bit_for_bit(layer: tm.InBetween, bar
         assert layer(*leaves(bars)).is_inference()
 
 
-@pytest.mark.parametrize("backend", ["warp", "torch"])
-def test_batches_are_what_single_samples_are(bars: Shapes, backend: str) -> None:
-    layer = tm.InBetween(bars.bases[:2], bars.faces, solver=tm.Solver(backend=backend))
-    torch.set_num_threads(3)
-    given, apart = leaves(bars), leaves(bars)
-    x = layer(*given)
-    y = torch.stack([layer(*sample) for sample in zip(*apart, strict=True)])
-    torch.testing.assert_close(x, y, rtol=0, atol=1e-11)
-    for both in ((x, given), (y, apart)):
-        both[0].square().sum().backward()
-    for own, other in zip(given, apart, strict=True):
-        torch.testing.assert_close(own.grad, other.grad, rtol=1e-7, atol=1e-9)
-
-
 def test_all_layers_and_subdivide(bars: Shapes) -> None:
     x, bases, faces = bars.keyframes, bars.bases, bars.faces
     weights = torch.rand(6, 3, dtype=DOUBLE).softmax(1)
@@ -105,20 +91,6 @@ def test_all_layers_and_subdivide(bars: Shapes) -> None:
         return [*each, *(tm.subdivide(x[:n], faces, 3, bases=bases[:n], progress=False) for n in (2, 3))]
 
     assert same(each_number(compute))
-
-
-def test_second_derivatives(layer: tm.InBetween, bars: Shapes) -> None:
-    def twice(given: list[Tensor]) -> list[Tensor]:
-        first = torch.autograd.grad(layer(*given).square().sum(), given, create_graph=True)
-        torch.autograd.backward(sum(x.square().sum() for x in first))  # type: ignore[arg-type]
-        return [*(x.detach() for x in first), *(x.grad for x in given)]  # type: ignore[list-item]
-
-    torch.set_num_threads(3)
-    found = twice(leaves(bars, 3))
-    samples = zip(*leaves(bars, 3), strict=True)
-    alone = [twice([x.detach()[None].requires_grad_() for x in sample]) for sample in samples]
-    for x, *parts in zip(found, *alone, strict=True):
-        torch.testing.assert_close(x, torch.cat(parts), rtol=1e-6, atol=1e-8)
 
 
 def test_the_graph_is_freed_and_kept_as_torch_does(layer: tm.InBetween, bars: Shapes) -> None:
@@ -244,50 +216,6 @@ def test_an_interrupt_ends_the_call_when_no_thread_runs() -> None:
     with pytest.raises(KeyboardInterrupt):
         threads.run([slow] * 20)
     assert len(begun) == len(ended) < 20
-
-
-def test_transforms_and_forward_mode_run_as_before(layer: tm.InBetween, bars: Shapes) -> None:
-    torch.set_num_threads(3)
-    a, b, t = (x.detach() for x in leaves(bars))
-
-    def f(t: Tensor) -> Tensor:
-        return layer(a, b, t)
-
-    _, moved = torch.func.jvp(f, (t,), (torch.ones_like(t),))
-    whole = torch.func.vmap(layer)(a, b, t)
-    torch.testing.assert_close(whole, f(t), rtol=0, atol=1e-10)
-    with torch.autograd.forward_ad.dual_level():
-        dual = f(torch.autograd.forward_ad.make_dual(t, torch.ones_like(t)))
-        torch.testing.assert_close(torch.autograd.forward_ad.unpack_dual(dual).tangent, moved, rtol=1e-8, atol=1e-8)
-    slope = torch.func.grad(lambda t: f(t).sum())(t)
-    torch.testing.assert_close(slope, moved.sum((1, 2)), rtol=1e-6, atol=1e-7)
-
-
-class InLoader(torch.utils.data.Dataset):  # type: ignore[type-arg]
-    """One batch of in-betweens, computed in a process of a loader."""
-
-    def __init__(self, layer: tm.InBetween, given: list[Tensor]) -> None:
-        self.layer, self.given = layer, given
-
-    def __len__(self) -> int:
-        return 2
-
-    def __getitem__(self, index: int) -> Tensor:
-        assert torch.get_num_threads() == 1
-        with torch.no_grad():
-            return self.layer(*self.given)  # type: ignore[no-any-return]
-
-
-@pytest.mark.skipif(not hasattr(__import__("os"), "fork"), reason="this system cannot fork")
-def test_workers_of_a_loader_find_the_same(layer: tm.InBetween, bars: Shapes) -> None:
-    torch.set_num_threads(3)
-    given = [x.detach() for x in leaves(bars)]
-    with torch.no_grad():
-        wanted = layer(*given)
-    loader = torch.utils.data.DataLoader(
-        InLoader(layer, given), batch_size=None, num_workers=1, multiprocessing_context="fork"
-    )
-    assert all(torch.equal(x, wanted) for x in loader)
 
 
 def test_threads_that_begin_together_make_tables_once(bars: Shapes) -> None:

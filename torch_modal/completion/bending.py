@@ -8,7 +8,7 @@ from torch import Tensor
 from torch_modal.geometry.poisson import Reconstruction
 from torch_modal.geometry.rigid import infinitesimal_motions
 from torch_modal.geometry.rotations import exp
-from torch_modal.geometry.triangle_frames import bent_sides, frames_of
+from torch_modal.geometry.triangle_frames import bend_sides, frames_of
 from torch_modal.motion.decoder import bending_columns
 
 MOST_STRAIN = 1.0
@@ -44,7 +44,7 @@ class ModalBending:
     def _sides(self, base: Tensor, bending: Tensor, n_copies: int = 1) -> tuple[Tensor, Tensor]:
         rest = frames_of(base[None], self.faces.repeat(n_copies, 1))
         turn = bending[0] * rest.e1[:, 0] + bending[1] * rest.e2[:, 0] + bending[2] * rest.normal[:, 0]
-        return bent_sides(turn[:, None], bending[3:, None].clamp(-MOST_STRAIN, MOST_STRAIN), rest)
+        return bend_sides(turn[:, None], bending[3:, None].clamp(-MOST_STRAIN, MOST_STRAIN), rest)
 
     def shape(self, base: Tensor, pose: ModalPose) -> Tensor:
         """The deformed shape. *Shape:* ``(V, 3)``."""

@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from torch_modal.arrays import BoolArray, FloatArray, IntArray
 from torch_modal.geometry.closest import closest_on_triangles, dot
-from torch_modal.geometry.connectivity import Connectivity, connected_pieces
+from torch_modal.geometry.connectivity import Connectivity, label_pieces
 from torch_modal.registration.surface import MeshSurface, places_between
 
 # Places of each triangle that are candidates: its middle, and one near each corner.
@@ -173,6 +173,6 @@ class Cloud(NamedTuple):
             return []
         neighbours = cKDTree(self.points).query(self.points, min(N_NEIGHBOURS, len(self.points)))[0]
         gap = GAP / 2 * float(np.median(neighbours[:, -1]))
-        pieces = connected_pieces(cKDTree(self.points[off]).query_pairs(gap, output_type="ndarray"), len(off))
+        pieces = label_pieces(cKDTree(self.points[off]).query_pairs(gap, output_type="ndarray"), len(off))
         sizes = np.bincount(pieces)
         return [off[pieces == k] for k in np.argsort(-sizes, kind="stable") if sizes[k] >= least]

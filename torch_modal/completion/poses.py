@@ -15,7 +15,7 @@ from torch_modal.completion.frames import CompletionProblem
 from torch_modal.completion.pairs import Pairs
 from torch_modal.completion.search import PoseSearch
 from torch_modal.geometry.rigid import best_fit
-from torch_modal.geometry.triangle_frames import frames_of, mirrored_sides
+from torch_modal.geometry.triangle_frames import frames_of, mirror_sides
 from torch_modal.modes.coarsening import coarsen
 from torch_modal.modes.extract import extract_bases
 from torch_modal.motion.decoder import scale_modes
@@ -134,7 +134,7 @@ class FramePoses:
     def _beyond(self, before: Tensor, last: Tensor) -> Tensor:
         """The shape as far after the last one as that is after the one before."""
         motion = best_fit(before, last)
-        sides = mirrored_sides(frames_of(last[None], self.faces), frames_of(motion.apply(before)[None], self.faces))
+        sides = mirror_sides(frames_of(last[None], self.faces), frames_of(motion.apply(before)[None], self.faces))
         x = self.bending.reconstruction(sides, last.T[:, None].contiguous())[:, 0].T
         x = best_fit(x, last).apply(x)
         middle = last.mean(0)

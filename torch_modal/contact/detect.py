@@ -10,10 +10,9 @@ import numpy as np
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from torch_modal.geometry.closest import closest_on_triangles
+from torch_modal.geometry.closest import closest_on_triangles, dot
 from torch_modal.geometry.crossings import BoolArray, Crossings, FloatArray, IntArray
 from torch_modal.geometry.surface import Surface
-from torch_modal.geometry.triangle_pairs import dot
 
 # Lengths are parts of the diagonal.
 REACH = 0.06
@@ -58,7 +57,7 @@ class Search:
         before = crossings.known_inside
         surface = Surface(x, crossings.mesh)
         winds = crossings.encloses(surface, crossings.within(corners, DEEP) | (watched & before))
-        inside = crossings.connected_to(winds & ~before, corners)
+        inside = crossings.select_connected(winds & ~before, corners)
         watched |= crossings.grow(np.flatnonzero(corners), 2) | crossings.grow(np.flatnonzero(inside))
         # Vertices inside in a key-frame must not enter elsewhere.
         return *self.opposite(surface, watched, inside, winds & before & watched), len(pairs)

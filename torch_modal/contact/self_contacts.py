@@ -44,8 +44,8 @@ class SelfContacts(NamedTuple):
 def self_contacts(x: Any, faces: Any, ignore: Any = None) -> SelfContacts:
     """Find self-intersections of shapes.
 
-    Two triangles without a common vertex intersect if their interiors do (broad phase of ``ipctk``, exact predicates of
-    ``libigl``); touching and coplanar triangles do not. Depths come from winding numbers (``libigl``).
+    Two triangles without a common vertex intersect if their interiors do (exact predicates of ``libigl``); touching and
+    coplanar triangles do not. Depths come from winding numbers (``libigl``).
     Not differentiable.
 
     Args:

@@ -12,7 +12,7 @@ from torch_modal.data.space import ShapeSpace
 from torch_modal.data.strain import edge_strains
 from torch_modal.geometry.poisson import Reconstruction
 from torch_modal.geometry.rigid import best_fit
-from torch_modal.geometry.triangle_frames import bend, bent_sides, frames_of, sides
+from torch_modal.geometry.triangle_frames import bend, bend_sides, frames_of, sides
 
 # A draw beyond the bound is scaled to this fraction of it; its largest strain is nearly linear in the scale.
 _WITHIN_BOUND = 0.98
@@ -106,6 +106,6 @@ def deform(x: Tensor, displacement: Tensor, keyframe: Tensor, reconstruction: Re
     turn, strain = bend(sides(displacement, faces), frames_of(keyframe[None], faces))
     pose = best_fit(keyframe.expand_as(x), x, weights).rotation
     turn = (pose @ turn.movedim(0, 1)).movedim(0, 1)
-    wanted = bent_sides(turn, strain, frames_of(x, faces))
+    wanted = bend_sides(turn, strain, frames_of(x, faces))
     bent = reconstruction(wanted, x.movedim(-1, 0).contiguous()).movedim(0, -1)
     return best_fit(bent, x, weights).apply(bent)

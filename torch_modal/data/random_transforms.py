@@ -14,7 +14,7 @@ from torch_modal.data.space import ShapeSpace
 from torch_modal.geometry.poisson import Reconstruction
 from torch_modal.geometry.rigid import RigidMotion, best_fit
 from torch_modal.geometry.rotations import exp
-from torch_modal.geometry.triangle_frames import frames, mirrored_sides, sides
+from torch_modal.geometry.triangle_frames import frames, mirror_sides, sides
 from torch_modal.statistics.variation import check_density
 
 
@@ -131,7 +131,7 @@ def extrapolate(centre: Tensor, other: Tensor, reconstruction: Reconstruction) -
     weights, faces = reconstruction.areas.to(centre), reconstruction.faces
     motion = best_fit(centre, other, weights)
     last, aligned = (y.movedim(-1, 0).contiguous() for y in (centre, motion.inverse().apply(other)))
-    wanted = mirrored_sides(frames(sides(last, faces)), frames(sides(aligned, faces)))
+    wanted = mirror_sides(frames(sides(last, faces)), frames(sides(aligned, faces)))
     beyond = reconstruction(wanted, last).movedim(0, -1)
     return RigidMotion(motion.rotation.mT, motion.source, 2 * motion.source - motion.target).apply(beyond)
 

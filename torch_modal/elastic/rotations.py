@@ -53,7 +53,7 @@ class WarpRotations(LocalRotations):
 
     def right_hand_side(self, shapes: Tensor, weights: Tensor, poisson: Poisson) -> Tensor:
         """Overrides the base class."""
-        if self.clusters is not None or weights.shape[1] != 2:
+        if self.beyond_a_turn or weights.shape[1] != 2:
             return super().right_hand_side(shapes, weights, poisson)
         return _RightHandSide(self, poisson)(shapes, weights)[0].to(shapes)
 

@@ -163,15 +163,18 @@ def conjugate_gradients(
     dot: Callable[[Tensor, Tensor], Tensor],
     right: Tensor,
     n_products: int,
+    tolerance: float | None = None,
 ) -> Tensor:
     """An approximate solution, preconditioned, of one or more systems.
 
     Args:
-        product: With the matrix, symmetric and never negative.
+        product: With the matrix, symmetric and never negative; with a tolerance, it may be indefinite.
         precondition: With an approximate inverse.
         dot: Inner products of two such fields, one of each system, that broadcast against them.
         right: The right side.
         n_products: How many.
+        tolerance: Of one system, the relative residual that ends the iteration. It also ends, in a direction that goes
+            downhill, where the curvature is not positive. Default: all products are taken.
     """
 
     def quotient(a: Tensor, b: Tensor) -> Tensor:
@@ -181,16 +184,21 @@ def conjugate_gradients(
     solution = torch.zeros_like(right)
     residual = right
     direction = preconditioned = precondition(residual)
-    size = dot(residual, preconditioned)
+    size = first = dot(residual, preconditioned)
     for k in range(n_products):
         along = product(direction)
-        length = quotient(size, dot(direction, along))
+        curvature = dot(direction, along)
+        if tolerance is not None and not curvature > 0:
+            return solution if k else preconditioned
+        length = quotient(size, curvature)
         solution = solution + length * direction
         if k == n_products - 1:
             break
         residual = residual - length * along
         preconditioned = precondition(residual)
         previous, size = size, dot(residual, preconditioned)
+        if tolerance is not None and not size > tolerance**2 * first:
+            break
         direction = preconditioned + quotient(size, previous) * direction
     return solution
 

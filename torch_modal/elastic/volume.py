@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torch_modal.elastic.term import KernelFunctions, Mesh, Term, square
 from torch_modal.geometry.connectivity import Connectivity, double_areas
-from torch_modal.geometry.inspect import OPEN, open_part, signed_volume
+from torch_modal.geometry.inspect import OPEN, open_part, volume_of
 from torch_modal.geometry.vectors import cross, norm
 
 # Eq. 5 divides by the rest volume, which has this bound for flat bodies, as a part of (surface area)^(3/2); a sphere
@@ -69,7 +69,7 @@ def encloses(x: Tensor, mesh: Connectivity) -> bool:
     if open_part(points, mesh) > OPEN:
         return False
     area = double_areas(points, mesh.faces).sum() / 2
-    volume = signed_volume(points - points[mesh.used].mean(0), mesh.faces)
+    volume = volume_of(points - points[mesh.used].mean(0), mesh.faces)
     return bool(abs(volume) > MIN_RELATIVE_VOLUME * area**1.5)
 
 

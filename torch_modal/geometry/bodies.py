@@ -24,7 +24,6 @@ def bodies(shapes: FloatArray, mesh: Connectivity) -> list[tuple[Any, Connectivi
     """
     group = np.unique(mesh.vertex_pieces[mesh.used], return_inverse=True)[1].reshape(-1)
     order, i = np.argsort(group, kind="stable"), 0
-    shapes = shapes / np.ptp(shapes[:, mesh.used])  # against overflow of squares
     corners = np.concatenate([shapes, -shapes], 2)[:, mesh.used[order]]
     box = np.minimum.reduceat(corners, np.flatnonzero(np.diff(group[order], prepend=-1)), 1)  # (K, n, 6)
     while i < min(box.shape[1], MOST_BODIES + 1):

@@ -1,4 +1,4 @@
-"""Exact closest points on a surface, by a tree of bounding boxes. NumPy and SciPy only."""
+"""Exact closest points on a surface, by trees of centroids. NumPy and SciPy only."""
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -8,79 +8,43 @@ from torch_modal.arrays import FloatArray, IntArray
 # Triangles with less than this part of the area that their sides allow count as segments.
 FLAT = 1e-12
 
-# Pairs of a point and a box that are tested together.
+# Groups of triangles of similar size.
+N_GROUPS = 8
+
+# Pairs of a point and a triangle that are tested together.
 CHUNK = 2**18
 
 
-def leaves(faces: IntArray, shapes: FloatArray) -> IntArray:
-    """Faces as leaves of a binary tree, split on each level along the longest axis of their centres.
-
-    Node 1 is the root, node ``i`` has the children ``2 i`` and ``2 i + 1``, and the last ``F`` nodes are the leaves.
-    The faces of a node are close in all of the shapes. *Shape:* ``(F, 3), (K, V, 3) -> (F,)``.
-    """
-    points = np.concatenate(shapes[:, faces].mean(2), 1)
-    n = len(points)
-    first_nodes = [1 << k for k in range((n - 1).bit_length())]  # of each inner level
-    sizes = np.ones(2 * n, np.int64)
-    for start in reversed(first_nodes):
-        level = np.arange(start, min(2 * start, n))
-        sizes[level] = sizes[2 * level] + sizes[2 * level + 1]
-    order, nodes = np.arange(n), np.ones(n, np.int64)
-    for start in first_nodes:
-        # Finished leaves come last.
-        level = np.arange(start, min(2 * start, n))
-        size = sizes[level]
-        firsts, m = np.cumsum(size) - size, int(size.sum())
-        inner = points[order[:m]]
-        low = np.minimum.reduceat(inner, firsts)
-        extent = np.maximum.reduceat(inner, firsts) - low
-        axis, node = extent.argmax(1), np.repeat(np.arange(len(level)), size)
-        longest = np.maximum(extent[np.arange(len(level)), axis], 1e-300)
-        share = (inner[np.arange(m), axis[node]] - low[node, axis[node]]) / longest[node]
-        order[:m] = order[:m][np.argsort(2 * node + share)]
-        nodes[:m] = np.repeat(np.arange(2 * level[0], 2 * level[-1] + 2), sizes[2 * level[0] : 2 * level[-1] + 2])
-    order_of_leaves = np.empty(n, np.int64)
-    order_of_leaves[nodes - n] = order
-    return order_of_leaves
-
-
 class ClosestFaces:
-    """Exact queries for the closest triangle of a surface, which has one or more. *Shape:* ``(V, 3), (F, 3)``."""
+    """Exact queries for the closest triangle of a surface, which has one or more. *Shape:* ``(V, 3), (F, 3)``.
+
+    Triangles are searched by their centroids, in groups of similar size: none is nearer than its centroid less its
+    radius.
+    """
 
     def __init__(self, vertices: FloatArray, faces: IntArray) -> None:
         #: *Shape:* ``(F, 3, 3)``.
         self.corners = vertices[faces]
-        self.centroids = cKDTree(self.corners.mean(1))
-        self._leaves, n = leaves(faces, vertices[None]), len(faces)
-        ordered = self.corners[self._leaves]
-        self._low, self._high = np.empty((2, 2 * n, 3))
-        self._low[n:], self._high[n:] = ordered.min(1), ordered.max(1)
-        first = n
-        while first > 1:  # the nodes of first to 2 first - 1 are done; their parents are next
-            parents = np.arange((first + 1) // 2, first)
-            self._low[parents] = np.minimum(self._low[2 * parents], self._low[2 * parents + 1])
-            self._high[parents] = np.maximum(self._high[2 * parents], self._high[2 * parents + 1])
-            first = (first + 1) // 2
+        centres = self.corners.mean(1)
+        self.centroids = cKDTree(centres)
+        radii = np.linalg.norm(self.corners - centres[:, None], axis=2).max(1)
+        groups = np.array_split(np.argsort(radii), min(N_GROUPS, len(faces)))
+        self._groups = [(faces, cKDTree(centres[faces]), radii[faces[-1]]) for faces in groups]
 
     def __call__(self, points: FloatArray) -> IntArray:
         """Closest triangle to each point. *Shape:* ``(n, 3) -> (n,)``."""
         face = np.asarray(self.centroids.query(points)[1], dtype=np.int64)
         nearest = closest_on_triangles(points, self.corners[face])[1]
-        n = len(self.corners)
-        left = [(np.arange(len(points)), np.ones(len(points), np.int64))]
-        while left:  # depth first, so that few pairs are kept
-            row, node = left.pop()
-            gap = np.maximum(np.maximum(self._low[node] - points[row], points[row] - self._high[node]), 0)
-            near = dot(gap, gap) < nearest[row] ** 2
-            row, node = row[near], node[near]
-            at, candidates = row[node >= n], self._leaves[node[node >= n] - n]
-            distance = closest_on_triangles(points[at], self.corners[candidates])[1]
-            nearer = distance < nearest[at]
-            np.minimum.at(nearest, at, distance)
-            nearer &= distance == nearest[at]
-            face[at[nearer]] = candidates[nearer]
-            row, node = np.repeat(row[node < n], 2), (2 * node[node < n, None] + np.arange(2)).reshape(-1)
-            left += [(row[i : i + CHUNK], node[i : i + CHUNK]) for i in range(0, len(row), CHUNK)]
+        for faces, tree, radius in self._groups:
+            counts = tree.query_ball_point(points, nearest + radius, return_length=True)
+            bounds = np.flatnonzero(np.diff(np.cumsum(counts) // CHUNK)) + 1
+            for rows in np.split(np.arange(len(points)), bounds):
+                near = tree.query_ball_point(points[rows], nearest[rows] + radius)
+                row, candidates = np.repeat(rows, counts[rows]), faces[np.concatenate([*near, []]).astype(np.int64)]
+                distance = closest_on_triangles(points[row], self.corners[candidates])[1]
+                order = np.lexsort((-distance, row))  # of each point, the nearest comes last
+                order = order[distance[order] < nearest[row[order]]]
+                face[row[order]], nearest[row[order]] = candidates[order], distance[order]
         return face
 
 

@@ -57,13 +57,8 @@ class Connectivity:
 
         width = max(self.n_vertices - 1, 0).bit_length()
         key = np.minimum(self.start, self.end) << width | np.maximum(self.start, self.end)
-        bits = len(key).bit_length()
-        if 2 * width + bits < 64:  # packed into one integer: three times as fast as argsort
-            packed = np.sort(key << bits | np.arange(len(key)))
-            order, key = packed & (1 << bits) - 1, packed >> bits
-        else:
-            order = np.argsort(key, kind="stable")
-            key = key[order]
+        order = np.argsort(key, kind="stable")
+        key = key[order]
         first = np.flatnonzero(np.diff(key, prepend=-1))  # of the sides of each edge
         self.edges: IntArray = np.stack([key[first] >> width, key[first] & (1 << width) - 1], axis=1)
         self.counts: IntArray = np.diff(first, append=len(order))
@@ -91,10 +86,10 @@ class Connectivity:
     @cached_property
     def vertex_pieces(self) -> IntArray:
         """Connected component of each vertex, including unreferenced ones. *Shape:* ``(V,)``."""
-        return connected_pieces(self.edges, self.n_vertices)
+        return label_pieces(self.edges, self.n_vertices)
 
 
-def connected_pieces(pairs: IntArray, n: int) -> IntArray:
+def label_pieces(pairs: IntArray, n: int) -> IntArray:
     """Connected component of each of ``n`` nodes, numbered by first nodes. *Shape:* ``(m, 2) -> (n,)``."""
     graph = sparse.coo_matrix((np.ones(len(pairs), dtype=bool), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
     return connected_components(graph, directed=False)[1].astype(np.int64)
@@ -116,7 +111,7 @@ def merge_seams(shapes: FloatArray, faces: IntArray) -> IntArray:
     tolerance = SEAM_WIDTH * float(np.linalg.norm(np.ptp(shapes[:, used], axis=1), axis=1).min())
     pairs = boundary[cKDTree(shapes[0, boundary]).query_pairs(tolerance, output_type="ndarray")]
     distance = np.linalg.norm(shapes[:, pairs[:, 0]] - shapes[:, pairs[:, 1]], axis=2).max(axis=0, initial=0.0)
-    return connected_pieces(pairs[distance <= tolerance], n)
+    return label_pieces(pairs[distance <= tolerance], n)
 
 
 def spanning_forest(n: int, pairs: IntArray, costs: FloatArray) -> tuple[IntArray, IntArray]:
@@ -135,20 +130,12 @@ def spanning_forest(n: int, pairs: IntArray, costs: FloatArray) -> tuple[IntArra
         graph = sparse.coo_matrix((costs[order], pairs[order].T), shape=(n, n)).tocsr()
     tree = minimum_spanning_tree(graph).tocoo()
     piece = connected_components(tree, directed=False)[1].astype(np.int64)
-    parents = traversal(tree.row, tree.col, np.unique(piece, return_index=True)[1], n)[1]
-    return np.where(parents == n, np.arange(n), parents).astype(np.int64), piece
-
-
-def traversal(one: IntArray, other: IntArray, roots: IntArray, n: int) -> tuple[IntArray, IntArray]:
-    """The nodes of a forest by breadth from its roots, and the one before each, n where none. *Shape:* ``(n,)`` each.
-
-    The forest joins the nodes ``one`` with ``other``. *Shape:* ``(m,)``.
-    """
     # An extra node above all roots: one traversal visits all trees.
-    ends = np.append(one, np.full(len(roots), n)), np.append(other, roots)
+    roots = np.unique(piece, return_index=True)[1]
+    ends = np.append(tree.row, np.full(len(roots), n)), np.append(tree.col, roots)
     whole = sparse.coo_matrix((np.ones(len(ends[0])), ends), shape=(n + 1, n + 1)).tocsr()
-    order, before = breadth_first_order(whole, n, directed=False)
-    return order[1:], before[:n]
+    parents = breadth_first_order(whole, n, directed=False)[1][:n]
+    return np.where(parents == n, np.arange(n), parents).astype(np.int64), piece
 
 
 def half_cotangents(vertices: FloatArray, mesh: Connectivity) -> FloatArray:

@@ -1,14 +1,11 @@
 """Which triangles of a surface pass through each other, and which vertices lie inside. NumPy and SciPy only.
 
-Pairs come from a broad phase of ``ipctk`` and exact predicates of ``libigl``, as do winding numbers. Both
-are the extra ``contact`` and are imported when they are first needed.
+Pairs come from the tree of boxes and the exact predicates of ``libigl``, as do winding numbers. It is the extra
+``contact`` and is imported when it is first needed.
 """
 
 from collections.abc import Callable
 from functools import cached_property
-from itertools import chain
-from operator import attrgetter
-from typing import Any
 
 import numpy as np
 from scipy import sparse
@@ -16,10 +13,11 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 
 from torch_modal import extras
 from torch_modal.arrays import BoolArray, FloatArray, IntArray
+from torch_modal.geometry.closest import dot
 from torch_modal.geometry.connectivity import Connectivity, edge_graph
-from torch_modal.geometry.inspect import signed_volume
+from torch_modal.geometry.inspect import volume_of
 from torch_modal.geometry.surface import Surface
-from torch_modal.geometry.triangle_pairs import dot, triangles_cross
+from torch_modal.geometry.triangle_pairs import triangles_cross
 
 RINGS = 2
 """Pairs within so many rings of a crossing of a key-frame belong to it: it grows and shrinks with every rounding."""
@@ -36,7 +34,7 @@ def require_contact() -> None:
     Raises:
         MissingPackageError: It names what is missing.
     """
-    extras.require_installed(("ipctk", "igl"), "contact", "contact")
+    extras.require_installed(("igl",), "contact", "contact")
 
 
 class Crossings:
@@ -47,7 +45,7 @@ class Crossings:
         known: Shapes whose own crossings are tolerated. *Shape:* ``(K, V, 3)``.
         like: The shape whose lengths say what is far along the surface. Default: the first of ``known``.
         search: Finds what :meth:`pairs` does, in any order, and may find more. *Shape:* ``(V, 3) -> (P, 2)``.
-            Default: by boxes, with ``ipctk``.
+            Default: by ``libigl``.
     """
 
     def __init__(
@@ -57,8 +55,7 @@ class Crossings:
         like: FloatArray | None = None,
         search: Callable[[FloatArray], IntArray] | None = None,
     ) -> None:
-        self.mesh, self.known = mesh, known
-        self._search = search or self._search_boxes
+        self.mesh, self.known, self._search = mesh, known, search
         self.like = known[0] if like is None else like
         used = self.like[np.unique(mesh.faces)]
         self.diagonal = float(np.linalg.norm(np.ptp(used, axis=0)))
@@ -68,15 +65,8 @@ class Crossings:
     # ------------------------------------------------------------------------------------------------- once for a mesh
     @cached_property
     def adjacency(self) -> sparse.csr_matrix:
-        """One between vertices that an edge joins. *Shape:* ``(V, V)``."""
-        return _ones(self.lengths)
-
-    @cached_property
-    def incidence(self) -> sparse.csr_matrix:
-        """One of a vertex and a face around it. *Shape:* ``(V, F)``."""
-        n = len(self.mesh.faces)
-        ends = self.mesh.faces.reshape(-1), np.repeat(np.arange(n), 3)
-        return sparse.coo_matrix((np.ones(3 * n), ends), (self.mesh.n_vertices, n)).tocsr()
+        """True between vertices that an edge joins. *Shape:* ``(V, V)``."""
+        return self.lengths.astype(bool)
 
     @cached_property
     def lengths(self) -> sparse.csr_matrix:
@@ -94,16 +84,16 @@ class Crossings:
         return np.unique(np.concatenate([*self.pairs_of_known, np.zeros((0, 2), np.int64)]), axis=0)
 
     @cached_property
-    def _around_known(self) -> sparse.csr_matrix | None:
-        """One where a pair of faces lies within :data:`RINGS` of a known one. *Shape:* ``(F, F)``."""
-        pairs, n = self.known_pairs, len(self.mesh.faces)
-        if not len(pairs):
-            return None
-        ends = pairs.reshape(-1), pairs[:, ::-1].reshape(-1)
-        near = _ones(sparse.coo_matrix((np.ones(len(ends[0])), ends), (n, n)))
-        touching = _ones(self.incidence.T @ self.incidence)  # faces that share a vertex
+    def _around_known(self) -> sparse.csr_matrix:
+        """True where a pair of faces lies within :data:`RINGS` of a known one. *Shape:* ``(F, F)``."""
+        n, (one, other) = len(self.mesh.faces), self.known_pairs.T
+        ends = self.mesh.faces.reshape(-1), np.repeat(np.arange(n), 3)
+        incidence = sparse.csr_matrix((np.ones(3 * n, dtype=bool), ends), (self.mesh.n_vertices, n))
+        touching = incidence.T @ incidence  # faces that share a vertex
+        near = sparse.csr_matrix((np.ones(len(one), dtype=bool), (one, other)), (n, n))
+        near = near + near.T
         for _ in range(RINGS):
-            near = _ones(touching @ near @ touching)
+            near = touching @ near @ touching
         return near
 
     @cached_property
@@ -124,23 +114,16 @@ class Crossings:
         By :func:`~torch_modal.geometry.triangle_pairs.triangles_cross`: those that only touch, or lie in one plane, do
         not cross. *Shape:* ``(V, 3) -> (P, 2)``.
         """
-        pairs = np.sort(self._search(x), axis=1)
-        one, other = (x[self.mesh.faces[side]] for side in pairs.T)
-        pairs = pairs[triangles_cross(one, other)]
+        if self._search is None:
+            predicates = extras.require("igl.predicates", "contact", "contact")
+            pairs = predicates.find_self_intersections(np.ascontiguousarray(x), self.mesh.faces.copy())[1]
+        else:
+            pairs = self._search(x)
+        pairs = np.sort(pairs, axis=1)
+        one, other = self.mesh.faces[pairs].transpose(1, 0, 2)
+        apart = ~(one[:, :, None] == other[:, None]).any((1, 2))
+        pairs = pairs[apart][triangles_cross(x[one[apart]], x[other[apart]])]
         return pairs[np.lexsort(pairs.T[::-1])]
-
-    def _search_boxes(self, x: FloatArray) -> IntArray:
-        tree = extras.require("ipctk", "contact", "contact").LBVH()
-        faces = np.asfortranarray(self.mesh.faces.astype(np.int32))
-        # Scaled and centred: the library's boxes are of single precision.
-        centred = np.asfortranarray((x - self.like.mean(0)) / self.diagonal)
-        # Without the edges, whose boxes are not needed.
-        tree.build(centred, np.zeros((0, 2), np.int32, order="F"), faces, 1e-6)
-        faces_of_pairs = map(attrgetter("face0_id", "face1_id"), tree.detect_face_face_candidates())
-        candidates = np.fromiter(chain.from_iterable(faces_of_pairs), np.int64).reshape(-1, 2)
-        corners = self.mesh.faces[candidates]
-        candidates = candidates[~(corners[:, 0, :, None] == corners[:, 1, None, :]).any((1, 2))]
-        return np.unique(candidates, axis=0)
 
     def far_pairs(self, x: FloatArray) -> IntArray:
         """The :meth:`pairs` that are far, by :meth:`is_far`. *Shape:* ``(V, 3) -> (P, 2)``."""
@@ -169,9 +152,8 @@ class Crossings:
         :data:`FAR` of the diagonal apart along the surface. *Shape:* ``(P, 2) -> (P,)``.
         """
         far = self.is_new(pairs)
-        if self._around_known is not None and far.any():
-            at = np.flatnonzero(far)
-            far[at] = np.asarray(self._around_known[pairs[at, 0], pairs[at, 1]]).reshape(-1) == 0
+        if len(pairs) and len(self.known_pairs):
+            far &= ~np.asarray(self._around_known[pairs[:, 0], pairs[:, 1]]).reshape(-1)
         one, other = self.mesh.faces[pairs[far]].transpose(1, 0, 2)
         far[far] = np.all([self.are_far_apart(corner, other) for corner in one.T], axis=0)
         return far
@@ -209,7 +191,7 @@ class Crossings:
         corners = np.zeros(self.mesh.n_vertices, dtype=bool)
         corners[self.mesh.faces[pairs.reshape(-1)]] = True
         inside = self.encloses(Surface(x, self.mesh), np.ones(len(x), dtype=bool) if len(pairs) else corners)
-        return self.connected_to(inside & ~self.known_inside if len(self.known) else inside, corners)
+        return self.select_connected(inside & ~self.known_inside if len(self.known) else inside, corners)
 
     def encloses(self, surface: Surface, asked: BoolArray) -> BoolArray:
         """Around which of some vertices a shape winds: around a point just outside. *Shape:* ``(V,) -> (V,)``."""
@@ -220,11 +202,11 @@ class Crossings:
             # About 1 inside, about 0 outside.
             igl = extras.require("igl", "contact", "contact")
             number = igl.fast_winding_number(*(np.ascontiguousarray(a) for a in (x, faces, points)))
-            is_inside_out = signed_volume(x - x.mean(0), faces) < 0
+            is_inside_out = volume_of(x - x.mean(0), faces) < 0
             inside[queried] = (-number if is_inside_out else number) > 0.5
         return inside
 
-    def connected_to(self, vertices: BoolArray, seeds: BoolArray) -> BoolArray:
+    def select_connected(self, vertices: BoolArray, seeds: BoolArray) -> BoolArray:
         """Vertices that hang together with others, or with the ring around them. *Shape:* ``(V,), (V,) -> (V,)``."""
         members, kept = np.flatnonzero(vertices), np.zeros(len(vertices), dtype=bool)
         if len(members) and seeds.any():
@@ -237,12 +219,5 @@ class Crossings:
         chosen = np.zeros(self.mesh.n_vertices, dtype=bool)
         chosen[vertices] = True
         for _ in range(rings):
-            chosen |= self.adjacency @ chosen.astype(np.float64) > 0
+            chosen |= self.adjacency @ chosen
         return chosen
-
-
-def _ones(matrix: Any) -> sparse.csr_matrix:
-    """The pattern of a matrix, with ones."""
-    pattern = sparse.csr_matrix(matrix, copy=True)
-    pattern.data[:] = 1.0
-    return pattern

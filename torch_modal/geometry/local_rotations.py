@@ -6,15 +6,15 @@ from functools import reduce
 from math import cos
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from torch_modal.errors import MeshWarning
-from torch_modal.geometry.clusters import Clusters, beyond_a_turn
 from torch_modal.geometry.connectivity import Connectivity, spanning_forest
 from torch_modal.geometry.poisson import Poisson
 from torch_modal.geometry.rotations import arc, conjugate, mean, product, quaternion, rotate, rotate_by, signs_of_mean
-from torch_modal.geometry.triangle_frames import Frames, Sides, doubled_areas, edge_means, frames_of, stretch, transform
+from torch_modal.geometry.triangle_frames import Frames, edge_means, frames_of, stretch, transform, twice_areas
 from torch_modal.geometry.vectors import pick
 
 # The tree along which turns are compared avoids slivers, whose normals mean little: one with an altitude of this part
@@ -25,6 +25,12 @@ SLIVER = 0.02
 # Above this part of the area there is a warning.
 ALIKE = 0.5
 PART_TORN = 1e-3
+
+# Rotations follow each other along the tree where more than this part of the area of a piece turns by more than this
+# angle, in radians, from its mean. Half a turn would be a full one from side to side; the rest is noise. Of fists, 1 %
+# turns by half a turn.
+BEYOND = np.radians(200)
+PART_BEYOND = 0.05
 
 # Edges without a length count like one of this part of the mean.
 SHORTEST = 1e-9
@@ -55,7 +61,7 @@ class LocalRotations(nn.Module):
     Where linear interpolation shrinks what turns, this does not. ``R`` alone does not tell a turn of 200 degrees from
     one of -160. But neighbours turn alike: the signs of quaternions are passed on along a spanning tree, which tells up
     to a full turn. Where the references turn by more from side to side, as a sheet that rolls up does,
-    :class:`Clusters` take over.
+    each triangle follows its parent in the tree.
 
     Args:
         mesh: The connectivity.
@@ -70,6 +76,7 @@ class LocalRotations(nn.Module):
     areas: Tensor
     ancestors: Tensor
     piece: Tensor
+    middle: Tensor
 
     def __init__(self, mesh: Connectivity, references: Tensor) -> None:
         super().__init__()
@@ -85,15 +92,19 @@ class LocalRotations(nn.Module):
         #: The first reference, from which rotations of more than two shapes are measured. *Shape:* ``(1, V, 3)``.
         self.register_buffer("reference", references[:1].clone(), persistent=False)
         #: Twice the summed areas of the triangles in the references. *Shape:* ``(F,)``.
-        self.register_buffer("areas", torch.cat([x.doubled_areas for x in every]).sum(0), persistent=False)
+        self.register_buffer("areas", torch.cat([x.twice_areas for x in every]).sum(0), persistent=False)
         #: By 1, 2, 4, ... generations, as many as any tree needs. *Shape:* ``(J, F)``.
         self.register_buffer("ancestors", torch.stack(ancestors), persistent=False)
         self.register_buffer("piece", piece, persistent=False)
         self.n_edges, self.n_pieces = len(mesh.edges), int(piece.max()) + 1
-        wound = self.cluster_arguments(every)
-        #: For rotations beyond a full turn; None where there are none.
-        self.clusters = Clusters(*wound) if beyond_a_turn(*wound) else None
-        self._warn_of_tears(wound[0], mesh)
+        self._warn_of_tears(_quaternions_from_first(every), mesh)
+        off = self.off_mean(every)
+        #: True where parts turn by more than a full turn from each other.
+        self.beyond_a_turn = self.turns_beyond(off)
+        order = np.lexsort((off, piece))
+        middles = torch.from_numpy(order[np.unique(piece[order], return_index=True)[1]])
+        #: The triangle of each piece that turns like its mean, for all triangles. *Shape:* ``(F,)``.
+        self.register_buffer("middle", middles[piece], persistent=False)
 
     def _warn_of_tears(self, quaternions: Tensor, mesh: Connectivity) -> None:
         """Warn where neighbours are a full turn apart with any tree. *Shape:* ``(4, K, F)``."""
@@ -140,9 +151,9 @@ class LocalRotations(nn.Module):
         start = frames_of(shapes[:, 0] if shapes.shape[1] == 2 else self.reference, self.faces)
         frames = Frames(*(x.unflatten(-2, weights.shape) for x in frames_of(shapes.flatten(0, 1), self.faces)))
         quaternions = _quaternion_between(Frames(*(x[..., None, :] for x in start)), frames)
-        if self.clusters is None:
+        if not self.beyond_a_turn:
             signs = self.sign(
-                quaternions.detach().flatten(1, 2).movedim(0, -1), frames.doubled_areas.detach().flatten(0, 1)
+                quaternions.detach().flatten(1, 2).movedim(0, -1), frames.twice_areas.detach().flatten(0, 1)
             )
             # A triangle that is a point has no frame and a quaternion of 0.5: with the other sign it would make a whole
             # turn, whose axis has no derivative.
@@ -152,10 +163,11 @@ class LocalRotations(nn.Module):
                 self._agree(quaternions.detach(), weights.detach()) * quaternions, weights[..., None]
             )
         else:
-            mean_quaternion = self.clusters(quaternions, weights[..., None])
+            mean_quaternion = self._mean_along_tree(quaternions, weights[..., None])
         xx, xy, yy = ((weights[..., None] * x).sum(-2) for x in frames[3:])
         first, second = (rotate(mean_quaternion, start.world(*side)) for side in transform(xx, xy, xy, yy))
-        return self._edges((first, second), self.areas.expand(len(weights), -1))
+        areas = self.areas.expand(len(weights), -1).repeat(1, 3)
+        return edge_means((first, second), areas, self.sides, self.side_signs, self.n_edges)
 
     def right_hand_side(self, shapes: Tensor, weights: Tensor, poisson: Poisson) -> Tensor:
         """:meth:`Poisson.right_hand_side` of these edge vectors. *Shape:* ``(B, K, V, 3), (B, K) -> (B, V, 3)``."""
@@ -171,10 +183,38 @@ class LocalRotations(nn.Module):
         products = torch.stack([zero.index_add(-1, self.piece, row) for row in rows], -1).movedim(2, 1)
         return pick(signs_of_mean(products, weights[:, None]).mT, self.piece)
 
-    def cluster_arguments(self, every: Sequence[Frames]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Arguments of :class:`Clusters`, between shapes."""
-        areas = torch.cat([x.doubled_areas for x in every]).sum(0)
-        return _quaternions_from_first(every), areas, self.ancestors, self.piece
+    def _mean_along_tree(self, quaternions: Tensor, weights: Tensor) -> Tensor:
+        r"""Weighted means of rotations of more than a full turn, each relative to the one of the parent.
+
+        A triangle turns by :math:`T(t) = T_p(t)\, (R_p^T R)^t` with its parent ``p``: no power is one of a rotation of
+        half a turn or more. The middle of the piece turns the short way. *Shape:* ``(4, B, K, F), (B, K, 1)``.
+        """
+        followed = mean(self._from_parents(quaternions), weights)
+        for ancestors in self.ancestors:
+            followed = product(pick(followed, ancestors), followed)
+        middle = mean(torch.where(quaternions[0] < 0, -quaternions, quaternions), weights)
+        return product(pick(product(middle, conjugate(followed)), self.middle), followed)
+
+    def _from_parents(self, quaternions: Tensor) -> Tensor:
+        """Rotations from the parents, the short way round; none of roots. *Shape:* ``(4, ..., F)``."""
+        step = product(conjugate(pick(quaternions, self.ancestors[0])), quaternions)
+        return torch.where(step[0] < 0, -step, step)
+
+    def turns_beyond(self, off: Tensor) -> bool:
+        """True where parts of a piece turn by more than a full turn from each other, by :meth:`off_mean`."""
+        total = torch.bincount(self.piece, self.areas)
+        return bool((torch.bincount(self.piece, self.areas * (off > BEYOND)) > PART_BEYOND * total).any())
+
+    def off_mean(self, every: Sequence[Frames]) -> Tensor:
+        """Largest angle of each triangle from the mean of its piece, between any two shapes. *Shape:* ``(F,)``."""
+        winding = 2 * arc(self._from_parents(_quaternions_from_first(every)))
+        for ancestors in self.ancestors:
+            winding = winding + pick(winding, ancestors)
+        total = torch.bincount(self.piece, self.areas)
+        sums = winding.new_zeros(*winding.shape[:2], len(total)).index_add(-1, self.piece, self.areas * winding)
+        off = winding - pick(sums / total, self.piece)
+        spans = [(off[:, i:] - off[:, i - 1 : i]).norm(dim=0).amax(0) for i in range(1, off.shape[1])]
+        return torch.stack(spans).amax(0)
 
     def step(self, a: Frames, b: Frames) -> Tensor:
         """The step of each triangle from one shape to another.
@@ -183,16 +223,16 @@ class LocalRotations(nn.Module):
         entries of the stretch. *Shape:* ``(6, B, F)``.
         """
         growth = [y - x for x, y in zip(a[3:], b[3:], strict=True)]
-        return torch.stack([*a.coordinates(2 * arc(self._signed_quaternions(a, b))), *growth])
+        return torch.stack([*a.coordinates(2 * arc(self.quaternions(a, b))), *growth])
 
     def edges_along(self, trajectory: Trajectory, which: Tensor, t: Tensor) -> Tensor:
         """Edge vectors of shapes on the trajectories of P pairs; of each the pair and the time are given.
 
         *Shape:* ``(B,), (B,) -> (3, B, E)``.
         """
-        return self.bent_edges_along(Trajectory._make(values.index_select(-2, which) for values in trajectory), t)
+        return self.edges_with_bending(Trajectory._make(values.index_select(-2, which) for values in trajectory), t)
 
-    def bent_edges_along(self, trajectory: Trajectory, t: Tensor, bending: Tensor | None = None) -> Tensor:
+    def edges_with_bending(self, trajectory: Trajectory, t: Tensor, bending: Tensor | None = None) -> Tensor:
         """Edge vectors of shapes on trajectories, whose triangles may be strained and turned beforehand.
 
         Trajectories are of one pair, or of a pair for each shape. Bending is in coordinates of the triangles: axis
@@ -211,22 +251,15 @@ class LocalRotations(nn.Module):
             return x * trajectory.e1 + y * trajectory.e2 + z * trajectory.normal
 
         # At a key-frame, the intervals on both sides weigh alike: velocities of edges are continuous.
-        areas = torch.lerp(doubled_areas(*trajectory.size), doubled_areas(*(trajectory.size + trajectory.step[3:])), u)
+        areas = torch.lerp(twice_areas(*trajectory.size), twice_areas(*(trajectory.size + trajectory.step[3:])), u)
         first, second = transform(xx, xy, xy, yy) if bending is None else stretch(bending[3:], xx, xy, yy)
-        return self._edges((place(*first), place(*second)), areas)
-
-    def _edges(self, wanted: Sides, areas: Tensor) -> Tensor:
-        """Edge vectors that the triangles ask for, by area. *Shape:* ``(B, F) -> (3, B, E)``."""
+        wanted = place(*first), place(*second)
         return edge_means(wanted, areas.repeat(1, 3), self.sides, self.side_signs, self.n_edges)
 
-    def quaternions(self, first: Tensor, second: Tensor) -> Tensor:
-        """Quaternions of triangles, whose signs tell the way round. *Shape:* ``(B, V, 3), (B, V, 3) -> (4, B, F)``."""
-        return self._signed_quaternions(frames_of(first, self.faces), frames_of(second, self.faces))
-
-    def _signed_quaternions(self, a: Frames, b: Frames) -> Tensor:
+    def quaternions(self, a: Frames, b: Frames) -> Tensor:
         """Quaternions between frames, whose signs tell the way round. *Shape:* ``(4, B, F)``."""
         quaternions = _quaternion_between(a, b)
-        areas = (a.doubled_areas + b.doubled_areas).detach()
+        areas = (a.twice_areas + b.twice_areas).detach()
         return self.sign(quaternions.detach().movedim(0, -1), areas) * quaternions
 
     def sign(self, quaternions: Tensor, areas: Tensor) -> Tensor:

@@ -1,6 +1,7 @@
 """Vertex positions from target edge vectors: Poisson problems, factorised once per connectivity."""
 
-from functools import cache, partial
+from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
@@ -8,10 +9,10 @@ from scipy.spatial import KDTree
 from torch import Tensor, nn
 
 from torch_modal.arrays import FloatArray, IntArray
-from torch_modal.autograd import is_eager
-from torch_modal.geometry.connectivity import Connectivity, half_cotangents, vertex_areas
+from torch_modal.autograd import Recent, is_eager
+from torch_modal.geometry.connectivity import Connectivity, half_cotangents, label_pieces, vertex_areas
 from torch_modal.geometry.rigid import best_fit
-from torch_modal.geometry.sparse import MAKING, SparseSolver, graph_laplacian, solve_by, solve_exported
+from torch_modal.geometry.sparse import SparseSolver, graph_laplacian, solve_by
 from torch_modal.geometry.triangle_frames import Sides, edge_means
 
 # Bounds of cotangent weights, for slivers. Positive weights make the matrix positive definite.
@@ -25,7 +26,7 @@ class Poisson(nn.Module):
     r"""Solves :math:`\min_x \sum_e w_e |x_j - x_i - \bar e|^2` with prescribed centres of the connected pieces.
 
     All shapes share the weights and one factorisation (:class:`~torch_modal.geometry.sparse.SparseSolver`), which is
-    made at the first use and again if the weights change.
+    made at the first use.
 
     Args:
         mesh: The connectivity, of all vertices.
@@ -37,7 +38,6 @@ class Poisson(nn.Module):
     weights: Tensor
     piece: Tensor
     shares: Tensor
-    free: Tensor
 
     def __init__(self, mesh: Connectivity, weights: Tensor, vertex_weights: Tensor | None = None) -> None:
         super().__init__()
@@ -49,25 +49,15 @@ class Poisson(nn.Module):
         self.register_buffer("weights", weights.clone(), persistent=False)
         self.register_buffer("piece", piece, persistent=False)
         self.register_buffer("shares", (mass / total[piece]).to(weights), persistent=False)
-        # The equations determine each piece up to a translation: one vertex of each is fixed at first.
-        fixed = np.unique(mesh.vertex_pieces, return_index=True)[1]
-        self.register_buffer("free", torch.from_numpy(np.setdiff1d(np.arange(len(piece)), fixed)), persistent=False)
-        self.n_pieces = len(fixed)
         self._made: tuple[Tensor, SparseSolver] | None = None
+        self.n_pieces = int(piece.max()) + 1
 
     def _solver_of(self, weights: Tensor) -> SparseSolver:
         """Inverse of the Laplacian for the current weights, which ``functional_call`` may replace."""
-        with MAKING:
-            if self._made is not None:
-                known, solver = self._made
-                alike = (known.dtype, known.device) == (weights.dtype, weights.device)
-                if known is weights or (alike and torch.equal(known, weights)):
-                    return solver
-            laplacian = graph_laplacian(self.edges.cpu().numpy(), weights.double().cpu().numpy(), len(self.piece))
-            # A copy: `share_memory()`, as for spawned workers, frees what is under the view of a tensor.
-            solver = SparseSolver(laplacian, self.free.cpu().numpy().copy())
-            self._made = weights, solver
-            return solver
+        if self._made is None or self._made[0] is not weights:
+            edges, values = self.edges.cpu().numpy(), weights.double().cpu().numpy()
+            self._made = weights, _make_solver(edges, values, len(self.piece))
+        return self._made[1]
 
     def forward(self, right: Tensor, near: Tensor) -> Tensor:
         """The shape that fits edge vectors (:meth:`right_hand_side`), with the centres of the pieces of ``near``.
@@ -75,10 +65,11 @@ class Poisson(nn.Module):
         Unreferenced vertices have the positions of ``near``. *Shape:* ``(..., V, 3), (..., V, 3) -> (..., V, 3)``.
         """
         if torch.compiler.is_exporting():
-            x = solve_exported(self.edges, self.weights, self.free, right)
+            x = solve_exported(self.edges, self.weights, right)
         else:
             # Bound to the current weights: other weights may be in place during the backward solve.
-            x = solve_by(cache(partial(self._solver_of, self.weights)), right)
+            weights = self.weights
+            x = solve_by(lambda right: self._solver_of(weights)(right), right)
         return x + self.centres(near - x)
 
     def forward_or_near(self, right: Tensor, near: Tensor) -> Tensor:
@@ -102,6 +93,40 @@ class Poisson(nn.Module):
             return (shares.double() @ x.double())[..., None, :].to(x)
         weighted = x.double() * shares.double()[:, None]
         return torch.zeros_like(weighted).index_add(-2, piece, weighted).index_select(-2, piece).to(x)
+
+
+def _make_solver(edges: IntArray, weights: FloatArray, n: int) -> SparseSolver:
+    """The inverse of the Laplacian of n vertices."""
+    # The equations determine each piece up to a translation: one vertex of each is fixed at first.
+    fixed = np.unique(label_pieces(edges, n), return_index=True)[1]
+    return SparseSolver(graph_laplacian(edges, weights, n), np.setdiff1d(np.arange(n), fixed))
+
+
+_EXPORTED = Recent(8)
+
+
+@torch.library.custom_op("torch_modal::solve_exported", mutates_args=())
+def solve_exported(edges: Tensor, weights: Tensor, right: Tensor) -> Tensor:
+    """Solve with the Laplacian of edges, as an operation of exported programs, which hold no solver.
+
+    *Shape:* ``(E, 2), (E,), (..., V, m) -> (..., V, m)``.
+    """
+    arrays = [x.detach().cpu().numpy() for x in (edges, weights.double())]
+    make = partial(_make_solver, arrays[0], arrays[1], right.shape[-2])
+    solver: SparseSolver = _EXPORTED.get(tuple(x.tobytes() for x in arrays), make)
+    return solver(right)
+
+
+def _save(ctx: Any, inputs: tuple[Tensor, ...], output: Tensor) -> None:
+    ctx.save_for_backward(*inputs[:2])
+
+
+def _backward(ctx: Any, grad: Tensor) -> tuple[None, None, Tensor]:
+    return None, None, solve_exported(*ctx.saved_tensors, grad)
+
+
+solve_exported.register_fake(lambda edges, weights, right: torch.empty_like(right))
+solve_exported.register_autograd(_backward, setup_context=_save)
 
 
 class Reconstruction(nn.Module):
@@ -133,21 +158,16 @@ class Reconstruction(nn.Module):
         labels, areas = mesh.vertex_pieces, self.areas.numpy()
         pieces = [np.flatnonzero(labels == label) for label in np.unique(labels[mesh.used])]
         largest, *loose = sorted(pieces, key=lambda piece: -float(areas[piece].sum()))
-        self.n_loose = len(loose)
-        for i, piece in enumerate(loose):
-            anchors = largest[_nearest(shape[largest], shape[piece])]
-            self.register_buffer(f"piece_{i}", torch.from_numpy(piece), persistent=False)
-            self.register_buffer(f"anchors_{i}", torch.from_numpy(anchors), persistent=False)
+        #: Vertices of each piece except the largest, and the vertices of the largest nearest to it, which it follows.
+        self.loose = []
+        for piece in loose:
+            nearest = np.argsort(KDTree(shape[piece]).query(shape[largest])[0], kind="stable")[:_N_ANCHORS]
+            self.loose.append((torch.from_numpy(piece), torch.from_numpy(largest[nearest])))
 
     @property
     def edges(self) -> Tensor:
         """Vertex indices of each edge. *Shape:* ``(E, 2)``."""
         return self.poisson.edges
-
-    @property
-    def loose(self) -> list[tuple[Tensor, Tensor]]:
-        """Vertices of each piece except the largest, and vertices of the largest that it follows."""
-        return [(getattr(self, f"piece_{i}"), getattr(self, f"anchors_{i}")) for i in range(self.n_loose)]
 
     def fit(self, wanted: Sides, near: Tensor) -> Tensor:
         """The linear part of :meth:`forward`: all pieces have the centres that they have in a shape nearby.
@@ -168,14 +188,5 @@ class Reconstruction(nn.Module):
             motion = best_fit(before, after)
             centre = (rest[..., piece] * self.poisson.shares.to(rest)[piece]).sum(-1).T[:, None]
             moved = placed[..., piece] + (motion.apply(centre) - centre).movedim(-1, 0)
-            out = out.index_copy(-1, piece, moved)
+            out = out.index_copy(-1, piece.to(out.device), moved)
         return out
-
-
-def _nearest(points: FloatArray, piece: FloatArray) -> IntArray:
-    """Indices of a few points nearest to a piece."""
-    count = min(_N_ANCHORS, len(points))
-    distances, indices = KDTree(points).query(piece, k=min(count, 4))
-    order = np.ravel(indices)[np.argsort(np.ravel(distances), kind="stable")]
-    _, first = np.unique(order, return_index=True)
-    return order[np.sort(first)][:count]

@@ -159,7 +159,7 @@ def looks_mirrored(first: Tensor, second: Tensor, faces: Tensor) -> Tensor:
     return gain > MIRRORED * total
 
 
-def signed_volumes(x: Tensor, faces: Tensor) -> Tensor:
+def volumes_of(x: Tensor, faces: Tensor) -> Tensor:
     """Volumes of closed shapes: heights of their faces over a plane, times areas in it.
 
     *Shape:* ``(..., V, 3), (F, 3) -> (...)``.

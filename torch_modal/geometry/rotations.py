@@ -7,26 +7,14 @@ first, as in :mod:`~torch_modal.geometry.vectors`.
 
 from math import factorial, pi
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from torch_modal.arrays import FloatArray
 from torch_modal.geometry.vectors import cross
 
 # Squared half angle below which series are evaluated: they are exact to rounding there, and beyond it closed forms lose
 # at most six digits when differentiated twice.
 SMALL = 1e-3
-# Matrices of rotations are linear in the products of the entries of their quaternions, and these in the matrices; of
-# both, the identity is left out. *Shape:* ``(9, 16)`` and, of four times the products, ``(16, 9)``.
-_EYE = np.eye(3)
-_CROSS = np.cross(_EYE[:, None], _EYE)
-_MATRIX, _PRODUCTS = np.zeros((3, 3, 4, 4)), np.zeros((4, 4, 3, 3))
-_MATRIX[..., 0, 1:] = -2 * _CROSS
-_MATRIX[..., 1:, 1:] = 2 * (np.einsum("ia,jb->ijab", _EYE, _EYE) - np.einsum("ij,ab->ijab", _EYE, _EYE))
-_PRODUCTS[0, 0], _PRODUCTS[0, 1:], _PRODUCTS[1:, 0] = _EYE, -_CROSS, -_CROSS
-_PRODUCTS[1:, 1:] = np.einsum("ai,bj->abij", _EYE, _EYE) + np.einsum("aj,bi->abij", _EYE, _EYE)
-_PRODUCTS[1:, 1:] -= np.einsum("ab,ij->abij", _EYE, _EYE)
 _COS = [(-1) ** k / factorial(2 * k) for k in range(4)]
 _SINC = [(-1) ** k / factorial(2 * k + 1) for k in range(4)]
 _ARC = [(-1) ** k / (2 * k + 1) for k in range(5)]
@@ -66,7 +54,15 @@ def log(rotation: Tensor) -> Tensor:
 def quaternion(rotation: Tensor) -> Tensor:
     """Quaternion of a rotation, of either sign. *Shape:* ``(3, 3, ...) -> (4, ...)``."""
     # Four times the quaternion's products with itself. The row of its largest entry is far from zero.
-    products = _linear(_PRODUCTS, rotation)
+    (a, b, c), (d, e, f), (g, h, i) = rotation
+    wx, wy, wz, xy, xz, yz = h - f, c - g, d - b, b + d, c + g, f + h
+    rows = (
+        [1 + a + e + i, wx, wy, wz],
+        [wx, 1 + a - e - i, xy, xz],
+        [wy, xy, 1 - a + e - i, yz],
+        [wz, xz, yz, 1 - a - e + i],
+    )
+    products = torch.stack([torch.stack(row) for row in rows])
     w, x, y, z = products.diagonal().unbind(-1)
     # Elementwise, at a tenth of what argmax takes over few long rows.
     first, second = torch.where(x > w, 1, 0), torch.where(z > y, 3, 2)
@@ -77,15 +73,13 @@ def quaternion(rotation: Tensor) -> Tensor:
 
 def matrix(q: Tensor) -> Tensor:
     """Rotation matrix of a quaternion of norm one. *Shape:* ``(4, ...) -> (3, 3, ...)``."""
-    return _linear(_MATRIX, q[:, None] * q)
-
-
-def _linear(table: FloatArray, x: Tensor) -> Tensor:
-    """The identity plus a linear function of matrices. *Shape:* ``(m, m, n, n), (n, n, ...) -> (m, m, ...)``."""
-    m, n = len(table), table.shape[-1]
-    matrix_of_table = torch.as_tensor(table.reshape(m * m, n * n), dtype=x.dtype, device=x.device)
-    eye = torch.eye(m, dtype=x.dtype, device=x.device).view(m, m, *[1] * (x.dim() - 2))
-    return torch.tensordot(matrix_of_table, x.flatten(0, 1), 1).unflatten(0, (m, m)) + eye
+    w, x, y, z = q
+    rows = (
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    )
+    return torch.stack([torch.stack(row) for row in rows])
 
 
 def product(p: Tensor, q: Tensor) -> Tensor:

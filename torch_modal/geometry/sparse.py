@@ -22,7 +22,7 @@ from scipy.sparse.linalg import SuperLU, splu
 from torch import Tensor
 
 from torch_modal.arrays import FloatArray, IntArray
-from torch_modal.autograd import Recent, disable_compile, linear_map
+from torch_modal.autograd import disable_compile, linear_map
 
 try:
     import cholespy
@@ -35,8 +35,8 @@ Solve = Callable[[Tensor], Tensor]
 # Right-hand sides per solve: more are not faster and use more memory; CUDA allows at most 128.
 MOST_COLUMNS = 48
 
-MAKING = threading.RLock()
-"""Lock of factorisations: threads that need the same factors compute them once."""
+# Threads that need the same factors compute them once.
+_MAKING = threading.RLock()
 
 
 def factorize(matrix: sparse.spmatrix, ordering: str = "MMD_AT_PLUS_A") -> SuperLU:
@@ -85,7 +85,7 @@ class SparseSolver:
         columns = right.detach().to(device, torch.float64).movedim(-2, 0)
         if not columns.numel():
             return torch.zeros_like(right)
-        with MAKING:
+        with _MAKING:
             if device not in self._solves:
                 _SOLVERS.add(self)
                 self._solves[device] = _superlu(self._inner) if cholespy is None else _cholesky(self._inner, device)
@@ -144,12 +144,9 @@ def _cholesky(matrix: sparse.csr_matrix, device: torch.device) -> Solve:
 
 
 @disable_compile
-def solve_by(solver: Callable[[], Solve], right: Tensor) -> Tensor:
-    """Solve with gradients, which are solves, too. *Shape:* ``(..., V, m) -> (..., V, m)``.
-
-    The solver is made lazily: inside ``torch.func`` transforms, tensors cannot be read earlier.
-    """
-    return linear_map(lambda x: solver()(x), lambda x: solver()(x), right)
+def solve_by(solver: Solve, right: Tensor) -> Tensor:
+    """Solve with gradients, which are solves, too. *Shape:* ``(..., V, m) -> (..., V, m)``."""
+    return linear_map(solver, solver, right)
 
 
 def graph_laplacian(edges: IntArray, weights: FloatArray, n: int) -> sparse.csr_matrix:
@@ -157,36 +154,3 @@ def graph_laplacian(edges: IntArray, weights: FloatArray, n: int) -> sparse.csr_
     half = sparse.coo_matrix((weights, (edges[:, 0], edges[:, 1])), shape=(n, n))
     adjacency = (half + half.T).tocsr()
     return (sparse.diags(np.asarray(adjacency.sum(1)).reshape(-1)) - adjacency).tocsr()
-
-
-_EXPORTED = Recent(8)
-
-
-@torch.library.custom_op("torch_modal::solve_exported", mutates_args=())
-def solve_exported(edges: Tensor, weights: Tensor, free: Tensor, right: Tensor) -> Tensor:
-    """Solve with the Laplacian of edges, as an operation of exported programs, which hold no solver.
-
-    Unknowns that are not free are zero. *Shape:* ``(E, 2), (E,), (n,), (..., V, m) -> (..., V, m)``.
-    """
-    arrays = [x.detach().cpu().numpy() for x in (edges, weights.double(), free)]
-
-    def make() -> SparseSolver:
-        return SparseSolver(graph_laplacian(arrays[0], arrays[1], right.shape[-2]), arrays[2].copy())
-
-    return _EXPORTED.get(tuple(x.tobytes() for x in arrays), make)(right)
-
-
-@solve_exported.register_fake
-def _(edges: Tensor, weights: Tensor, free: Tensor, right: Tensor) -> Tensor:
-    return right.new_empty(right.shape)
-
-
-def _save(ctx: Any, inputs: tuple[Tensor, ...], output: Tensor) -> None:
-    ctx.save_for_backward(*inputs[:3])
-
-
-def _backward(ctx: Any, grad: Tensor) -> tuple[None, None, None, Tensor]:
-    return None, None, None, solve_exported(*ctx.saved_tensors, grad)
-
-
-solve_exported.register_autograd(_backward, setup_context=_save)

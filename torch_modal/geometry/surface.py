@@ -6,7 +6,6 @@ import numpy as np
 
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.geometry.connectivity import Connectivity, vertex_areas
-from torch_modal.geometry.triangle_pairs import cross
 from torch_modal.geometry.vectors import vertex_normals
 
 
@@ -31,7 +30,7 @@ class Surface:
     def area_vectors(self) -> FloatArray:
         """Normals of the faces times their areas. *Shape:* ``(F, 3)``."""
         a, b, c = self.vertices[self.faces.T]
-        return 0.5 * cross(b - a, c - a)
+        return 0.5 * np.cross(b - a, c - a)
 
     @cached_property
     def face_areas(self) -> FloatArray:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torch_modal.geometry.rotations import SMALL, arc, product, rotate_by
+from torch_modal.geometry.rotations import arc, product, rotate_by
 from torch_modal.geometry.vectors import cross, inverse, norm, pick, tiny
 
 # Smallest area relative to the squared sides; below, the normal is rounding, and divisions amplify noise.
@@ -55,15 +55,15 @@ class Frames(NamedTuple):
         return 0.5 * (self.xx + self.yy)
 
     @property
-    def doubled_areas(self) -> Tensor:
+    def twice_areas(self) -> Tensor:
         """*Shape:* ``(B, F)``."""
-        return doubled_areas(self.xx, self.xy, self.yy)
+        return twice_areas(self.xx, self.xy, self.yy)
 
     @property
     def slenderness(self) -> Tensor:
         """Altitude over longest side. *Shape:* ``(B, F)``."""
         (a, b), (c, d) = transform(self.xx, self.xy, self.xy, self.yy)
-        return self.doubled_areas / torch.stack([x * x + y * y for x, y in ((a, b), (c, d), (c - a, d - b))]).amax(0)
+        return self.twice_areas / torch.stack([x * x + y * y for x, y in ((a, b), (c, d), (c - a, d - b))]).amax(0)
 
 
 def sides(x: Tensor, faces: Tensor) -> Sides:
@@ -94,7 +94,7 @@ def frames_of(shapes: Tensor, faces: Tensor) -> Frames:
     return frames(sides(shapes.movedim(-1, 0).contiguous(), faces))
 
 
-def doubled_areas(xx: Tensor, xy: Tensor, yy: Tensor) -> Tensor:
+def twice_areas(xx: Tensor, xy: Tensor, yy: Tensor) -> Tensor:
     """Twice the areas of equilateral triangles with a side of 1 after a stretch. *Shape of each:* ``(B, F)``."""
     return HEIGHT * (xx * yy - xy * xy)
 
@@ -151,7 +151,7 @@ def stretch(strain: Tensor, xx: Tensor, xy: Tensor, yy: Tensor) -> tuple[tuple[T
     return transform(*_product(_exponential(*strain), (xx, xy, yy)))
 
 
-def bent_sides(rotation: Tensor, strain: Tensor, reference: Frames) -> Sides:
+def bend_sides(rotation: Tensor, strain: Tensor, reference: Frames) -> Sides:
     """Sides after a bend: stretched in their plane, then turned by the finite rotation of the same axis and angle.
 
     The stretch is the exponential of the strain: shear keeps the area, and no triangle inverts.
@@ -166,7 +166,7 @@ def bent_sides(rotation: Tensor, strain: Tensor, reference: Frames) -> Sides:
 
 
 def bending_between(reference: Frames, other: Frames, quaternions: Tensor) -> tuple[Tensor, Tensor]:
-    """Rotation and strain from one shape to another: :func:`bent_sides` of it are the sides of the other.
+    """Rotation and strain from one shape to another: :func:`bend_sides` of it are the sides of the other.
 
     Args:
         reference: Frames of the shape that bends.
@@ -179,7 +179,7 @@ def bending_between(reference: Frames, other: Frames, quaternions: Tensor) -> tu
     return rotation, torch.stack(_logarithm(*entries))
 
 
-def mirrored_sides(centre: Frames, other: Frames) -> Sides:
+def mirror_sides(centre: Frames, other: Frames) -> Sides:
     r"""Sides of the shape that lies as far beyond ``centre`` as ``other`` lies before it.
 
     From ``centre`` to ``other`` a triangle turns by ``R`` and stretches by ``U``. The mirror image turns by ``R^T``
@@ -214,11 +214,7 @@ def _polar(reference: Frames, other: Frames) -> tuple[Tensor, ...]:
 def _inverse(frame: Frames) -> tuple[Tensor, Tensor, Tensor]:
     """The inverse of the stretch, by entries. *Shape of each:* ``(B, F)``."""
     determinant = frame.xx * frame.yy - frame.xy * frame.xy
-    return (
-        frame.yy / determinant,
-        -frame.xy / determinant,
-        frame.xx / determinant,
-    )
+    return frame.yy / determinant, -frame.xy / determinant, frame.xx / determinant
 
 
 def _product(a: tuple[Tensor, ...], b: tuple[Tensor, ...]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -230,13 +226,8 @@ def _product(a: tuple[Tensor, ...], b: tuple[Tensor, ...]) -> tuple[Tensor, Tens
 def _logarithm(xx: Tensor, xy: Tensor, yy: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Matrix logarithm of symmetric positive definite 2 x 2 matrices, by entries."""
     mean, half = 0.5 * (xx + yy), 0.5 * (xx - yy)
-    squared = half**2 + xy**2
-    small = squared < SMALL * mean**2
-    radius = torch.where(small, 1, squared).sqrt()
-    ratio = torch.where(small, squared / mean**2, 0)
-    near = (1 + ratio * (1 / 3 + ratio * (1 / 5 + ratio / 7))) / mean
-    odd = torch.where(small, near, torch.atanh(torch.where(small, 0, radius / mean)) / radius)
-    even = 0.5 * (mean**2 - squared).log()
+    radius = (half**2 + xy**2).clamp_min(tiny(xx)).sqrt()
+    even, odd = 0.5 * (mean**2 - radius**2).log(), torch.atanh(radius / mean) / radius
     return even + odd * half, odd * xy, even - odd * half
 
 

@@ -54,8 +54,5 @@ def vertex_normals(x: Array, faces: Tensor | IntArray) -> Array:
     rows = x.movedim(-1, 0).contiguous()
     a, b, c = (pick(rows, corner) for corner in faces.unbind(1))
     doubled = cross(b - a, c - a)
-    # Scaled against underflow of squared areas.
-    largest = doubled.detach().abs().amax((0, -1), keepdim=True)
-    doubled = doubled / torch.where(largest > 0, largest, 1)
     summed = torch.zeros_like(rows).index_add(-1, faces.T.flatten(), torch.cat([doubled] * 3, -1))
     return torch.nn.functional.normalize(summed, dim=0, eps=torch.finfo(x.dtype).tiny ** 0.5).movedim(0, -1)

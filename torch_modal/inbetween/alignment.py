@@ -11,7 +11,7 @@ from torch_modal.elastic.backend import TorchBackend
 from torch_modal.errors import MeshWarning
 from torch_modal.geometry.canonical import CANONICAL_SIZE, size
 from torch_modal.geometry.connectivity import Connectivity, vertex_areas
-from torch_modal.geometry.rigid import best_rotation, centroid, looks_mirrored, signed_volumes
+from torch_modal.geometry.rigid import best_rotation, centroid, looks_mirrored, volumes_of
 
 # A key-frame smaller than this part of the reference is a point.
 SMALLEST_SIZE = 1e-6
@@ -134,7 +134,7 @@ class KeyframeAlignment(nn.Module):
         """True for mirror images of the heaviest, of closed surfaces. *Shape:* ``(B, K, V, 3), (B, K) -> (B, K)``."""
         if not self.closed:
             return torch.zeros_like(weights, dtype=torch.bool)
-        volumes, heaviest = signed_volumes(shapes, self.faces), weights.argmax(1, keepdim=True)
+        volumes, heaviest = volumes_of(shapes, self.faces), weights.argmax(1, keepdim=True)
         inverted = volumes * volumes.gather(1, heaviest) < 0
         if is_eager(inverted) and not inverted.any():
             return inverted
@@ -147,10 +147,8 @@ class KeyframeAlignment(nn.Module):
         if self.size_warned or not is_eager(sizes):
             return
         ratios = sizes / self.extent
-        if bool(((ratios < OTHER_SIZE) & (ratios > 1 / OTHER_SIZE)).all()):
-            return
-        other = (ratios > SMALLEST_SIZE) & ((ratios > OTHER_SIZE) | (ratios < 1 / OTHER_SIZE)) & ratios.isfinite()
-        if not bool(other.any()) or self.size_warned:  # perhaps by another thread
+        other = (ratios > SMALLEST_SIZE) & ratios.isfinite() & ((ratios > OTHER_SIZE) | (ratios < 1 / OTHER_SIZE))
+        if not bool(other.any()):
             return
         self.size_warned = True
         warnings.warn(

@@ -9,6 +9,7 @@ from torch_modal import trees
 from torch_modal.autograd import as_normal_tensor, is_double_backward, outside_inference_mode, run_outside_transforms
 from torch_modal.elastic.energy import AssembledTerm, Energy, EnergyAt, Linearised, Reference, energy_rounding
 from torch_modal.elastic.minimise import Solution, Status
+from torch_modal.elastic.steps import conjugate_gradients
 from torch_modal.geometry.canonical import CANONICAL_SIZE
 from torch_modal.geometry.sparse import Solve, factorize, solve_by
 
@@ -47,10 +48,6 @@ class FreeVertices(nn.Module):
         super().__init__()
         self.energy = energy
         self.register_buffer("free", free, persistent=False)
-        numbers = np.full(energy.n_extended, -1)
-        numbers[free.numpy()] = np.arange(len(free))
-        #: Of each term that is no total, the entries of its elements' Hessians between free coordinates, and where.
-        self.entries = [_entries(summand, numbers) for summand in energy.parts if not summand.term.total]
 
     @property
     def n_amplitudes(self) -> int:
@@ -147,11 +144,11 @@ class FreeVertices(nn.Module):
             return torch.cat([solvers[i % len(solvers)](row) for i, row in enumerate(rows)]).view_as(right)
 
         def solve(right: Tensor) -> Tensor:
-            solution = solve_by(lambda: solve_all, right)
+            solution = solve_by(solve_all, right)
             if is_double_backward(solution, a, *tensors):
                 # Its derivative is the derivative of the Hessian's product, solved once more.
                 product = torch.func.vjp(lambda a: self.value_and_gradient(a, placement)[1], a)[1](solution)[0]
-                solution = solution + solve_by(lambda: solve_all, torch.where(converged[:, None], right - product, 0))
+                solution = solution + solve_by(solve_all, torch.where(converged[:, None], right - product, 0))
             return solution
 
         return solve
@@ -173,25 +170,10 @@ class FreeVertices(nn.Module):
                 leaf = a.detach().requires_grad_()
                 return torch.autograd.grad(self.value_and_gradient(leaf, placement)[1], leaf, field)[0]
 
-        def solve(right: Tensor) -> Tensor:
-            residual, solution = right, torch.zeros_like(right)
-            direction = preconditioned = precondition(residual)
-            size = first = (residual * preconditioned).sum()
-            for k in range(MOST_ITERATIONS):
-                along = product(direction)
-                curvature = (direction * along).sum()
-                if not curvature > 0:
-                    return solution if k else preconditioned
-                solution = solution + size / curvature * direction
-                residual = residual - size / curvature * along
-                preconditioned = precondition(residual)
-                previous, size = size, (residual * preconditioned).sum()
-                if not size > tolerance**2 * first:
-                    break
-                direction = preconditioned + size / previous * direction
-            return solution
+        def dot(a: Tensor, b: Tensor) -> Tensor:
+            return (a * b).sum()
 
-        return solve
+        return lambda right: conjugate_gradients(product, precondition, dot, right, MOST_ITERATIONS, tolerance)
 
     def _factors(self, at: EnergyAt, placement: Placement, convex: bool) -> Solve:
         """The inverse of the Hessian of all but totals, or of its part that is never negative.
@@ -199,29 +181,22 @@ class FreeVertices(nn.Module):
         Raises:
             ValueError: It is not positive definite.
         """
-        n, entries, values = self.n_amplitudes, iter(self.entries), []
-        rows, columns = (np.concatenate(each) for each in zip(*(entry[1:] for entry in self.entries), strict=True))
+        free, axes = self.free.cpu().numpy(), np.arange(3)
+        unknowns = (3 * free[:, None] + axes).reshape(-1)
+        whole = sparse.csr_matrix((3 * self.energy.n_extended,) * 2)
         for summand, one in zip(self.energy.parts, at.terms, strict=True):
             if not summand.term.total:
                 blocks = _hessians(summand, one, convex)[..., 0, :].cpu().numpy()
-                values.append(blocks.reshape(-1)[next(entries)[0]])
-        whole = sparse.coo_matrix((np.concatenate(values), (rows, columns)), shape=(n, n)).tocsr()
+                coordinates = 3 * summand.corners.cpu().numpy()[:, None] + axes[:, None]  # (n, 3, M)
+                rows = np.broadcast_to(coordinates[:, :, None, None], blocks.shape)
+                columns = np.broadcast_to(coordinates, blocks.shape)
+                entries = blocks.reshape(-1), (rows.reshape(-1), columns.reshape(-1))
+                whole = whole + sparse.csr_matrix(entries, whole.shape)
         # Not CHOLMOD, which prints where a matrix is indefinite.
-        factors = factorize(whole + float(self._ridge(placement)) * sparse.eye(n, format="csr"))
+        factors = factorize(whole[unknowns][:, unknowns] + float(self._ridge(placement)) * sparse.eye(len(unknowns)))
         if not factors.U.diagonal().min() > 0:
             raise ValueError("the Hessian is not positive definite")
         return lambda right: torch.from_numpy(factors.solve(right.cpu().numpy().T).T).to(right)
-
-
-def _entries(summand: AssembledTerm, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Places among the entries of all elements' Hessians, ``(n, 3, n, 3, M)``; rows and columns of the matrix."""
-    vertex = numbers[summand.corners.numpy()]  # (n, M)
-    coordinate = np.where(vertex[:, None] >= 0, 3 * vertex[:, None] + np.arange(3)[:, None], -1)  # (n, 3, M)
-    shape = (*coordinate.shape[:2], *coordinate.shape)
-    rows = np.broadcast_to(coordinate[:, :, None, None], shape).reshape(-1)
-    columns = np.broadcast_to(coordinate, shape).reshape(-1)
-    places = np.flatnonzero((rows >= 0) & (columns >= 0))
-    return places, rows[places], columns[places]
 
 
 def _hessians(summand: AssembledTerm, one: Linearised, convex: bool) -> Tensor:

@@ -1,13 +1,14 @@
 """Flat batches of in-betweens, their results, and warnings about those that did not converge."""
 
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
+from torch_modal import trees
 from torch_modal.autograd import is_eager, is_traced, is_transformed, run_outside_transforms
 from torch_modal.elastic.implicit import ConvergenceWarning
 from torch_modal.elastic.minimise import Solution, Status
@@ -29,19 +30,10 @@ class InBetweenResult(NamedTuple):
     """In the paired space, ``x1*`` near the first key-frame; the shapes are the mean of ``first`` and ``second``."""
     second: Tensor | None = None
     """In the paired space, ``x2*`` near the second key-frame."""
-    shell_energy: Tensor | None = None
-    """In the paired space, the mean of Eq. 5 from both key-frames, on the fine mesh. *Shape:* ``(...)``."""
-    linear_energy: Tensor | None = None
-    """The mean energy of linear interpolation. *Shape:* ``(...)``."""
 
     def unflatten(self, lead: torch.Size) -> "InBetweenResult":
         """A flat batch with these leading dimensions."""
-
-        def each(values: Iterable[Tensor | None]) -> Iterator[Tensor | None]:
-            return (None if value is None else value.reshape(lead + value.shape[1:]) for value in values)
-
-        shapes, *others = each([self.shapes, *self[2:]])
-        return InBetweenResult(shapes, Solution(*each(self.solution)), *others)  # type: ignore[arg-type]
+        return trees.map_leaves(self, lambda x: x.reshape(lead + x.shape[1:]))  # type: ignore[no-any-return]
 
 
 class Samples(NamedTuple):

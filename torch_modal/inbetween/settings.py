@@ -170,28 +170,30 @@ def settings(
     return Settings(objective, solver)
 
 
-def stiffnesses(terms: Iterable[Term], energy: Energy, like: Tensor, lead: torch.Size, encloses: bool) -> list[Tensor]:
-    """Stiffnesses of terms in a flat batch; that of the volume is 0 where there is none.
-
-    *Shape of each:* ``(B, M)`` or ``(B, 1)``.
+def expand_to_samples(name: str, values: float | Tensor, n: int, like: Tensor, lead: torch.Size) -> Tensor:
+    """Values of elements for each sample of a flat batch. *Shape:* ``(..., n)`` or ``(..., 1)``, to ``(B, n or 1)``.
 
     Raises:
-        ValueError: A stiffness has neither one value nor one of each element, or does not broadcast.
+        ValueError: There is neither one value nor one of each element, or they do not broadcast.
     """
+    values = torch.as_tensor(values, dtype=like.dtype, device=like.device)
+    values = values[None] if values.dim() == 0 else values
+    try:
+        if values.shape[-1] not in (1, n):
+            raise RuntimeError
+        return values.expand(*lead, values.shape[-1]).reshape(-1, values.shape[-1])
+    except RuntimeError:
+        raise ValueError(
+            f"{name} has shape {tuple(values.shape)}; its last dimension counts the {n} elements or is 1, its others "
+            f"broadcast against samples of {tuple(lead)}: one for each sample is values[:, None]"
+        ) from None
+
+
+def stiffnesses(terms: Iterable[Term], energy: Energy, like: Tensor, lead: torch.Size, encloses: bool) -> list[Tensor]:
+    """Stiffnesses of terms in a flat batch, 0 of volumes that are not enclosed. *Shape of each:* ``(B, M or 1)``."""
     flat = []
     for term, summand in zip(terms, energy.parts, strict=True):
-        values = torch.as_tensor(term.stiffness, dtype=like.dtype, device=like.device)
-        values = values[None] if values.dim() == 0 else values
-        values = values if encloses or not isinstance(term, Volume) else 0 * values
         n = 1 if term.total else summand.corners.shape[1]
-        try:
-            if values.shape[-1] not in (1, n):
-                raise RuntimeError
-            flat.append(values.expand(*lead, values.shape[-1]).reshape(-1, values.shape[-1]))
-        except RuntimeError:
-            raise ValueError(
-                f"a stiffness of {type(term).__name__} has shape {tuple(values.shape)}; its last dimension counts "
-                f"the {n} elements or is 1, its others broadcast against samples of {tuple(lead)}: one for each "
-                "sample is values[:, None]"
-            ) from None
+        values = expand_to_samples(f"a stiffness of {type(term).__name__}", term.stiffness, n, like, lead)
+        flat.append(values if encloses or not isinstance(term, Volume) else 0 * values)
     return flat

@@ -100,7 +100,7 @@ class InBetweenSolver(nn.Module):
         base = straight if self.blend is None else self.blend(shapes, weights, straight)
         solution = self.minimise_amplitudes(base, rests, samples.mu, usable)
         if self.blend is None:
-            return self.finish_paired(straight, rests, solution, pose)
+            return self.finish_paired(rests, solution, pose)
         x = base if self.space is None else self.space.lift(solution.amplitudes, base)
         x = self.relax(x, rests)
         # No shape is better for being far from a key-frame with a weight below zero.
@@ -111,23 +111,16 @@ class InBetweenSolver(nn.Module):
         x = x if is_eager(valid) and valid.all() else torch.where(valid[:, None, None], x, torch.nan)
         return InBetweenResult(x, solution)
 
-    def finish_paired(self, straight: Tensor, rests: RestShapes, solution: Solution, pose: Pose) -> InBetweenResult:
+    def finish_paired(self, rests: RestShapes, solution: Solution, pose: Pose) -> InBetweenResult:
         """The two shapes of Eq. 4, interpolated locally, and their mean, as in the paper."""
         ends = self.space.lift(solution.amplitudes, rests.shapes)
         if self.local is not None:
             ends, status = self.local(ends, rests, solution.status != Status.INVALID)
             solution = solution._replace(status=torch.where(solution.converged, status, solution.status))
         x = self.relax((ends[0] + ends[1]) / 2, rests)
-        energies = [self.mean_energy(shape, rests) for shape in (x, straight)]
         valid = (solution.status != Status.INVALID)[:, None, None]
         first, second, x = (torch.where(valid, self.alignment.to_caller(y, pose), torch.nan) for y in (*ends, x))
-        return InBetweenResult(x, solution, first, second, *energies)
-
-    @torch.no_grad()
-    def mean_energy(self, x: Tensor, rests: RestShapes) -> Tensor:
-        """Mean of Eq. 5 from two key-frames to shapes, on the fine mesh. *Shape:* ``(B, V, 3) -> (B,)``."""
-        energy, anchors = self.fine.energy, None if rests.anchors is None else rests.anchors.movedim(-1, 0)
-        return energy.value(energy.extend(x.movedim(-1, 0).contiguous(), anchors), rests.reference(energy))
+        return InBetweenResult(x, solution, first, second)
 
     def minimise_amplitudes(self, base: Tensor, rests: RestShapes, mu: Tensor, usable: Tensor) -> Solution:
         """Amplitudes of least energy in the modal space. *Shape:* of ``mu`` and ``usable`` ``(B,)``."""

@@ -136,7 +136,7 @@ def _repair(faces: IntArray, n_vertices: int) -> tuple[Connectivity, bool, list[
 
     for flaw, what in (
         (inspect.degenerate_faces, "use a vertex twice"),
-        (inspect.repeated_faces, "have the same vertices as an earlier face"),
+        (inspect.find_repeated_faces, "have the same vertices as an earlier face"),
     ):
         bad = flaw(faces[kept])
         messages.append(_count(np.argwhere(bad), f"faces {what} and were dropped", name))
@@ -188,7 +188,7 @@ def _check_sizes(shapes: FloatArray, mesh: Connectivity, dtype: torch.dtype) -> 
 
 def _refuse_mirrored(scaled: FloatArray, faces: IntArray) -> None:
     """Reject closed meshes that are mirror images of each other. *Shape:* ``(K, V, 3), (F, 3)``."""
-    volumes = np.array([inspect.signed_volume(shape, faces) for shape in scaled])
+    volumes = np.array([inspect.volume_of(shape, faces) for shape in scaled])
     positive, turned = int(volumes.argmax()), np.flatnonzero(volumes < -_LEAST_VOLUME)
     if volumes[positive] > _LEAST_VOLUME and len(turned):
         first, others = (torch.from_numpy(scaled[rows]) for rows in ([positive] * len(turned), turned))

@@ -14,7 +14,7 @@ from torch_modal.elastic.volume import encloses
 from torch_modal.geometry.bodies import bodies
 from torch_modal.geometry.canonical import own_order
 from torch_modal.inbetween.results import InBetweenResult, Samples, join_bodies
-from torch_modal.inbetween.settings import Settings, stiffnesses
+from torch_modal.inbetween.settings import Settings, expand_to_samples, stiffnesses
 from torch_modal.inbetween.solver import InBetweenSolver
 from torch_modal.keyframes.arrays import as_faces, as_positions, check_tensor
 from torch_modal.keyframes.check import check_surface
@@ -59,36 +59,17 @@ class PreciseModule(nn.Module):
     bases: Any
     faces: Tensor
     built_from: Tensor
-    _known: list[int] | None = None  # identities of tensors that are the bases' own
 
     @outside_inference_mode
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "PreciseModule":
         """Never below float32."""
 
-        def kept(tensor: Tensor) -> Tensor:
+        def convert(tensor: Tensor) -> Tensor:
             out = fn(tensor)
             low = out.is_floating_point() and torch.finfo(out.dtype).bits < 32
             return tensor.to(out.device, torch.float32) if low else out
 
-        return super()._apply(kept, recurse)
-
-    def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
-        """Load a state as torch does, but refuse one that does not fit as a whole, before any of it is loaded."""
-        self._check_state(state_dict, "", strict)
-        return super().load_state_dict(state_dict, strict, assign)
-
-    def _load_from_state_dict(self, state_dict: Mapping[str, Any], prefix: str, *others: Any) -> None:
-        self._check_state(state_dict, prefix, strict=False)
-        super()._load_from_state_dict(state_dict, prefix, *others)
-
-    def _check_state(self, state_dict: Mapping[str, Any], prefix: str, strict: bool) -> None:
-        present, state = self.state_dict(prefix=prefix), {k: x for k, x in state_dict.items() if k.startswith(prefix)}
-        wrong = [name for name in present.keys() & state.keys() if present[name].shape != state[name].shape]
-        if wrong := sorted([*wrong, *(present.keys() ^ state.keys() if strict else [])]):
-            what = ", ".join(f"{name} {tuple(state[name].shape) if name in state else 'missing'}" for name in wrong[:4])
-            raise RuntimeError(f"the state does not fit this {type(self).__name__}, which stays as it is: {what}")
-        names = [f"{prefix}bases.{i}.reference" for i in range(len(self.bases))]
-        check_surface([state.get(name, present[name]).double().cpu() for name in names], self.faces.cpu())
+        return super()._apply(convert, recurse)
 
     def check_shapes(self, *sizes: int | str, **shapes: Tensor) -> None:
         """Raise a ValueError for shapes that do not fit the mesh, sizes of their leading dimensions, or the device."""
@@ -96,21 +77,29 @@ class PreciseModule(nn.Module):
         for name, x in shapes.items():
             check_tensor(name, x, "...", *sizes, *reference.shape, device=reference.device)
 
+    def _load_from_state_dict(self, state_dict: Mapping[str, Any], prefix: str, *others: Any) -> None:
+        """Load a state as torch does, but refuse tensors that do not fit, before any of them is loaded."""
+        present = self.state_dict(prefix=prefix)
+        state = {name: state_dict.get(name, x) for name, x in present.items()}
+        if wrong := [f"{name} {tuple(x.shape)}" for name, x in state.items() if x.shape != present[name].shape]:
+            what = ", ".join(wrong[:4])
+            raise RuntimeError(f"the state does not fit this {type(self).__name__}, which stays as it is: {what}")
+        references = [state[f"{prefix}bases.{i}.reference"].double().cpu() for i in range(len(self.bases))]
+        check_surface(references, self.faces.cpu())
+        super()._load_from_state_dict(state_dict, prefix, *others)
+
     def _marks(self) -> Tensor:
         """Numbers that identify the bases. *Shape:* ``(K, 3)``."""
         return torch.stack([torch.cat([b.reference, *b.modes[-1:]]).square().mean(0) for b in self.bases])
 
     def _require_own_bases(self) -> None:
         """Raise where ``functional_call`` has replaced the bases, and not what follows from them."""
-        seen = [id(x) for basis in self.bases for x in (basis.reference, basis.modes)]
-        if seen == self._known or not is_eager(marks := self._marks()):
-            return
-        if not torch.allclose(marks.to(self.built_from), self.built_from, 1e-4, 0.0):
+        marks = self._marks()
+        if is_eager(marks) and not torch.allclose(marks.to(self.built_from), self.built_from, 1e-4, 0.0):
             raise RuntimeError(
                 f"the bases of this {type(self).__name__} were replaced, and not what it computed from its own: load "
                 "them by load_state_dict, or make a layer of them"
             )
-        self._known = seen
 
 
 class InBetweenLayer(PreciseModule):
@@ -187,22 +176,13 @@ class InBetweenLayer(PreciseModule):
         n, item = weights.shape[-1], keyframes.shape[-2:]
         flat = keyframes.to(self.dtype).expand(*lead, n, *item).reshape(-1, n, *item)
         flat_weights = weights.to(self.dtype).expand(*lead, n).reshape(-1, n)
-        mu, results = self.mu_of(flat_weights, lead), []
+        mu = expand_to_samples("mu[..., None]", torch.as_tensor(self.mu)[..., None], 1, flat_weights, lead)[:, 0]
+        results = []
         for i, (vertices, core) in enumerate(zip(self.vertices, self.cores, strict=True)):
             samples = Samples(flat[:, :, vertices], flat_weights, mu, self.stiffness_of(flat_weights, lead, i))
             # Further terms may have parameters of their own.
             results.append(by_chunks(core, samples, samples.keyframes.shape[2], closed=not self.objective.terms))
         return join_bodies(results, self.vertices).unflatten(lead)
-
-    def mu_of(self, like: Tensor, lead: torch.Size) -> Tensor:
-        """``mu`` of a flat batch of these leading dimensions. *Shape:* ``(B,)``."""
-        mu = torch.as_tensor(self.mu, dtype=like.dtype, device=like.device)
-        try:
-            return mu.expand(lead).reshape(-1)
-        except RuntimeError:
-            raise ValueError(
-                f"mu of shape {tuple(mu.shape)} does not broadcast against samples of {tuple(lead)}"
-            ) from None
 
     def stiffness_of(self, like: Tensor, lead: torch.Size, body: int = 0) -> list[Tensor]:
         """Stiffnesses of a body in a flat batch, of each term. *Shape of each:* ``(B, M)`` or ``(B, 1)``."""

@@ -85,22 +85,17 @@ class Blend(InBetweenLayer):
     @disable_compile
     def solve(self, keyframes: Tensor, weights: Tensor) -> InBetweenResult:
         """The shapes, and how each minimisation went, without a warning. Arguments as for :meth:`forward`."""
-        lead = self._check(keyframes, weights)
+        check_tensor("weights", weights, "...", "K", device=self.bases[0].reference.device)
+        self.check_shapes(weights.shape[-1], keyframes=keyframes)
+        lead = broadcast_leading(keyframes=keyframes.shape[:-3], weights=weights.shape[:-1])
+        if not is_traced(weights):
+            run_outside_transforms(_check_weights, weights)
         normalised = weights
         if torch.finfo(weights.dtype).bits < 32:  # of an autocast model: to more digits, they do not add up to one
             normalised = weights.to(self.dtype)
             normalised = normalised / normalised.sum(-1, keepdim=True)
         result = self.solve_samples(keyframes, normalised, lead)
         return result._replace(shapes=with_exact_keyframes(result.shapes, keyframes, weights))
-
-    def _check(self, keyframes: Tensor, weights: Tensor) -> torch.Size:
-        """The leading dimensions of the result, of arguments that are checked."""
-        check_tensor("weights", weights, "...", "K", device=self.bases[0].reference.device)
-        self.check_shapes(weights.shape[-1], keyframes=keyframes)
-        lead = broadcast_leading(keyframes=keyframes.shape[:-3], weights=weights.shape[:-1])
-        if not is_traced(weights):
-            run_outside_transforms(_check_weights, weights)
-        return lead
 
 
 def _check_weights(weights: Tensor) -> None:

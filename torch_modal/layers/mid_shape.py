@@ -52,9 +52,8 @@ class MidShape(nn.Module):
     def solve(self, x_a: Tensor, x_b: Tensor) -> InBetweenResult:
         """The mid-shapes, and how each minimisation went, without a warning. Arguments as for :meth:`forward`.
 
-        In the paired space the result has ``first`` and ``second``, the paper's ``x1*`` and ``x2*``, too, and the
-        energies of the mid-shape and of linear interpolation. There, a shape is what the method gives, whatever its
-        status: it is not replaced by a better one.
+        In the paired space the result has ``first`` and ``second``, the paper's ``x1*`` and ``x2*``, too. There, a
+        shape is what the method gives, whatever its status: it is not replaced by a better one.
         """
         return self.in_between.solve(x_a, x_b, 0.5)
 

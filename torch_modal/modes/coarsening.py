@@ -8,9 +8,9 @@ import numpy as np
 from scipy import sparse
 
 from torch_modal.arrays import FloatArray, IntArray
-from torch_modal.geometry.connectivity import Connectivity, connected_pieces, double_areas
+from torch_modal.geometry.connectivity import Connectivity, double_areas, label_pieces
 from torch_modal.geometry.decimation import decimate
-from torch_modal.geometry.inspect import degenerate_faces, repeated_faces
+from torch_modal.geometry.inspect import degenerate_faces, find_repeated_faces
 
 # Ratio of area to squared longest edge below which a triangle is a needle; an equilateral one has 0.43. With needles,
 # other numbers of faces are tried.
@@ -119,7 +119,7 @@ def collapse(points: FloatArray, faces: IntArray, n_faces: int, known: IntArray 
 
     n = start + bisect_left(range(start, len(collapses)), True, key=is_enough)
     root = _roots(collapses[:n], len(points))
-    piece = connected_pieces(np.concatenate([faces[:, :2], faces[:, 1:]]), len(points))
+    piece = label_pieces(np.concatenate([faces[:, :2], faces[:, 1:]]), len(points))
     before = np.bincount(piece[faces[:, 0]])
     if np.count_nonzero(before) > 1:
         after = np.bincount(piece[_coarse_faces(root, faces)[:, 0]], minlength=len(before))
@@ -140,7 +140,7 @@ def join_clusters(points: FloatArray, faces: IntArray, coarsening: Coarsening, s
     centres, edges = coarsening.restrict(points), Connectivity(coarsening.faces).edges
     lengths = np.linalg.norm(centres[edges[:, 1]] - centres[edges[:, 0]], axis=1)
     short = lengths <= shortest * lengths.mean()
-    joint = connected_pieces(edges[short], len(centres))
+    joint = label_pieces(edges[short], len(centres))
     labels = np.where(coarsening.clusters >= 0, joint[coarsening.clusters], -1)
     return Coarsening.of_labels(labels, faces) if short.any() else coarsening
 
@@ -158,4 +158,4 @@ def _coarse_faces(labels: IntArray, faces: IntArray, repeated: bool = False) -> 
     """Faces in terms of labels, without degenerate ones, or repeated ones unless wanted. *Shape:* ``(n, 3)``."""
     left = labels[faces]
     left = left[~degenerate_faces(left)]
-    return left if repeated else left[~repeated_faces(left)]
+    return left if repeated else left[~find_repeated_faces(left)]

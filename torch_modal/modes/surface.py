@@ -10,7 +10,7 @@ from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.errors import MeshError
 from torch_modal.geometry.canonical import CANONICAL_SIZE, in_order, to_canonical
 from torch_modal.geometry.connectivity import Connectivity, vertex_areas
-from torch_modal.geometry.inspect import FLATNESS, principal_extents, signed_volume
+from torch_modal.geometry.inspect import FLATNESS, principal_extents, volume_of
 from torch_modal.geometry.vectors import vertex_normals
 from torch_modal.threads import n_threads
 
@@ -78,7 +78,7 @@ class CanonicalSurface:
         order, sorted_faces = in_order(points, compact.reshape(-1, 3))
         ordered = order[sorted_faces]
         # fTetWild keeps the volume with positive winding number, which is empty for an inverted mesh.
-        if signed_volume(points - points.mean(axis=0), ordered) < 0:
+        if volume_of(points - points.mean(axis=0), ordered) < 0:
             ordered = np.ascontiguousarray(ordered[:, ::-1])
         return cls(points, ordered, used, scale, axes)
 
@@ -105,7 +105,7 @@ class CanonicalSurface:
     @property
     def thickness(self) -> float:
         """Mean thickness of the body: twice the volume over the area."""
-        return 2 * abs(signed_volume(self.points, self.faces)) / self.area
+        return 2 * abs(volume_of(self.points, self.faces)) / self.area
 
     @cached_property
     def normals(self) -> FloatArray:

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torch_modal.arrays import BoolArray, FloatArray, IntArray
-from torch_modal.geometry.connectivity import connected_pieces
+from torch_modal.geometry.connectivity import label_pieces
 from torch_modal.modes.surface import CanonicalSurface
 
 EDGES = np.array([(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)])
@@ -125,7 +125,7 @@ def small_pieces(amounts: NDArray[Any], corners: FloatArray, piece: IntArray) ->
 def loose_pieces(tetrahedra: Tetrahedra) -> IntArray:
     """Connected component of each vertex. *Shape:* ``(N,)``."""
     pairs = np.stack([np.repeat(tetrahedra.tets[:, 0], 3), tetrahedra.tets[:, 1:].reshape(-1)], axis=1)
-    return connected_pieces(pairs, len(tetrahedra.vertices))
+    return label_pieces(pairs, len(tetrahedra.vertices))
 
 
 def face_connected_pieces(tets: IntArray) -> IntArray:
@@ -137,7 +137,7 @@ def face_connected_pieces(tets: IntArray) -> IntArray:
     order = np.argsort(sides)
     shared = np.diff(sides[order]) == 0
     owner = order % max(len(tets), 1)
-    return connected_pieces(np.stack([owner[:-1][shared], owner[1:][shared]], axis=1), len(tets))
+    return label_pieces(np.stack([owner[:-1][shared], owner[1:][shared]], axis=1), len(tets))
 
 
 def submesh(tetrahedra: Tetrahedra, kept: BoolArray) -> Tetrahedra:

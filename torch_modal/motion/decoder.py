@@ -192,7 +192,7 @@ def bending_columns(reference: Tensor, faces: Tensor, displaced: Tensor) -> Tens
 
 def _limit_slivers(columns: Tensor, rest: Frames) -> Tensor:
     """Bound turns and strains of slivers; zero them for triangles without a size. *Shape:* ``(6, k, F)``."""
-    areas = rest.doubled_areas
+    areas = rest.twice_areas
     columns = torch.where(areas / rest.size > LEAST * rest.size.mean(), columns, 0)
     squared = columns.square().sum(0) + columns[4].square()  # the off-diagonal entry counts twice
     limit = MOST * ((areas * squared).sum(1, keepdim=True) / areas.sum()).sqrt()

@@ -217,7 +217,7 @@ class Path(PreciseModule):
         knots = [spline.knots(flat[:, :, body]) for spline, body in zip(splines, self.vertices, strict=True)]
         limited, turns = zip(*map(Spline.explain, splines, knots), strict=True)
         share, turn = self.smooth * torch.cat(limited, -1).to(u).mean(-1), torch.stack(turns).amax(0)
-        even = [not self.smooth or any(s.rotations[i].clusters is not None for s in splines) for i in range(n)]
+        even = [not self.smooth or any(s.rotations[i].beyond_a_turn for s in splines) for i in range(n)]
         known, result = knots if self.smooth else None, self.solve(keyframes, t)
         alone = join_batches(
             *evaluate_by_interval(segment, n, lambda i, rows: self._spline_shapes(known, flat, i, which[rows], u[rows]))

@@ -9,7 +9,6 @@ from torch_modal.autograd import full_precision
 from torch_modal.elastic.backend import TorchBackend
 from torch_modal.elastic.minimise import Solution
 from torch_modal.geometry.canonical import own_order
-from torch_modal.geometry.clusters import beyond_a_turn
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.local_rotations import Trajectory, weights_per_length
 from torch_modal.geometry.poisson import Poisson
@@ -107,10 +106,10 @@ class Spline(nn.Module):
         one, other = torch.tensor(mesh.face_neighbours).unbind(1)
         for i in range(1, len(times) - 1):
             ends = references[[i, (i + 1) % n]]
-            between = first.cluster_arguments([frames_of(x[None], first.faces) for x in ends])
-            plain = first.clusters is None and not beyond_a_turn(*between)
+            frames = [frames_of(x[None], first.faces) for x in ends]
+            plain = not first.beyond_a_turn and not first.turns_beyond(first.off_mean(frames))
             if plain:
-                turns = first.quaternions(ends[:1], ends[1:])[:, 0]
+                turns = first.quaternions(*frames)[:, 0]
                 plain = bool(((pick(turns, one) * pick(turns, other)).sum(0) >= 0).all())
             self.rotations.append(first if plain else backend.rotations(mesh, ends))
 
@@ -193,8 +192,8 @@ class Spline(nn.Module):
         rotations = self.rotations[i]
         straight = self.straight(knots, i, which, u) if straight is None else straight
         if bending is not None:
-            edges = rotations.bent_edges_along(self.trajectory(knots, i), u, bending)
-        elif rotations.clusters is not None:
+            edges = rotations.edges_with_bending(self.trajectory(knots, i), u, bending)
+        elif rotations.beyond_a_turn:
             ends = knots.shapes[i : i + 2, which].movedim(0, 1)
             edges = rotations(ends, torch.stack([1 - u, u], -1))
         else:

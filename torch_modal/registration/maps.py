@@ -65,7 +65,7 @@ class SpectralShape:
             n_faces = int(N_COARSE / len(clean.vertices) * len(clean.faces))
             vertices, faces, _ = decimate(clean.vertices, clean.faces, n_faces)
             faces = faces[~inspect.degenerate_faces(faces)]
-            clean, _ = drop_unreferenced(vertices, faces[~inspect.repeated_faces(faces)])
+            clean, _ = drop_unreferenced(vertices, faces[~inspect.find_repeated_faces(faces)])
         #: Coarse copy in the units of the fine surface.
         self.placed = main_part(clean)
         self.scale = np.sqrt(self.placed.area)

@@ -11,7 +11,7 @@ from torch_modal import extras
 from torch_modal.arrays import BoolArray, FloatArray, IntArray
 from torch_modal.geometry.closest import closest_on_triangles, dot
 from torch_modal.geometry.connectivity import Connectivity
-from torch_modal.geometry.inspect import signed_volume
+from torch_modal.geometry.inspect import volume_of
 from torch_modal.geometry.surface import Surface
 
 LEAN = 0.01
@@ -101,7 +101,7 @@ def outward(vertices: FloatArray, faces: IntArray) -> IntArray:
     """Faces with outward winding if the surface is closed, otherwise unchanged. *Shape:* ``(F, 3)``."""
     closed = not len(Connectivity(faces).boundary_edges)
     centred = vertices - vertices[faces].mean((0, 1))
-    return faces[:, ::-1].copy() if closed and signed_volume(centred, faces) < 0 else faces
+    return faces[:, ::-1].copy() if closed and volume_of(centred, faces) < 0 else faces
 
 
 def drop_unreferenced(vertices: FloatArray, faces: IntArray) -> tuple[MeshSurface, IntArray]:

@@ -8,7 +8,7 @@ from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.local_rotations import LocalRotations
 from torch_modal.geometry.poisson import Reconstruction
 from torch_modal.geometry.rigid import RigidMotion, best_fit
-from torch_modal.geometry.triangle_frames import Sides, bending_between, bent_sides, frames_of
+from torch_modal.geometry.triangle_frames import Sides, bend_sides, bending_between, frames_of
 
 # Only triangles without area have logarithmic strains beyond this, a factor of 3,000.
 MOST_STRAIN = 8.0
@@ -34,7 +34,7 @@ class BendingCoordinates:
         self.mesh = Connectivity(faces.numpy(), len(mean))
         self.reconstruction = Reconstruction(mean, faces)
         self.frames = frames_of(mean[None], faces)
-        areas = 0.5 * self.frames.doubled_areas[0]
+        areas = 0.5 * self.frames.twice_areas[0]
         self._has_area = areas > SMALLEST_AREA * areas.mean()
         self.size = size(mean.numpy(), faces.numpy())
         loose = self.reconstruction.loose
@@ -56,9 +56,9 @@ class BendingCoordinates:
         for x in placed:
             rotations = LocalRotations(self.mesh, torch.stack([self.mean, x.detach()]))
             seen = frames_of(x[None], self.faces)
-            turn, strain = bending_between(self.frames, seen, rotations.quaternions(self.mean[None], x[None]))
+            turn, strain = bending_between(self.frames, seen, rotations.quaternions(self.frames, seen))
             turn, strain = turn[:, 0], strain[:, 0].clamp(-MOST_STRAIN, MOST_STRAIN)
-            areas = seen.doubled_areas[0]
+            areas = seen.twice_areas[0]
             flat = ~self._has_area | (areas <= SMALLEST_AREA * areas.mean())
             flat = flat | ~(turn.isfinite().all(0) & strain.isfinite().all(0))
             strain, above = torch.where(flat, 0, strain), rotations.ancestors[0]
@@ -92,7 +92,7 @@ class BendingCoordinates:
     def sides(self, coordinates: Tensor) -> Sides:
         """Target sides of the triangles. *Shape:* ``(B, 6, E)``."""
         rows = coordinates[..., : len(self.faces)].movedim(1, 0)
-        return bent_sides(rows[:3], rows[3:], self.frames)
+        return bend_sides(rows[:3], rows[3:], self.frames)
 
     def shapes(self, coordinates: Tensor) -> Tensor:
         """The shapes of coordinates, in the pose of the mean. *Shape:* ``(B, 6, E) -> (B, V, 3)``."""
