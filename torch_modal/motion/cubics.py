@@ -13,7 +13,6 @@ coordinates that turn along.
 from collections.abc import Callable
 from typing import NamedTuple, TypeVar
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -69,16 +68,22 @@ def limited_spline(speeds: Tensor, durations: Tensor, cyclic: bool, squared: Squ
     n = len(speeds)
     if n == 1 and not cyclic:
         return torch.cat([speeds, speeds])
-    from scipy.interpolate import CubicSpline  # 0.1 s, only where it is needed
-
-    h, inner = durations.cpu().double().numpy(), torch.arange(0 if cyclic else 1, n, device=durations.device)
-    before, share = (inner - 1) % n, h / h.sum()
-    # The way travelled with a speed of one in one interval alone, without its mean speed: zero at both ends.
-    knots = np.append(0.0, h.cumsum())
-    ways = np.tri(n + 1, n, -1) * h - knots[:, None] * share
-    ways[-1] = 0
-    spline = CubicSpline(knots, ways, bc_type="periodic" if cyclic else "natural")
-    velocities = torch.tensordot(torch.from_numpy(spline(knots, 1) + share).to(speeds), speeds, 1)
+    # Not SciPy's spline: transforms of torch.func wrap even constants.
+    h, inner = durations.double(), torch.arange(0 if cyclic else 1, n, device=durations.device)
+    size, before = n + (not cyclic), (inner - 1) % n
+    matrix, right = h.new_zeros(size, size), h.new_zeros(size, n)
+    for rows, column, value in (
+        (matrix, before, h[inner]),
+        (matrix, inner, 2 * (h[before] + h[inner])),
+        (matrix, (inner + 1) % size, h[before]),
+        (right, before, 3 * h[inner]),
+        (right, inner, 3 * h[before]),
+    ):
+        rows.index_put_((inner, column), value, accumulate=True)
+    if not cyclic:
+        matrix[0, :2], matrix[-1, -2:] = torch.tensor([[2.0, 1], [1, 2]]).to(h)
+        right[0, 0] = right[-1, -1] = 3
+    velocities = torch.tensordot(torch.linalg.solve(matrix, right).to(speeds), speeds, 1)
     slow, fast, length = squared(speeds[before]), squared(speeds[inner]), squared(velocities[inner])
     both = slow + fast
     most = LIMIT**2 * slow * fast / torch.where(both > 0, both, 1)
