@@ -164,6 +164,19 @@ def test_picture_has_the_points_above_the_shapes(
     assert orange(upper) > 0.02 > 2 * orange(lower[:, : -image.shape[1] // 10])  # without the inferred half of the last
 
 
+def test_an_order_of_names_that_is_none_of_numbers_is_warned_of(
+    files: Path, arrived: dict[str, Any], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As shells have it: s-10 stands before s-9."""
+    Path("s-10.ply").write_bytes(Path(SCANS[1]).read_bytes())
+    Path("s-9.ply").write_bytes(Path(SCANS[0]).read_bytes())
+    argv = ["complete", "template.obj", "s-10.ply", "s-9.ply", "--out", "a.npz", "--overwrite"]
+    assert cli.main(argv) == 0
+    assert "warning: s-10.ply, s-9.ply, ... were seen at 0, 1" in capsys.readouterr().err
+    assert cli.main([*argv, "--times", "10", "9"]) == 0
+    assert capsys.readouterr().err == ""
+
+
 def test_what_cannot_work_is_refused_before_the_work(
     files: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -178,6 +191,7 @@ def test_what_cannot_work_is_refused_before_the_work(
     argv = [*base, *out, "--keyframes", "later.obj", "--keyframe-times", "3"]
     assert "later.obj; got 1" in misused(capsys, *argv)
     assert "template.obj; got 2" in misused(capsys, *base, *out, "--keyframe-times", "3", "4")
+    assert "must be 2 or more; got 1" in misused(capsys, *base, *out, "--frames", "1")
     assert "required: SEEN" in misused(capsys, "complete", "template.obj", *out)
     assert "noise is a length above 0" in fails(capsys, *base, *out, "--noise", "0")
     assert "2 times for 10 clouds (scans/s-00.ply, " in fails(capsys, *base, *out, "--times", "0", "1")

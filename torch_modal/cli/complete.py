@@ -1,6 +1,7 @@
 """``torch-modal complete``: from a template and what was seen of a motion to files."""
 
 import argparse
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -46,13 +47,20 @@ def run(args: argparse.Namespace) -> None:
     whole, times = [args.mesh, *args.keyframes], args.keyframe_times
     if (times or args.keyframes) and len(times or ()) != len(whole):
         args.fail(f"--keyframe-times needs a time for each of {', '.join(map(str, whole))}; got {len(times or ())}")
+    if args.frames is not None and args.frames < 2:
+        args.fail(f"--frames must be 2 or more; got {args.frames}")
     animation = check_files(args, [*whole, *args.observations])
 
     import torch
 
     import torch_modal as tm
     from torch_modal.completion.read import load_observations
+    from torch_modal.data.tree import natural
 
+    names = [f.as_posix() for f in args.observations if f.suffix.lower() != ".csv"]
+    if not args.times and names != sorted(names, key=natural):
+        message = f"{', '.join(names[:3])}, ... were seen at 0, 1, 2, ..., in this order; --times says other times"
+        warnings.warn(message, stacklevel=2)
     keyframes, faces = tm.load_keyframes(whole)
     view = args.view and torch.tensor(args.view, dtype=torch.float64)
     seen = load_observations(args.observations, keyframes.shape[1], args.times, noise=args.noise, view=view)
@@ -63,7 +71,7 @@ def run(args: argparse.Namespace) -> None:
     options = pick_options(args, "estimate_times", "contact", "progress")
     completion = tm.complete(rests, welded.faces, seen, times=times, **options)
     knots, when = completion.path.times if completion.path else completion.times, completion.times
-    if len(knots) > 1 and args.frames and args.frames > 1:
+    if len(knots) > 1 and args.frames:
         when = torch.linspace(float(knots[0]), float(knots[-1]), args.frames, dtype=torch.float64)
     elif len(knots) > 1:
         when = tm.frame_times(len(knots), min(3, max(0, 6 - (len(knots) - 2).bit_length())), times=knots)
