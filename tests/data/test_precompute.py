@@ -256,6 +256,7 @@ def test_folders_that_cannot_work_are_refused(bench: Bench, capsys: pytest.Captu
     assert "there is no folder" in refused(bench.root / "a" / "1.obj", bench.out)
     assert "is or contains the input" in refused(bench.root, bench.root)
     assert "is or contains the input" in refused(bench.root / "a", bench.root)
+    assert "must be positive, got 0" in refused(bench.root, bench.out, "--workers", "0")
     assert "File exists" in refused(bench.root, bench.root / "a" / "1.obj")
     lone = bench.root / "lone"
     lone.mkdir()

@@ -44,6 +44,8 @@ def run(args: argparse.Namespace) -> None:
       scans of different connectivity:
         torch-modal bake "scans/*.ply" --register --bones 40 --out motion.glb
     """
+    if args.every is not None and args.every < 2:
+        args.fail(f"--every must be 2 or more; got {args.every}")
     check_suffix(args.out, ANIMATION_FORMATS)
     arguments.check_forms(args, args.out)
 
@@ -59,7 +61,7 @@ def run(args: argparse.Namespace) -> None:
     if len(frames) < 2:
         raise ValueError(f"{files[0]} is one shape; a motion has two frames or more: name more meshes, or a folder")
     args.report(f"{len(frames)} frames of {frames.shape[1]} vertices, {fps:g} a second")
-    if args.smooth:
+    if args.smooth is not None:
         frames = smooth_in_time(frames, args.smooth, args.cyclic)
     used = frames[0, faces.unique()]
     diagonal = (used.amax(0) - used.amin(0)).norm()
@@ -75,7 +77,8 @@ def run(args: argparse.Namespace) -> None:
         with torch.no_grad():
             filled = welded.scatter(path(keyframes, torch.arange(n)))
         left = sorted({*range(n)} - {*kept})
-        args.report(f"error:     {error((filled - frames)[left])} at the {len(left)} frames between key-frames")
+        if left:
+            args.report(f"error:     {error((filled - frames)[left])} at the {len(left)} frames between key-frames")
         frames = filled
     skin = tm.bake(frames, faces, args.bones) if args.bones else None
     asset = None if files[0].suffix.lower() == ".npz" else tm.open_asset(files[0])

@@ -133,6 +133,9 @@ def precompute_tree(
     """
     if not root.is_dir():
         raise ValueError(f"there is no folder {root}")
+    options = options or Options()
+    if (workers is not None and workers < 1) or not options.timeout > 0:
+        raise ValueError(f"workers and timeout must be positive, got {workers} and {options.timeout}")
     if out.resolve() in (root.resolve(), *root.resolve().parents):
         raise ValueError(f"the output folder {out} is or contains the input {root}; choose another one")
     out.mkdir(parents=True, exist_ok=True)
@@ -146,7 +149,7 @@ def precompute_tree(
         names: dict[Future[tuple[Record, bool]], str] = {}
         try:
             for name in sets:
-                arguments = root.resolve(), out.resolve(), name, options or Options(), stop
+                arguments = root.resolve(), out.resolve(), name, options, stop
                 names[executor.submit(run_set, *arguments)] = name
             for future in as_completed(names):
                 name = names[future]

@@ -93,7 +93,12 @@ def smooth_in_time(frames: Tensor, period: float, cyclic: bool = False) -> Tenso
     """Halve what oscillates with a period, in frames; faster changes vanish, and slower ones hardly change.
 
     Least squares with a penalty on second differences; straight motions stay. *Shape:* ``(N, V, 3)``.
+
+    Raises:
+        ValueError: The period is not positive.
     """
+    if not period > 0:
+        raise ValueError(f"smooth must be a positive number of frames, got {period}")
     eye = torch.eye(len(frames)).to(frames)
     second = eye.roll(1, 1) - 2 * eye + eye.roll(-1, 1)
     second = second if cyclic else second[1:-1]
