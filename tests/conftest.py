@@ -126,6 +126,13 @@ def hands(hand_path: Keyframes) -> Shapes:
     return Shapes(*hand_path, extract_bases(*hand_path, 30, progress=False))
 
 
+@pytest.fixture(scope="session")
+def women(data_dir: Path) -> Shapes:
+    """A figure of 13,380 vertices at rest and in two steps of a walk, 30 modes each."""
+    shapes = load_keyframes([data_dir / "mh-woman" / f"{n}.obj" for n in ("00-rest", "02-walk-a", "03-walk-b")])
+    return Shapes(*shapes, extract_bases(*shapes, 30, progress=False))
+
+
 @pytest.fixture
 def converged() -> Iterator[None]:
     """A minimisation that does not converge fails the test, unless the test expects it."""

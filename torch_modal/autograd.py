@@ -235,11 +235,18 @@ class _Outside(torch.autograd.Function):
 def apply_function(function: Any, *arguments: Any) -> Any:
     """``function.apply`` of a :class:`torch.autograd.Function` with ``setup_context``.
 
-    Without recording it calls ``forward`` directly: torch inspects the signature at every call, which takes as long as
-    a small kernel.
+    Without a gradient to record it calls ``forward`` directly: torch inspects the signature at every call, which takes
+    as long as a small kernel.
     """
-    alone = not torch.is_grad_enabled() and is_eager(*(value for value in arguments if isinstance(value, Tensor)))
-    return function.forward(*arguments) if alone else function.apply(*arguments)
+    if needs_function(*(value for value in arguments if isinstance(value, Tensor))):
+        return function.apply(*arguments)
+    with torch.no_grad():
+        return function.forward(*arguments)
+
+
+def needs_function(*tensors: Tensor) -> bool:
+    """True where autograd or a transform has to see an operation on tensors."""
+    return (torch.is_grad_enabled() and any(x.requires_grad for x in tensors)) or not is_eager(*tensors)
 
 
 class _LinearMap(torch.autograd.Function):

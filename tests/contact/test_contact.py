@@ -23,6 +23,8 @@ from torch_modal.contact.separate import Timeline, spline_weights
 from torch_modal.data.samples import load_sample
 from torch_modal.elastic.energy import RestShapes
 from torch_modal.elastic.term import Mesh
+from torch_modal.geometry.connectivity import Connectivity
+from torch_modal.geometry.crossings import Crossings
 from torch_modal.inbetween.results import Samples
 from torch_modal.motion import path as path_module
 
@@ -359,6 +361,18 @@ def test_few_shapes_stay_beside_keyframes_that_intersect_themselves(
     assert 9 * peak_acceleration(displacement) < 2 * peak_acceleration(displacement[::3])
 
 
+@pytest.mark.slow
+def test_no_shape_of_a_path_is_made_worse_at_searched_times(frogs: Shapes) -> None:
+    shapes = frogs.pick(1, 2)
+    t = torch.arange(3, 64, 7, dtype=DOUBLE) / 64  # every other one is searched
+    with torch.no_grad():
+        plain = tm.Path(shapes.bases, shapes.faces)(shapes.keyframes, t)
+        pushed, solution = tm.Path(shapes.bases, shapes.faces, contact=True).solve(shapes.keyframes, t)[:2]
+    before, after = far(plain, shapes), far(pushed, shapes)
+    assert int(before.max()) > 0 and bool((after <= before)[1::2].all())
+    assert solution.n_crossing.tolist() == after.tolist()
+
+
 def test_what_contact_needs_is_said_before_any_work(hand: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ValueError, match="joint"):
         tm.Objective(space="paired", contact=True)
@@ -443,6 +457,17 @@ def test_path_takes_any_time(hand: Shapes) -> None:
     assert torch.equal(shapes[3], hand.keyframes[1])
 
 
+@pytest.mark.filterwarnings("ignore:in .* in-betweens, parts still")
+def test_limit_keeps_a_trajectory_from_popping(hand: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Three times the peak acceleration, if nothing but this little weight held it.
+    monkeypatch.setattr(modal, "SMOOTHNESS", 0.02)
+    options = {"bases": hand.bases, "progress": False}
+    plain = tm.subdivide(hand.keyframes, hand.faces, 4, **options)
+    frames = tm.subdivide(hand.keyframes, hand.faces, 4, contact=True, **options)
+    assert not torch.equal(frames, plain)
+    assert peak_acceleration(frames) < 1.3 * peak_acceleration(plain)
+
+
 def test_nothing_changes_where_nothing_touches(bars: Shapes) -> None:
     pair = bars.pick(0, 1)
     found = tm.subdivide(pair.keyframes, pair.faces, 2, bases=pair.bases, contact=True, progress=False)
@@ -470,6 +495,19 @@ def test_crossings_of_keyframes_are_said_and_stay(hand: Shapes) -> None:
 def test_space_draws_from_tables_without_crossings(hand: Shapes) -> None:
     space = tm.ShapeSpace(hand.bases, hand.faces, contact=True, times=9)
     assert int(far(space.in_betweens.table(0, 1).double(), hand).sum()) == 0
+
+
+@pytest.mark.slow
+def test_scanned_like_figure_walks_with_few_crossings(women: Shapes) -> None:
+    """Thighs and hands of 13,380 vertices: of some 150 pairs, a few are left where parts lie deep in each other."""
+    pair = women.pick(1, 2)
+    layers = [tm.InBetween(pair.bases, pair.faces, contact=contact) for contact in (False, True)]
+    with torch.no_grad():
+        plain, pushed = (layer.solve(*pair.keyframes, 0.5) for layer in layers)
+    crossings = Crossings(Connectivity(pair.faces.numpy()), pair.keyframes.numpy())
+    before, after = (len(crossings.far_pairs(result.shapes.numpy())) for result in (plain, pushed))
+    assert before > 50 and after <= 0.2 * before
+    assert int(pushed.solution.n_crossing) <= 0.2 * before
 
 
 def test_shapes_beside_keyframes_that_intersect_themselves_all_take_steps() -> None:

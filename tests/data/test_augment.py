@@ -155,6 +155,14 @@ def test_wrong_calls(bars: Shapes, space: tm.ShapeSpace) -> None:
 
 
 # ----------------------------------------------------------------------------------------------------- in-between
+def test_without_a_generator_the_global_one_is_used(bars: Shapes, space: tm.ShapeSpace) -> None:
+    augment = tm.RandomRigidMotion(p=1.0)
+    torch.manual_seed(5)
+    first = augment(bars.keyframes)
+    torch.manual_seed(5)
+    assert torch.equal(augment(bars.keyframes), first)
+
+
 def test_in_between_is_the_layers(bars: Shapes, space: tm.ShapeSpace) -> None:
     """Partner and time read from the parameters, the shape from the layer itself."""
     augment = tm.RandomInBetween(p=1.0, generator=seeded(), space=space)

@@ -344,3 +344,6 @@ def test_what_a_dataset_refuses(root: Path, tmp_path: Path) -> None:
         tm.ShapeDataset(tmp_path / "nowhere")
     with pytest.raises(ValueError, match="samples_per_set"):
         tm.ShapeDataset(root, samples_per_set=0)
+    for seed in (-1, 1.5, None):
+        with pytest.raises(ValueError, match=f"seed is an integer, 0 or more; got {seed}"):
+            tm.ShapeDataset(root, seed=seed)  # type: ignore[arg-type]

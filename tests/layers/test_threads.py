@@ -153,6 +153,64 @@ def test_parameters_of_terms_have_the_gradients_of_plain_calls(bars: Shapes, mon
     assert float(found[0].abs()) > 0
 
 
+def test_second_derivatives(layer: tm.InBetween, bars: Shapes) -> None:
+    def twice(given: list[Tensor]) -> list[Tensor]:
+        first = torch.autograd.grad(layer(*given).square().sum(), given, create_graph=True)
+        torch.autograd.backward(sum(x.square().sum() for x in first))  # type: ignore[arg-type]
+        return [*(x.detach() for x in first), *(x.grad for x in given)]  # type: ignore[list-item]
+
+    torch.set_num_threads(3)
+    found = twice(leaves(bars, 3))
+    samples = zip(*leaves(bars, 3), strict=True)
+    alone = [twice([x.detach()[None].requires_grad_() for x in sample]) for sample in samples]
+    for x, *parts in zip(found, *alone, strict=True):
+        torch.testing.assert_close(x, torch.cat(parts), rtol=1e-6, atol=1e-8)
+
+
+def test_transforms_and_forward_mode_run_as_before(layer: tm.InBetween, bars: Shapes) -> None:
+    torch.set_num_threads(3)
+    a, b, t = (x.detach() for x in leaves(bars))
+
+    def f(t: Tensor) -> Tensor:
+        return layer(a, b, t)
+
+    _, moved = torch.func.jvp(f, (t,), (torch.ones_like(t),))
+    whole = torch.func.vmap(layer)(a, b, t)
+    torch.testing.assert_close(whole, f(t), rtol=0, atol=1e-10)
+    with torch.autograd.forward_ad.dual_level():
+        dual = f(torch.autograd.forward_ad.make_dual(t, torch.ones_like(t)))
+        torch.testing.assert_close(torch.autograd.forward_ad.unpack_dual(dual).tangent, moved, rtol=1e-8, atol=1e-8)
+    slope = torch.func.grad(lambda t: f(t).sum())(t)
+    torch.testing.assert_close(slope, moved.sum((1, 2)), rtol=1e-6, atol=1e-7)
+
+
+class InLoader(torch.utils.data.Dataset):  # type: ignore[type-arg]
+    """One batch of in-betweens, computed in a process of a loader."""
+
+    def __init__(self, layer: tm.InBetween, given: list[Tensor]) -> None:
+        self.layer, self.given = layer, given
+
+    def __len__(self) -> int:
+        return 2
+
+    def __getitem__(self, index: int) -> Tensor:
+        assert torch.get_num_threads() == 1
+        with torch.no_grad():
+            return self.layer(*self.given)  # type: ignore[no-any-return]
+
+
+@pytest.mark.skipif(not hasattr(__import__("os"), "fork"), reason="this system cannot fork")
+def test_workers_of_a_loader_find_the_same(layer: tm.InBetween, bars: Shapes) -> None:
+    torch.set_num_threads(3)
+    given = [x.detach() for x in leaves(bars)]
+    with torch.no_grad():
+        wanted = layer(*given)
+    loader = torch.utils.data.DataLoader(
+        InLoader(layer, given), batch_size=None, num_workers=1, multiprocessing_context="fork"
+    )
+    assert all(torch.equal(x, wanted) for x in loader)
+
+
 def test_errors_and_warnings_reach_the_caller(bars: Shapes) -> None:
     torch.set_num_threads(3)
     layer = tm.InBetween(bars.bases[:2], bars.faces, solver=tm.Solver(max_steps=1, unconverged="raise"))

@@ -190,6 +190,13 @@ def unlimited(speeds: Tensor, durations: Tensor, cyclic: bool, squared: Squared)
     return torch.from_numpy(CubicSpline(knots, x, bc_type="natural")(knots, 1))
 
 
+def test_what_rests_between_equal_keyframes_does_not_move(bars: Shapes) -> None:
+    still = bars.pick(0, 1, 1, 2)
+    path = Path(still.keyframes, still.faces)
+    found = path(still.keyframes, torch.linspace(1, 2, 9, dtype=DOUBLE))
+    assert largest(found - still.keyframes[1]) < 1e-9
+
+
 def test_a_stop_is_not_passed(bars: Shapes) -> None:
     """A bar bends, stops, and goes back at uneven times; without the limit it would run on."""
     own = bars.pick(0, 2, 1, 1, 0)
@@ -368,6 +375,32 @@ def test_a_key_frame_of_another_period_is_that_of_the_first(motion: Shapes, turn
     assert outside.path.times.tolist() == [0.0, 1.0, 2.0, 2.5, 4.0]
     assert torch.equal(outside.path(outside.keyframes, 2.5 + 4 * turns), moved)
     assert torch.equal(outside.shapes(), inside.shapes())
+
+
+@pytest.mark.parametrize("cyclic", [False, True])
+def test_what_an_inserted_key_frame_changes_is_computed_again(bars: Shapes, cyclic: bool) -> None:
+    """The intervals around it that shapes were known of already, too."""
+    own = bars.pick(0, 1, 2, 1, 0)
+    editor = tm.PathEditor(Path(own.bases, own.faces, cyclic=cyclic), own.keyframes, steps=3)
+    before = editor.shapes()
+    editor.insert(1.5, own.keyframes[0] + 0.1)
+    whole = editor.path(editor.keyframes, editor.times())
+    torch.testing.assert_close(editor.shapes(), whole, rtol=0, atol=1e-9)
+    assert largest(whole[:6] - before[:6]) > 1e-3, "the intervals before it depend on it"
+
+
+def test_a_path_scheme_outlasts_an_insert(motion: Shapes) -> None:
+    """One in which every key-frame is a rest."""
+
+    def still(speeds: Tensor, durations: Tensor, cyclic: bool, squared: Squared) -> Tensor:
+        return torch.cat([torch.zeros_like(speeds), torch.zeros_like(speeds[:1])])
+
+    path = Path(motion.bases, motion.faces, smooth=still)
+    keyframes = torch.cat([motion.keyframes[:2], path(motion.keyframes, 1.5)[None], motion.keyframes[2:]])
+    near = path.insert(1.5)(keyframes, times(1.5, 1.5 + 1e-3, 2.0, 2.0 + 1e-3))
+    assert largest(near[1::2] - near[::2]) < 1e-4
+    away = Path(motion.bases, motion.faces).insert(1.5)(keyframes, times(1.5, 1.5 + 1e-3))
+    assert largest(away[1] - away[0]) > 3e-4, "without it, the motion goes on"
 
 
 @pytest.mark.parametrize("cyclic", [False, True])

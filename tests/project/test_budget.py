@@ -22,17 +22,17 @@ import torch
 import torch_modal as tm
 
 BOUNDS = {
-    "lines of code": 19410,
-    "functions": 1751,
+    "lines of code": 17497,
+    "functions": 1555,
     "docstrings that begin with no noun": 0,
-    "functions of in-between": 151,
-    "files of in-between": 32,
-    "functions of in-between, forward and backward": 187,
-    "files of in-between, forward and backward": 32,
-    "functions of subdivide": 164,
+    "functions of in-between": 144,
+    "files of in-between": 35,
+    "functions of in-between, forward and backward": 175,
+    "files of in-between, forward and backward": 35,
+    "functions of subdivide": 155,
     "files of subdivide": 36,
-    "functions of making a layer": 142,
-    "files of making a layer": 40,
+    "functions of making a layer": 139,
+    "files of making a layer": 38,
 }
 SLACK = 0.02
 """Relative growth that no commit has to explain."""

@@ -236,6 +236,15 @@ def test_across_shapes(pair: tuple[Mesh, Mesh, np.ndarray], marked: bool) -> Non
     assert result.to_target.mean < 0.12 and result.flipped_area < 0.02 and not result.doubtful
 
 
+def test_symmetric_bodies_are_doubtful_across_shapes() -> None:
+    """Several maps fit: the ends of a bar are alike."""
+    bar = trimesh.creation.box((3.0, 1.0, 0.6)).subdivide_to_size(0.15)
+    bar.merge_vertices()
+    capsule = trimesh.creation.capsule(2.0, 0.5)
+    result = register(bar.vertices, bar.faces, capsule.vertices, capsule.faces, same_subject=False, progress=False)
+    assert result.doubtful and any("another map" in what for what in result.warnings)
+
+
 def test_attributes_are_sampled(pair: tuple[Mesh, Mesh, np.ndarray], found: tm.Registration) -> None:
     there = torch.from_numpy(pair[1][0])
     below = found.sample(there)  # positions are an attribute too

@@ -50,7 +50,7 @@ class ShapeDataset(Dataset[Sample]):
 
     Raises:
         FileNotFoundError: There is no such folder, or no set in it.
-        ValueError: ``samples_per_set`` is below 1.
+        ValueError: ``samples_per_set`` is below 1, or ``seed`` below 0.
     """
 
     def __init__(
@@ -72,6 +72,8 @@ class ShapeDataset(Dataset[Sample]):
         if not self.sets:
             raise FileNotFoundError(f"no stored key-frame set in {root}; torch-modal precompute makes them")
         transform = RandomInBetween(p=1.0) if transform is None else transform
+        if not isinstance(seed, int | np.integer) or seed < 0:
+            raise ValueError(f"seed is an integer, 0 or more; got {seed!r}")
         is_chain = isinstance(transform, AugmentationSequential)
         self.transform = transform if is_chain else AugmentationSequential(transform)
         self.samples_per_set = samples_per_set

@@ -16,7 +16,7 @@ from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.elastic.crossings import WarpPairs
 from torch_modal.elastic.distortion import Distortion, KernelDistortion
 from torch_modal.elastic.energy import Energy
-from torch_modal.elastic.kernel_energy import KernelEnergy
+from torch_modal.elastic.kernel_energy import KernelEnergy, volumes_by_kernel
 from torch_modal.elastic.kernel_steps import KernelFineEnergy
 from torch_modal.elastic.kernels.launch import kernels, launch, load_kernels
 from torch_modal.elastic.minimise import bfgs_update
@@ -30,6 +30,7 @@ from torch_modal.errors import MissingPackageError
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.local_rotations import LocalRotations
 from torch_modal.geometry.procrustes import mean_pose
+from torch_modal.geometry.rigid import volumes_of
 
 
 class TorchBackend:
@@ -40,6 +41,7 @@ class TorchBackend:
     """
 
     mean_pose, quasi_newton = staticmethod(mean_pose), staticmethod(bfgs_update)
+    volumes_of = staticmethod(volumes_of)
 
     def load(self) -> None:
         """Load what takes long, so that the first call does not wait for it."""
@@ -73,7 +75,7 @@ class WarpBackend(TorchBackend):
     """
 
     load = staticmethod(load_kernels)
-    mean_pose = staticmethod(mean_pose_by_kernel)
+    mean_pose, volumes_of = staticmethod(mean_pose_by_kernel), staticmethod(volumes_by_kernel)
     rotations = staticmethod(WarpRotations)
     fine_energy = staticmethod(KernelFineEnergy)
     distortion = staticmethod(KernelDistortion)

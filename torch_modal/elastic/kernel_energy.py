@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from torch_modal.autograd import is_eager
 from torch_modal.elastic import volume
 from torch_modal.elastic.bend import NEEDLE, NEEDLE_OF_STEPS
 from torch_modal.elastic.energy import AssembledTerm, Energy, Reference, RestShapes
@@ -16,6 +17,7 @@ from torch_modal.elastic.kernels.function import Operation
 from torch_modal.elastic.kernels.launch import launch, make_once, of_elements
 from torch_modal.elastic.term import Mesh
 from torch_modal.elastic.volume import Volume
+from torch_modal.geometry.rigid import volumes_of
 from torch_modal.geometry.vectors import inverse
 
 
@@ -149,6 +151,17 @@ class KernelVolume(KernelTerm):
         launch(make_once(volume.kernels).sizes, (len(x), len(self.faces)), values, adjoints)
         if not self.closed:
             to_x.add_(self.fold(to_extended))
+
+
+def volumes_by_kernel(x: Tensor, faces: Tensor) -> Tensor:
+    """:func:`torch_modal.geometry.rigid.volumes_of` in one pass, without a gradient; of faces of int32."""
+    if not is_eager(x):
+        return volumes_of(x, faces)
+    shapes = x.detach().double().flatten(0, -3).contiguous()
+    sizes = shapes.new_zeros(len(shapes), 2, 3)
+    arguments = [faces, shapes.shape[1], shapes, sizes, 0, None]
+    launch(make_once(volume.kernels).sizes, (len(shapes), len(faces)), arguments)
+    return sizes[:, 1, 0].view(x.shape[:-2]).to(x)
 
 
 def by_kernels(energy: Energy, mesh: Mesh) -> list[KernelTerm | None]:

@@ -11,7 +11,7 @@ from torch_modal.elastic.backend import TorchBackend
 from torch_modal.errors import MeshWarning
 from torch_modal.geometry.canonical import CANONICAL_SIZE, size
 from torch_modal.geometry.connectivity import Connectivity, vertex_areas
-from torch_modal.geometry.rigid import best_rotation, centroid, looks_mirrored, volumes_of
+from torch_modal.geometry.rigid import best_rotation, centroid, looks_mirrored
 
 # A key-frame smaller than this part of the reference is a point.
 SMALLEST_SIZE = 1e-6
@@ -49,7 +49,7 @@ class KeyframeAlignment(nn.Module):
 
     def __init__(self, references: Tensor, mesh: Connectivity, backend: TorchBackend) -> None:
         super().__init__()
-        self.mean_pose = backend.mean_pose
+        self.mean_pose, self.volumes_of = backend.mean_pose, backend.volumes_of
         sizes = torch.tensor([size(x.numpy(), mesh.faces) for x in references], dtype=references.dtype)
         scale = CANONICAL_SIZE / sizes.mean()
         areas = torch.stack([torch.from_numpy(vertex_areas(x.numpy(), mesh.faces)) for x in references])
@@ -70,7 +70,7 @@ class KeyframeAlignment(nn.Module):
         extent = (self.reference.amax(0) - self.reference.amin(0)).norm()
         #: Diagonal of the bounding box of the first reference.
         self.register_buffer("extent", extent, persistent=False)
-        self.register_buffer("faces", torch.tensor(mesh.faces), persistent=False)
+        self.register_buffer("faces", torch.tensor(mesh.faces).int(), persistent=False)
         self.closed = len(mesh.boundary_edges) == 0
         self.size_warned = False
 
@@ -134,13 +134,13 @@ class KeyframeAlignment(nn.Module):
         """True for mirror images of the heaviest, of closed surfaces. *Shape:* ``(B, K, V, 3), (B, K) -> (B, K)``."""
         if not self.closed:
             return torch.zeros_like(weights, dtype=torch.bool)
-        volumes, heaviest = volumes_of(shapes, self.faces), weights.argmax(1, keepdim=True)
+        volumes, heaviest = self.volumes_of(shapes, self.faces), weights.argmax(1, keepdim=True)
         inverted = volumes * volumes.gather(1, heaviest) < 0
         if is_eager(inverted) and not inverted.any():
             return inverted
         first = shapes.take_along_dim(heaviest[..., None, None], 1).expand_as(shapes)
         heaviest_shapes, others = first.flatten(0, 1), shapes.flatten(0, 1)
-        return inverted & looks_mirrored(heaviest_shapes, others, self.faces).view_as(inverted)
+        return inverted & looks_mirrored(heaviest_shapes, others, self.faces.long()).view_as(inverted)
 
     def _warn_of_size(self, sizes: Tensor) -> None:
         """Warn, once for each layer, that key-frames and bases seem to be in different units."""

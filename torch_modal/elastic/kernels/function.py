@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torch_modal.autograd import apply_function, apply_transpose, is_double_backward, is_traced, merge_vmapped
+from torch_modal.autograd import apply_transpose, is_double_backward, is_traced, merge_vmapped, needs_function
 
 
 class Operation:
@@ -24,11 +24,13 @@ class Operation:
 
     def __call__(self, *tensors: Tensor, kernels: bool = True) -> tuple[Tensor, ...]:
         """The results for tensors of any dtype, by kernels or torch."""
+        if kernels and not needs_function(*tensors):
+            with torch.no_grad():
+                return self.run(None, *(x.detach().double().contiguous() for x in tensors))
         tensors = tuple(x.double() for x in tensors)
         if not kernels or any(map(is_traced, tensors)):
             return self.by_torch(*tensors)
-        keep = torch.is_grad_enabled() and any(x.requires_grad for x in tensors)
-        return tuple(apply_function(_Fused, self, [] if keep else None, *tensors))
+        return tuple(_Fused.apply(self, [] if any(x.requires_grad for x in tensors) else None, *tensors))
 
 
 class _Fused(torch.autograd.Function):
