@@ -27,7 +27,7 @@ from timing import limit_threads
 from torch import Tensor
 
 import torch_modal as tm
-from torch_modal.contact.separate import ROUNDS
+from torch_modal.contact.separate import SEPARATION_ROUNDS
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 N_SHAPES = 33
@@ -106,7 +106,7 @@ def run(case: Case) -> Run:
     sequence(case, bases, contact=False)  # what is made once
     plain, without = sequence(case, bases, contact=False)
     apart, with_ = sequence(case, bases, contact=True)
-    polished, _ = sequence(case, bases, solver=tm.Solver(polish=ROUNDS[1]), contact=False)
+    polished, _ = sequence(case, bases, solver=tm.Solver(polish=SEPARATION_ROUNDS[1]), contact=False)
     return Run(plain, apart, polished, (without, with_))
 
 

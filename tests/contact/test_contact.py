@@ -140,7 +140,7 @@ def test_gradients_are_exact_with_the_set_held(hand: Shapes, monkeypatch: pytest
     for tensor in given:
         tensor.requires_grad_()
     shapes = shape(*given)
-    assert len(found) >= separate.ROUNDS[0] and len(found[0][0].shapes) > 10
+    assert len(found) >= separate.SEPARATION_ROUNDS[0] and len(found[0][0].shapes) > 10
     weights = torch.cos(7 * x_a)
     gradients = torch.autograd.grad((shapes * weights).sum(), given)
     direction = 0.01 * torch.sin(9 * x_a + 1)
@@ -229,7 +229,7 @@ def test_the_round_with_the_fewest_crossings_is_kept(hand: Shapes, monkeypatch: 
         def relax(x: Tensor, some: Tensor, beside: Any) -> Tensor:
             # Most of a push first; then back to the shape without contact.
             taken.append(x)
-            n = len(taken) - separate.ROUNDS[0]
+            n = len(taken) - separate.SEPARATION_ROUNDS[0]
             return step(x, some, beside) if n < 0 else x if n == 0 else taken[0]
 
         return relax
@@ -238,7 +238,7 @@ def test_the_round_with_the_fewest_crossings_is_kept(hand: Shapes, monkeypatch: 
     with torch.no_grad():
         shape, solution = layer.solve(*hand.keyframes, 0.875)[:2]
         plain = tm.InBetween(hand.bases, hand.faces)(*hand.keyframes, 0.875)
-    assert len(taken) > separate.ROUNDS[0]
+    assert len(taken) > separate.SEPARATION_ROUNDS[0]
     assert int(solution.n_crossing) == int(far(shape, hand)) < int(far(plain, hand))
 
 
@@ -590,7 +590,7 @@ def test_shapes_rest_as_far_as_accelerations_allow(generator: torch.Generator, m
         found: Tensor = springs * places + sum(pull.weights[:, None] * pull.to for pull in pulls)
         return found / (springs + sum(pull.weights[:, None] for pull in pulls))
 
-    monkeypatch.setattr(separate, "ROUNDS", (4, 90))
+    monkeypatch.setattr(separate, "SEPARATION_ROUNDS", (4, 90))
     monkeypatch.setattr(separate, "PULL", 3.0)
     fake, trajectory = Fake(), unlimited(n, 3, 1.0)
     given: Any = torch.zeros_like(places), relax, fake, trajectory

@@ -36,7 +36,7 @@ def test_a_step_by_the_kernel_is_that_of_torch() -> None:
 
     half = random(5, n, n)
     inverse = half @ half.mT + torch.eye(n, dtype=torch.float64)
-    length = torch.tensor([1, 1, minimisation.SHORTEST, 0, 1], dtype=torch.float64)
+    length = torch.tensor([1, 1, minimisation.SHORTEST_STEP, 0, 1], dtype=torch.float64)
     value = torch.tensor([0.5, 2.0, 2.0, 0.5, 0.5], dtype=torch.float64)
     a, gradient = random(5, n, 1), random(5, n, 1)
     there = a - length[:, None, None] * (inverse @ gradient)

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from sheets import cylinder, folded, rectangle
 
 import torch_modal as tm
-from torch_modal.geometry.canonical import ROUNDING, in_order, size, to_canonical
+from torch_modal.geometry.canonical import QUANTUM, in_order, size, to_canonical
 from torch_modal.geometry.decimation import decimate
 from torch_modal.registration.load import load_keyframes
 
@@ -52,10 +52,10 @@ def test_of_no_area_the_size_is_the_diagonal() -> None:
 def test_placed_points_are_those_of_the_caller(hand: Mesh) -> None:
     points, faces = hand[0][0], hand[1]
     own, axes, centre, scale = to_canonical(points, faces)
-    np.testing.assert_allclose(own @ axes / scale + centre, points, atol=ROUNDING / scale)
+    np.testing.assert_allclose(own @ axes / scale + centre, points, atol=QUANTUM / scale)
     assert np.linalg.det(axes) == pytest.approx(1.0)
     turned = to_canonical(points @ TURN.T * 7.0 + 5.0, shuffled(faces))[0]
-    assert np.abs(turned - own).max() <= ROUNDING
+    assert np.abs(turned - own).max() <= QUANTUM
     assert (turned == own).mean() > 0.999
 
 

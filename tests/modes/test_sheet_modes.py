@@ -109,7 +109,7 @@ def test_rigid_motions_and_strains_are_carried_exactly() -> None:
 def test_the_coarse_mesh_has_the_modes_of_the_fine_one(monkeypatch: pytest.MonkeyPatch) -> None:
     sample = load_sample("creature")
     coarse = extract_modes(sample.keyframes[0], sample.faces, 20, method="shell", cache=False)
-    monkeypatch.setattr("torch_modal.modes.sheet.COARSE_FACES", 10**6)
+    monkeypatch.setattr("torch_modal.modes.sheet.SHEET_FACES", 10**6)
     fine = extract_modes(sample.keyframes[0], sample.faces, 30, method="shell", cache=False)
     spans = [torch.linalg.qr(basis.modes.flatten(1).T).Q for basis in (coarse.truncate(10), fine)]
     assert torch.linalg.svdvals(spans[0].T @ spans[1]).min() > 0.95

@@ -10,7 +10,7 @@ import torch_modal as tm
 from torch_modal.registration.fit import sliding_freedom
 from torch_modal.registration.maps import SpectralShape
 from torch_modal.registration.register import register
-from torch_modal.registration.report import MIRRORED, Distances, Quality, judge
+from torch_modal.registration.report import MIRRORED_LEAD, Distances, Quality, judge
 from torch_modal.registration.surface import MeshSurface
 
 for library in ("robust_laplacian", "potpourri3d", "igl"):
@@ -47,7 +47,7 @@ ONE_SUBJECT = {
     "from target": (lambda v: {"quality": PERFECT._replace(from_target=off(v))}, 1.0, 0.3, "mean distance"),
     "flipped": (lambda v: {"quality": PERFECT._replace(flipped_area=v)}, 0.10, 0.01, "flipped"),
     "unsupported": (lambda v: {"quality": PERFECT._replace(unsupported_area=v)}, 0.05, 0.02, "no target next to"),
-    "mirrored": (lambda v: {"mirrored_lead": v}, *MIRRORED, "mirror image"),
+    "mirrored": (lambda v: {"mirrored_lead": v}, *MIRRORED_LEAD, "mirror image"),
     "another": (lambda v: {"lead": v}, 0.0, 0.1, "another map"),
     "sliding": (lambda v: {"freedom": v}, 0.9, 0.65, "slide"),
     "landmarks": (lambda v: {"landmark_errors": (0.5, v, 1.0)}, 8.0, 2.0, "landmark 1"),

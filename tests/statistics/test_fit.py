@@ -14,7 +14,7 @@ from torch_modal.geometry.rigid import best_fit
 from torch_modal.geometry.rotations import exp
 from torch_modal.statistics.fit import fit
 from torch_modal.statistics.local_weights import LocalWeights, Observations
-from torch_modal.statistics.variation import MOST_BELOW_ZERO, LocalMixtures, Patches, Variation, bound_weights
+from torch_modal.statistics.variation import LARGEST_EXTRAPOLATION, LocalMixtures, Patches, Variation, bound_weights
 
 DOUBLE = torch.float64
 
@@ -242,7 +242,7 @@ def test_weights_far_below_zero_come_nearer_to_even_ones() -> None:
     weights = torch.tensor([[5.0, 1.5, 0.2], [-3.0, -0.5, 0.3], [-1.0, 0.0, 0.5]], dtype=DOUBLE)
     found = bound_weights(weights)
     torch.testing.assert_close(found.sum(0), torch.ones(3, dtype=DOUBLE))
-    assert float(found[:, 0].clamp_max(0).sum()) >= -MOST_BELOW_ZERO
+    assert float(found[:, 0].clamp_max(0).sum()) >= -LARGEST_EXTRAPOLATION
     torch.testing.assert_close(found[:, 1:], weights[:, 1:])  # within the bound
 
 

@@ -86,7 +86,7 @@ def test_sheet_has_every_shape_at_its_place(tmp_path):
     shapes = shapes_on(out)
     assert len(shapes) == 10
     areas, x, y = (np.array([shape[i] for shape in shapes]).reshape(2, 5) for i in range(3))
-    radius = picture.CELL_PIXELS / 2 / picture.MARGIN  # the largest ball fills its cell
+    radius = picture.CELL_PIXELS / 2 / picture.CELL_MARGIN  # the largest ball fills its cell
     expected = np.pi * (radius * np.linspace(0.5, 1, 5)) ** 2
     np.testing.assert_allclose(areas, [expected, expected[::-1]], rtol=0.06)
     np.testing.assert_allclose(np.diff(x, axis=1), np.diff(x, axis=1)[0, 0], atol=1.5)
@@ -100,7 +100,7 @@ def test_sheet_has_every_shape_at_its_place(tmp_path):
 def test_columns_and_keyframes_are_chosen(tmp_path):
     options = {"overwrite": True}
     rows, faces, out = {"a": growing(9)}, np.asarray(BALL.faces), tmp_path / "a.png"
-    largest = np.pi * (picture.CELL_PIXELS / 2 / picture.MARGIN) ** 2
+    largest = np.pi * (picture.CELL_PIXELS / 2 / picture.CELL_MARGIN) ** 2
 
     def radii(**more):
         shapes = shapes_on(render_sequence(rows, faces, out, **options, **more))

@@ -11,7 +11,7 @@ from torch_modal.cli.arguments import check_output, pick_options
 from torch_modal.io.formats import MESH_FORMATS, PICTURES
 from torch_modal.io.write import check_suffix
 
-SAMPLES = ("creature", "hand")
+DEMO_SAMPLES = ("creature", "hand")
 INCOMPLETE = 3  # exit status of `precompute` when some sets have no bases
 CROSSES = 3  # exit status of `check` when parts newly pass through each other
 
@@ -276,7 +276,7 @@ def add_demo(sub: argparse.ArgumentParser) -> None:
     """Add the arguments of ``demo``."""
     add, folder = sub.add_argument, Path("torch-modal-demo")
     add("--out", type=Path, default=folder, metavar="FOLDER", help="where the files go (default: %(default)s)")
-    add("--sample", choices=SAMPLES, help="only this one (default: both)")
+    add("--sample", choices=DEMO_SAMPLES, help="only this one (default: both)")
     arguments.add_levels(sub)
 
 
@@ -292,7 +292,7 @@ def demo(args: argparse.Namespace) -> None:
     Examples:
       torch-modal demo --sample hand --out hand-demo
     """
-    names = [args.sample] if args.sample else SAMPLES
+    names = [args.sample] if args.sample else DEMO_SAMPLES
     files = [args.out / f"{name}{suffix}" for name in names for suffix in (".glb", ".png")]
     check_output(args, files, ())
 

@@ -15,7 +15,7 @@ from torch_modal.progress import Progress, ProgressReport
 from torch_modal.times import Times, check_times
 
 LARGEST_ERROR = 0.002  # default for the largest mean distance of a frame's vertices, over the diagonal
-N_SAMPLES = 5  # frames of an interval that are fitted to estimate its error
+FRAMES_TO_FIT = 5  # frames of an interval that are fitted to estimate its error
 
 
 def select_keyframes(
@@ -118,7 +118,7 @@ class Selection:
                 around = list(keys[max(i - 1, 0) : i + 3])
             name = (*around, a)
             if name not in self._known and b - a > 1:
-                samples = torch.linspace(a + 1, b - 1, min(N_SAMPLES, b - a - 1)).round().long()
+                samples = torch.linspace(a + 1, b - 1, min(FRAMES_TO_FIT, b - a - 1)).round().long()
                 cycles, frames = (torch.tensor(around) // period, torch.tensor(around) % period)
                 times = self.times[frames] + (self.times[-1] - self.times[0]) * cycles
                 decoder = self._decoder.with_keyframes(self.frames[frames], times)

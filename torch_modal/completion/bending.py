@@ -11,7 +11,7 @@ from torch_modal.geometry.rotations import exp
 from torch_modal.geometry.triangle_frames import bend_sides, frames_of
 from torch_modal.motion.decoder import bending_columns
 
-MOST_STRAIN = 1.0
+MOST_LOG_STRETCH = 1.0
 """Bound on the logarithm of a triangle's stretch: on a fine mesh, few triangles of a mode may have far more than on the
 coarse one on which amplitudes are found."""
 
@@ -44,7 +44,7 @@ class ModalBending:
     def _sides(self, base: Tensor, bending: Tensor, n_copies: int = 1) -> tuple[Tensor, Tensor]:
         rest = frames_of(base[None], self.faces.repeat(n_copies, 1))
         turn = bending[0] * rest.e1[:, 0] + bending[1] * rest.e2[:, 0] + bending[2] * rest.normal[:, 0]
-        return bend_sides(turn[:, None], bending[3:, None].clamp(-MOST_STRAIN, MOST_STRAIN), rest)
+        return bend_sides(turn[:, None], bending[3:, None].clamp(-MOST_LOG_STRETCH, MOST_LOG_STRETCH), rest)
 
     def shape(self, base: Tensor, pose: ModalPose) -> Tensor:
         """The deformed shape. *Shape:* ``(V, 3)``."""

@@ -9,7 +9,7 @@ from torch_modal.completion.frames import CompletionProblem
 from torch_modal.completion.pairs import SampledSurface, robust_weights
 from torch_modal.geometry.rigid import best_fit
 
-NEAR = 2.5
+SEEN_WITHIN = 2.5
 """Distance from an observed point within which a vertex counts as seen, at a size of 100."""
 NEIGHBOURS = 0.9
 """Confidence of what a neighbour in time saw."""
@@ -40,7 +40,7 @@ def compare(problem: CompletionProblem, x: Tensor) -> tuple[Tensor, Tensor, Tens
             weights = agree * robust_weights(distances, one.noise)
             misses[one.numbers], trust[one.numbers] = distances, weights
             gaps, nearest = cKDTree(one.points).query(surface.vertices, 3)
-            close = (weights[nearest] * np.exp(-0.5 * (gaps / NEAR) ** 2)).max(1)
+            close = (weights[nearest] * np.exp(-0.5 * (gaps / SEEN_WITHIN) ** 2)).max(1)
             explained = float(weights.mean())
             if explained < DOUBTFUL:
                 doubtful[frame.time] = explained

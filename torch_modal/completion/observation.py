@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-LEAST = 3
+LEAST_POINTS = 3
 """Points of an observation, at least: a pose follows from three."""
 
 
@@ -49,9 +49,9 @@ class Observation:
         values: dict[str, Any] = {"time": float(self.time)}
         object.__setattr__(self, "time", values["time"])  # named by all other messages
         points = torch.as_tensor(self.points)
-        if points.dim() != 2 or points.shape[1] != 3 or len(points) < LEAST or not points.is_floating_point():
+        if points.dim() != 2 or points.shape[1] != 3 or len(points) < LEAST_POINTS or not points.is_floating_point():
             raise ValueError(
-                f"{self}: points are floating-point of the shape (n, 3), with n of {LEAST} or more; got "
+                f"{self}: points are floating-point of the shape (n, 3), with n of {LEAST_POINTS} or more; got "
                 f"{tuple(points.shape)} of {points.dtype}"
             )
         values["points"], n = points, len(points)

@@ -17,9 +17,9 @@ _PLACES = np.array([[2, 2, 2], [4, 1, 1], [1, 4, 1], [1, 1, 4]]) / 6
 # Part of the stiffness of a pair with a normal that is left along the surface.
 SLIDE = 0.3
 # Weight of normals: at a size of 100, a distance of 3 counts as much as 60 degrees.
-LEAN = 3.0
+CLOUD_NORMAL_WEIGHT = 3.0
 # Smallest cosine between the normals of a pair.
-ALIKE = 0.3
+LEAST_COSINE = 0.3
 # Cells of the picture in which surfaces hide others, the depth below which they do not, cosine of grazing sight.
 CELL, DEPTH, GRAZING = 2.0, 3.0, 0.15
 # Distance, in standard deviations of the noise, at which a point loses three quarters of its weight.
@@ -66,7 +66,7 @@ def robust_weights(distances: FloatArray, noise: float) -> FloatArray:
 
 def join_features(points: FloatArray, normals: FloatArray | None) -> FloatArray:
     """Points with their normals, as places of which near ones are alike. *Shape:* ``(n, 3), (n, 3) -> (n, 6)``."""
-    return points if normals is None else np.hstack([points, LEAN * normals])
+    return points if normals is None else np.hstack([points, CLOUD_NORMAL_WEIGHT * normals])
 
 
 class SampledSurface(MeshSurface):
@@ -84,7 +84,7 @@ class SampledSurface(MeshSurface):
         sampled = None if normals is None else self.face_normals[self.sample_faces]
         face = self.sample_faces[cKDTree(join_features(self.samples, sampled)).query(join_features(points, normals))[1]]
         barycentric, distances = closest_on_triangles(points, self.vertices[self.faces[face]])
-        agree = np.ones(len(points), bool) if normals is None else dot(self.face_normals[face], normals) > ALIKE
+        agree = np.ones(len(points), bool) if normals is None else dot(self.face_normals[face], normals) > LEAST_COSINE
         return face, barycentric, distances, agree
 
     def visible(self, view: FloatArray) -> IntArray:
@@ -146,7 +146,7 @@ class Cloud(NamedTuple):
         faces = surface.sample_faces[seen]
         tree = cKDTree(join_features(self.points, self.normals))
         nearest = tree.query(join_features(surface.samples[seen], surface.face_normals[faces]))[1]
-        agree = dot(surface.face_normals[faces], self.normals[nearest]) > ALIKE
+        agree = dot(surface.face_normals[faces], self.normals[nearest]) > LEAST_COSINE
         if released is not None:
             agree &= ~released[surface.faces[faces]].any(1)
         seen, faces, nearest = seen[agree], faces[agree], nearest[agree]

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torch_modal.completion.observation import LEAST, Observation
+from torch_modal.completion.observation import LEAST_POINTS, Observation
 from torch_modal.errors import MeshError
 from torch_modal.geometry.vectors import vertex_normals
 from torch_modal.io.points import PointFile
@@ -44,8 +44,8 @@ def load_observations(
 
 
 def _enough(points: Any, name: str) -> Tensor:
-    if len(points) < LEAST:
-        raise MeshError(f"{name}: {len(points)} points; an observation needs {LEAST} or more, so leave it out")
+    if len(points) < LEAST_POINTS:
+        raise MeshError(f"{name}: {len(points)} points; an observation needs {LEAST_POINTS} or more, so leave it out")
     return torch.as_tensor(points, dtype=torch.float64)
 
 

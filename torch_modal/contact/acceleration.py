@@ -10,13 +10,13 @@ at each time and vertex. Both are second differences of consecutive shapes, in t
 import torch
 from torch import Tensor
 
-from torch_modal.contact.detect import REACH
+from torch_modal.contact.detect import DEEPEST_CONTACT
 
-ROOM = 1.27
+ACCELERATION_ROOM = 1.27
 """Largest acceleration of a vertex, relative to the largest of the trajectory."""
-LEAST_LIMIT = 8 * 100 * REACH
+LEAST_LIMIT = 8 * 100 * DEEPEST_CONTACT
 """Smallest bound, at a diagonal of 100 and a duration of 1: a parabola as high as the reach of contacts."""
-ROUNDS = 400
+MOST_PROJECTIONS = 400
 """Most iterations of :meth:`AccelerationLimit.nearest`."""
 TOLERANCE = 0.01
 """Relative tolerance of the bound at which the iteration stops."""
@@ -34,7 +34,7 @@ class AccelerationLimit:
         rotations: Rotations from the coordinates of displacements to the viewer's. *Shape:* ``(T, 3, 3)``.
         goes_on: True if the motion continues beyond the first and the last shape. Each side has half of the room
             there: the motion must not bounce off a key-frame.
-        most: The bound. Default: :data:`ROOM` times the largest acceleration, or :data:`LEAST_LIMIT`.
+        most: The bound. Default: :data:`ACCELERATION_ROOM` times the largest acceleration, or :data:`LEAST_LIMIT`.
     """
 
     def __init__(
@@ -50,7 +50,9 @@ class AccelerationLimit:
         #: Accelerations of a displacement from its values at each time. *Shape:* ``(N, T)``.
         self.differences = torch.cat([second, *(2 * each[1:-1][i][None] for i in ends)])
         self.rotations = rotations.double()
-        self.most = most or max(ROOM * float(accelerations.norm(dim=-1).max()), LEAST_LIMIT / (len(x) - 1) ** 2)
+        self.most = most or max(
+            ACCELERATION_ROOM * float(accelerations.norm(dim=-1).max()), LEAST_LIMIT / (len(x) - 1) ** 2
+        )
 
     def nearest(self, wanted: Tensor, weights: Tensor | float = 1.0) -> tuple[Tensor, Tensor]:
         """Find the displacement nearest to a wanted one, in least squares, that keeps each vertex below the bound.
@@ -71,7 +73,7 @@ class AccelerationLimit:
         pull, freely = PENALTY * inverse @ rows.T, inverse @ metric @ goal
         reach, rest = rows @ pull, rows @ freely + trajectory
         split, dual = self._clip(rows @ goal + trajectory), torch.zeros_like(trajectory)
-        for _ in range(ROUNDS):
+        for _ in range(MOST_PROJECTIONS):
             pulled = split - dual - trajectory
             reached = torch.addmm(rest, reach, pulled)
             if float(_lengths(reached).max()) <= (1 + TOLERANCE) * self.most:

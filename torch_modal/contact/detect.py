@@ -15,9 +15,9 @@ from torch_modal.geometry.crossings import BoolArray, Crossings, FloatArray, Int
 from torch_modal.geometry.surface import Surface
 
 # Lengths are parts of the diagonal.
-REACH = 0.06
+DEEPEST_CONTACT = 0.06
 """Largest depth of a vertex that is pushed out."""
-NEAR = 0.015
+WATCHED_WITHIN = 0.015
 """Largest distance in front of a face at which a vertex next to an intersection is watched."""
 FACING = -0.1
 """Largest cosine between the normals of a vertex and of a face that face each other."""
@@ -77,7 +77,7 @@ class Search:
             Vertices and faces. *Shape:* ``(n,), (n,)``.
         """
         crossings, corners = self.crossings, self.crossings.mesh.faces
-        reach, near = REACH * crossings.diagonal, NEAR * crossings.diagonal
+        reach, near = DEEPEST_CONTACT * crossings.diagonal, WATCHED_WITHIN * crossings.diagonal
         some = np.flatnonzero(seeds[corners].any(1))
         tree = cKDTree(surface.face_centres[some])
         within = inside | stuck

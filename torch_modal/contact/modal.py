@@ -17,7 +17,7 @@ SMOOTHNESS = 30.0
 """``lambda``, at a diagonal of 100, with the time between the ends as the unit."""
 SOFTNESS = 0.1
 """Factor of the contact term: the modes alone would resolve contacts with far more energy than necessary."""
-STEPS = 2
+NEWTON_STEPS = 2
 """Newton steps."""
 
 
@@ -58,7 +58,7 @@ def modal_displacement(
         return elastic + SOFTNESS * contact.value(displace(a)).sum() + torch.einsum("ia,iajb,jb->", a, smooth, a)
 
     a = torch.zeros_like(slope)
-    for _ in range(STEPS):
+    for _ in range(NEWTON_STEPS):
         pushed, hardened = _in_modes(contact, displace(a), modes)
         gradient = slope + torch.einsum("sij,sj->si", stiffness, a) + SOFTNESS * pushed
         gradient = gradient + 2 * torch.einsum("iajb,jb->ia", smooth, a)

@@ -28,7 +28,7 @@ BESIDE = 0.125
 """Duration next to a key-frame that intersects itself, in which all shapes take steps."""
 AROUND = 2
 """Neighbours in time of shapes with contacts, in which the same vertices are watched."""
-ROUNDS = 4, 8
+SEPARATION_ROUNDS = 4, 8
 """Least and largest number of rounds."""
 WIDER = 0.075
 """Growth of the gap of a shape alone in each further round: edges of long triangles cross before a vertex is inside."""
@@ -92,9 +92,9 @@ def separate(
     most = MOST_MOVED * search.depth(start[0]) if timeline is None else math.inf
     # Shapes that relax on their own, what the bound took from them so far, and springs of the vertices it limits.
     alone, dual, springs = x, torch.zeros_like(x), torch.zeros_like(x[0, :, 0])
-    for k in range(1, ROUNDS[1] + 1):
+    for k in range(1, SEPARATION_ROUNDS[1] + 1):
         # In a trajectory, wider gaps where it cannot be separated would disturb neighbouring shapes.
-        gap = GAP if timeline is not None else GAP + WIDER * max(0, k - ROUNDS[0])
+        gap = GAP if timeline is not None else GAP + WIDER * max(0, k - SEPARATION_ROUNDS[0])
         energies = _energies(active.rows(chosen), Pull((x - dual)[chosen].detach(), springs), areas, gap)
         alone = x.index_copy(0, chosen, relax(alone[chosen], chosen, energies))
         if timeline is None:
@@ -107,10 +107,14 @@ def separate(
             x = start + field
             dual = dual.index_add(0, chosen, (alone - x)[chosen])
             springs[limited] = PULL * areas[limited]
-        some = every if k == ROUNDS[0] else torch.unique(torch.cat([active.shapes, torch.nonzero(n_far).flatten()]))
+        some = (
+            every
+            if k == SEPARATION_ROUNDS[0]
+            else torch.unique(torch.cat([active.shapes, torch.nonzero(n_far).flatten()]))
+        )
         contacts, counts = search(x, some)
         active, n_far = contacts.with_former(active), n_far.index_copy(0, some, counts)
-        if k < ROUNDS[0]:
+        if k < SEPARATION_ROUNDS[0]:
             continue
         moved, n_left = float((x - start).detach().norm(dim=-1).max()), int(n_far.sum())
         if moved <= most and n_left <= int(n_best.sum()) and n_left < int(n_before.sum()):

@@ -8,7 +8,7 @@ from torch_modal.elastic.kernels.launch import kernels, launch
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.crossings import FloatArray, IntArray
 
-ROOM = 4096
+FIRST_ROOM = 4096
 """Pairs that there is room for at first."""
 
 
@@ -61,7 +61,7 @@ class WarpPairs:
 
     def __call__(self, x: FloatArray) -> IntArray:
         """The pairs, in no order. *Shape:* ``(V, 3) -> (P, 2)``."""
-        n, room = len(self.order), ROOM
+        n, room = len(self.order), FIRST_ROOM
         positions, number = torch.as_tensor(x).contiguous(), torch.zeros(1, dtype=torch.int32)
         boxes = torch.empty(2 * n, 6, dtype=torch.float64)
         # Of a pair, at most two more stay behind on each level.

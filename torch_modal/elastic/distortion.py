@@ -28,7 +28,7 @@ LARGEST_STRAIN = 4.0
 LARGEST_WEIGHT = 8.0
 
 # Strain of all edges below which differences are hardly visible.
-SLIGHT = 0.02
+VISIBLE_STRAIN = 0.02
 
 BEND = Bend()
 
@@ -91,9 +91,9 @@ class Distortion(nn.Module):
         return [values if values.shape[-1] == 1 else values[:, chosen] for values, chosen in pairs]
 
     def slight(self, stiffness: Sequence[Tensor], like: Tensor) -> Tensor:
-        """The distortion of a shape whose edges are all strained by :data:`SLIGHT`. *Shape:* ``(B,)``."""
+        """The distortion of a shape whose edges are all strained by :data:`VISIBLE_STRAIN`. *Shape:* ``(B,)``."""
         lengths = norm(edge_vectors_of(like.detach().movedim(-1, 0), self.edges.T)[0]).sum(-1)
-        return self.shares[0] * stiffness[0].detach().mean(-1) * lengths * SLIGHT**2
+        return self.shares[0] * stiffness[0].detach().mean(-1) * lengths * VISIBLE_STRAIN**2
 
 
 class KernelDistortion(Distortion):

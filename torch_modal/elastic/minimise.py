@@ -17,7 +17,7 @@ from torch_modal.elastic.energy import energy_rounding
 MOST_EVALUATIONS = 40
 
 # Steps shorter than this part of the quasi-Newton step make no progress worth an evaluation.
-SHORTEST = 0.02
+SHORTEST_STEP = 0.02
 
 
 class Status(IntEnum):
@@ -194,7 +194,7 @@ def bfgs_update(state: State, value: Tensor, slope: Tensor) -> State:
     move, change = torch.where(taken, there - a, 0), torch.where(taken, slope - gradient, 0)
     a, gradient = torch.where(taken, there, a), torch.where(taken, slope, gradient)
     value, norm = torch.where(better, value, state.energy), torch.where(better, norm, state.norm)
-    length = torch.where(better, 1, torch.where(length > SHORTEST, 0.5 * length, 0)) * (norm > state.goal)
+    length = torch.where(better, 1, torch.where(length > SHORTEST_STEP, 0.5 * length, 0)) * (norm > state.goal)
     # The update keeps the inverse positive definite where the gradient grows along the step; elsewhere it is left out.
     pushed, across = torch.bmm(inverse, change), change.mT
     curvature = torch.bmm(across, move)

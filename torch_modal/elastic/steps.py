@@ -17,12 +17,12 @@ from torch_modal.geometry.canonical import CANONICAL_SIZE
 RIDGE = 1e-6
 
 # The curvature along a shorter step is rounding of energies.
-SLIGHT = 1e-5 * CANONICAL_SIZE
+SHORTEST_MOVE = 1e-5 * CANONICAL_SIZE
 
 # Vertices of all samples that are relaxed at a time: more would not fit into a processor's caches, or, of a GPU, into
 # its memory (6 KB a vertex where gradients are recorded).
-CHUNK = 20_000
-CHUNK_OF_GPU = 1_000_000
+VERTICES_AT_ONCE_OF_CPU = 20_000
+VERTICES_AT_ONCE_OF_GPU = 1_000_000
 
 
 class Point(NamedTuple):
@@ -102,7 +102,7 @@ def step_length(before: Tensor, slope: Tensor, after: Tensor, largest: Tensor) -
         before: The energy where the step starts. *Shape:* ``(B,)``.
         slope: Its derivative along the step, at most zero. *Shape:* ``(B,)``.
         after: The energy where the whole step leads. *Shape:* ``(B,)``.
-        largest: Largest coordinate of the step; none below :data:`SLIGHT` is shortened, and one of ten times
+        largest: Largest coordinate of the step; none below :data:`SHORTEST_MOVE` is shortened, and one of ten times
             that in full. *Shape:* ``(B,)``.
 
     Returns:
@@ -114,7 +114,7 @@ def step_length(before: Tensor, slope: Tensor, after: Tensor, largest: Tensor) -
     if not torch.is_grad_enabled() and is_eager(gap) and bool((finite & (gap <= 0)).all()):
         return torch.ones_like(gap)  # nearly always
     surplus = gap.clamp_min(0)
-    counts = ((largest / SLIGHT - 1) / 9).clamp(0, 1)
+    counts = ((largest / SHORTEST_MOVE - 1) / 9).clamp(0, 1)
     shorter = (surplus > 0) & (counts > 0)
     length = torch.where(shorter, 1 - counts * surplus / torch.where(shorter, half + surplus, 1), 1)
     return torch.where(finite, length, 0)
@@ -265,7 +265,10 @@ class FineEnergy(nn.Module):
 
         *Shape:* ``(B, V, 3)``.
         """
-        size, parts = max(1, (CHUNK if x.device.type == "cpu" else CHUNK_OF_GPU) // x.shape[1]), []
+        size, parts = (
+            max(1, (VERTICES_AT_ONCE_OF_CPU if x.device.type == "cpu" else VERTICES_AT_ONCE_OF_GPU) // x.shape[1]),
+            [],
+        )
         for i in range(0, len(x), size):
             some = slice(i, i + size)
             start, others = x[some], () if extra is None else extra(some, x[some])

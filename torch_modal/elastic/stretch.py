@@ -13,7 +13,7 @@ from torch_modal.geometry.vectors import inverse, norm, tiny
 MIN_RELATIVE_LENGTH = 1e-6
 
 # Strain over which the tension of an edge sets in.
-SLACK = 1e-3
+STRAIN_OF_TENSION = 1e-3
 
 
 class Stretch(Term):
@@ -51,7 +51,7 @@ class Stretch(Term):
     def tension(self, edge_vectors: Tensor, slope: Tensor, curvature: Tensor) -> Tensor:
         """Transverse stiffness of a stretched string; smoothly near zero under compression."""
         length = norm(edge_vectors[0])
-        width = SLACK * curvature * length
+        width = STRAIN_OF_TENSION * curvature * length
         return 0.5 * (slope + (slope * slope + width * width + torch.finfo(slope.dtype).tiny).sqrt()) / length
 
     def kernel_functions(self, n: int) -> KernelFunctions | None:
@@ -66,7 +66,7 @@ def kernel_functions() -> KernelFunctions:
     import warp as wp
 
     real, edge = wp.float64, wp.types.matrix(shape=(1, 3), dtype=wp.float64)
-    slack, shortest = wp.constant(real(SLACK)), wp.constant(real(MIN_RELATIVE_LENGTH))
+    slack, shortest = wp.constant(real(STRAIN_OF_TENSION)), wp.constant(real(MIN_RELATIVE_LENGTH))
     tiny_square, tiniest = wp.constant(real(tiny(torch.empty(0, dtype=torch.float64)))), wp.constant(real(2.0**-1022))
 
     @wp.func

@@ -11,9 +11,9 @@ from torch_modal.arrays import FloatArray, IntArray
 
 CANONICAL_SIZE = 100.0
 """Size (:func:`size`) at which energies are evaluated, modes computed and meshes decimated."""
-ROUNDING = 2.0**-20
+QUANTUM = 2.0**-20
 """Quantum of their coordinates, far above the rounding of rotations and sums, which it removes."""
-ALIKE = 1e-6
+EQUAL_MOMENTS = 1e-6
 """Relative difference of principal moments below which axes are undetermined; likewise skewness and signs."""
 GENERIC = np.array([1.0, 0.6180339887, 0.3247179572])
 """A generic direction, which is unlikely to match a symmetry of a shape."""
@@ -47,14 +47,14 @@ def to_canonical(points: FloatArray, faces: IntArray) -> tuple[FloatArray, Float
     axes = _principal_axes(second)
     along = axes @ arms
     skewness = (along * along * along) @ areas
-    is_skewed = np.abs(skewness) > ALIKE * max(float(np.trace(second)), 0.0) ** 1.5
+    is_skewed = np.abs(skewness) > EQUAL_MOMENTS * max(float(np.trace(second)), 0.0) ** 1.5
     axes = axes * np.where(np.where(is_skewed, skewness, axes @ GENERIC) < 0, -1.0, 1.0)[:, None]
     # The axis of least skewness completes a right-handed frame: mirrored shapes stay different.
     last = int(np.abs(skewness).argmin())
     axes[last] = np.cross(axes[last - 2], axes[last - 1])
     scale = CANONICAL_SIZE / length
     along_axes = ((points - centre) * scale) @ axes.T
-    return np.round(along_axes / ROUNDING) * ROUNDING, axes, centre, scale
+    return np.round(along_axes / QUANTUM) * QUANTUM, axes, centre, scale
 
 
 def in_order(points: FloatArray, faces: IntArray) -> tuple[IntArray, IntArray]:
@@ -107,7 +107,7 @@ def _principal_axes(second: FloatArray) -> FloatArray:
     moments, axes = moments[::-1], vectors.T[::-1].copy()
     start = 0
     for end in range(1, 4):
-        if end < 3 and moments[end - 1] - moments[end] < ALIKE * moments[0]:
+        if end < 3 and moments[end - 1] - moments[end] < EQUAL_MOMENTS * moments[0]:
             continue
         if end - start > 1 or moments[0] <= 0:
             axes[start:end] = _nearest_axes(axes[start:end])

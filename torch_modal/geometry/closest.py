@@ -6,13 +6,13 @@ from scipy.spatial import cKDTree
 from torch_modal.arrays import FloatArray, IntArray
 
 # Triangles with less than this part of the area that their sides allow count as segments.
-FLAT = 1e-12
+FLAT_FACE = 1e-12
 
 # Groups of triangles of similar size.
 N_GROUPS = 8
 
 # Pairs of a point and a triangle that are tested together.
-CHUNK = 2**18
+PAIRS_AT_ONCE = 2**18
 
 
 class ClosestFaces:
@@ -37,7 +37,7 @@ class ClosestFaces:
         nearest = closest_on_triangles(points, self.corners[face])[1]
         for faces, tree, radius in self._groups:
             counts = tree.query_ball_point(points, nearest + radius, return_length=True)
-            bounds = np.flatnonzero(np.diff(np.cumsum(counts) // CHUNK)) + 1
+            bounds = np.flatnonzero(np.diff(np.cumsum(counts) // PAIRS_AT_ONCE)) + 1
             for rows in np.split(np.arange(len(points)), bounds):
                 near = tree.query_ball_point(points[rows], nearest[rows] + radius)
                 row, candidates = np.repeat(rows, counts[rows]), faces[np.concatenate([*near, []]).astype(np.int64)]
@@ -61,7 +61,7 @@ def closest_on_triangles(points: FloatArray, corners: FloatArray) -> tuple[Float
     tiny = np.finfo(np.float64).tiny
     per_area = 1 / np.maximum(determinant, tiny)
     v, w = (ss * along - fs * across) * per_area, (ff * across - fs * along) * per_area
-    inside = (v >= 0) & (w >= 0) & (v + w <= 1) & (determinant > FLAT * ff * ss)
+    inside = (v >= 0) & (w >= 0) & (v + w <= 1) & (determinant > FLAT_FACE * ff * ss)
     # Otherwise it is on a side: the nearest of three.
     zero, third = np.zeros_like(v), second - first
     on_first, on_second, on_third = (

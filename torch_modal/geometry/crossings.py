@@ -19,9 +19,9 @@ from torch_modal.geometry.inspect import volume_of
 from torch_modal.geometry.surface import Surface
 from torch_modal.geometry.triangle_pairs import triangles_cross
 
-RINGS = 2
+RINGS_OF_CROSSINGS = 2
 """Pairs within so many rings of a crossing of a key-frame belong to it: it grows and shrinks with every rounding."""
-FAR = 0.06
+FAR_APART = 0.06
 """Part of the diagonal, along the surface; nearer crossings are folds, not two parts that meet."""
 _OFFSET = 1e-4
 """Offset along the normal, over the diagonal, at which winding numbers of vertices are taken: on the surface they are
@@ -59,7 +59,7 @@ class Crossings:
         self.like = known[0] if like is None else like
         used = self.like[np.unique(mesh.faces)]
         self.diagonal = float(np.linalg.norm(np.ptp(used, axis=0)))
-        #: Of the vertices searched so far, those within :data:`FAR`.
+        #: Of the vertices searched so far, those within :data:`FAR_APART`.
         self._near: dict[int, IntArray] = {}
 
     # ------------------------------------------------------------------------------------------------- once for a mesh
@@ -85,14 +85,14 @@ class Crossings:
 
     @cached_property
     def _around_known(self) -> sparse.csr_matrix:
-        """True where a pair of faces lies within :data:`RINGS` of a known one. *Shape:* ``(F, F)``."""
+        """True where a pair of faces lies within :data:`RINGS_OF_CROSSINGS` of a known one. *Shape:* ``(F, F)``."""
         n, (one, other) = len(self.mesh.faces), self.known_pairs.T
         ends = self.mesh.faces.reshape(-1), np.repeat(np.arange(n), 3)
         incidence = sparse.csr_matrix((np.ones(3 * n, dtype=bool), ends), (self.mesh.n_vertices, n))
         touching = incidence.T @ incidence  # faces that share a vertex
         near = sparse.csr_matrix((np.ones(len(one), dtype=bool), (one, other)), (n, n))
         near = near + near.T
-        for _ in range(RINGS):
+        for _ in range(RINGS_OF_CROSSINGS):
             near = touching @ near @ touching
         return near
 
@@ -148,8 +148,8 @@ class Crossings:
     def is_far(self, pairs: IntArray) -> BoolArray:
         """Which pairs are two parts that went through each other.
 
-        They are more than :data:`RINGS` from each pair that crosses in a known shape, and their triangles more than
-        :data:`FAR` of the diagonal apart along the surface. *Shape:* ``(P, 2) -> (P,)``.
+        They are more than :data:`RINGS_OF_CROSSINGS` from each pair that crosses in a known shape, and their triangles
+        more than :data:`FAR_APART` of the diagonal apart along the surface. *Shape:* ``(P, 2) -> (P,)``.
         """
         far = self.is_new(pairs)
         if len(pairs) and len(self.known_pairs):
@@ -159,11 +159,11 @@ class Crossings:
         return far
 
     def are_far_apart(self, vertices: IntArray, faces: IntArray) -> BoolArray:
-        """True where a vertex and a face are more than :data:`FAR` apart on the surface. *Shape:* ``(n,), (n, 3)``."""
+        """True for a vertex and a face more than :data:`FAR_APART` apart on the surface. *Shape:* ``(n,), (n, 3)``."""
         sources, which = np.unique(vertices, return_inverse=True)
         new = [v for v in sources.tolist() if v not in self._near]
         for some in (new[i : i + 256] for i in range(0, len(new), 256)):
-            reached = dijkstra(self.lengths, indices=some, limit=FAR * self.diagonal)
+            reached = dijkstra(self.lengths, indices=some, limit=FAR_APART * self.diagonal)
             self._near.update((v, np.flatnonzero(np.isfinite(row))) for v, row in zip(some, reached, strict=True))
         if not len(sources):
             return np.ones(0, dtype=bool)

@@ -23,7 +23,7 @@ SLIVER = 0.02
 
 # Neighbours whose rotations are alike to so many radians, but a full turn apart, are torn; in folds of bodies none are.
 # Above this part of the area there is a warning.
-ALIKE = 0.5
+LIKE_ROTATIONS = 0.5
 PART_TORN = 1e-3
 
 # Rotations follow each other along the tree where more than this part of the area of a piece turns by more than this
@@ -33,7 +33,7 @@ BEYOND = np.radians(200)
 PART_BEYOND = 0.05
 
 # Edges without a length count like one of this part of the mean.
-SHORTEST = 1e-9
+SHORTEST_PART = 1e-9
 
 
 class Trajectory(NamedTuple):
@@ -112,7 +112,7 @@ class LocalRotations(nn.Module):
         quaternions = quaternions * LocalRotations.sign(
             self, quaternions.movedim(0, -1), self.areas.expand(quaternions.shape[1], -1)
         )
-        torn = ((pick(quaternions, one) * pick(quaternions, other)).sum(0) < -cos(ALIKE / 2)).any(0)
+        torn = ((pick(quaternions, one) * pick(quaternions, other)).sum(0) < -cos(LIKE_ROTATIONS / 2)).any(0)
         if float((pick(self.areas, one) + pick(self.areas, other))[torn].sum()) > PART_TORN * float(self.areas.sum()):
             message = (
                 "around the mesh, key-frames turn by a full turn from each other, as a ring does that is twisted: no "
@@ -277,7 +277,7 @@ def weights_per_length(mesh: Connectivity, references: Tensor) -> Tensor:
     """Weights of edges where edge vectors are fitted: one over their mean lengths. *Shape:* ``(K, V, 3) -> (E,)``."""
     first, second = torch.tensor(mesh.edges).unbind(1)
     lengths = reduce(torch.add, ((x[second] - x[first]).norm(dim=-1) for x in references)) / len(references)
-    return 1 / lengths.clamp_min(SHORTEST * lengths.mean())
+    return 1 / lengths.clamp_min(SHORTEST_PART * lengths.mean())
 
 
 def _quaternions_from_first(every: Sequence[Frames]) -> Tensor:

@@ -11,7 +11,7 @@ from torch_modal.geometry.vectors import pick
 
 # Required gain of a reflection, in mean cosine between normals: mirrored poses of one body have at least 0.44, poses of
 # thin plates at most 0.2.
-MIRRORED = 0.3
+MIRRORED_GAIN = 0.3
 
 
 class RigidMotion(NamedTuple):
@@ -156,7 +156,7 @@ def looks_mirrored(first: Tensor, second: Tensor, faces: Tensor) -> Tensor:
     covariance, alike = ((weights[..., None] * a).mT @ b for a, b in (centred, unit))
     # A reflection M flips normals, and -M is the best rotation of the negative covariance.
     gain = ((best_rotation(-covariance) - best_rotation(covariance)) * alike).sum((1, 2))
-    return gain > MIRRORED * total
+    return gain > MIRRORED_GAIN * total
 
 
 def volumes_of(x: Tensor, faces: Tensor) -> Tensor:

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch_modal.geometry.rigid import best_rotation
 from torch_modal.geometry.rotations import quaternion
 
-STEPS = 65_535
+WEIGHT_STEPS = 65_535
 """Weights are whole parts of it, as files hold them."""
 FOLLOWED = 0.25
 """Weight in the root's rotation of the turn since the frame before; best fits of a body twisted by a turn jump."""

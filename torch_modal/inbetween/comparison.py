@@ -18,13 +18,13 @@ from torch_modal.elastic.minimise import Solution, Status
 
 # A shape has at most this many times the distortion of its starts. Below, the volume error, which is not measured and
 # which the starts have more of, and the choice of elements decide more than the shapes do.
-SLACK = 1.2
+DISTORTION_SLACK = 1.2
 
 # The same for shapes of a smooth path.
 SLACK_OF_PATHS = 3.0
 
 # From this part of the way between one and the slack on, a shape is blended into its start: none is replaced by a jump.
-MARGIN = 0.5
+BLENDING_MARGIN = 0.5
 
 
 def blend_towards_starts(
@@ -69,7 +69,7 @@ def blend_towards_starts(
 
 
 def blend_by_distortion(
-    x: Tensor, starts: Sequence[Tensor], distortion: Tensor, slight: Tensor, slack: float = SLACK
+    x: Tensor, starts: Sequence[Tensor], distortion: Tensor, slight: Tensor, slack: float = DISTORTION_SLACK
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Shapes, blended into their starts by the distortions of all, where a start has replaced one, and their weights.
 
@@ -89,7 +89,7 @@ def blend_by_distortion(
 
 def _least(slack: float) -> float:
     """Ratio of distortions up to which a shape is not blended into its start."""
-    return 1 + MARGIN * (slack - 1)
+    return 1 + BLENDING_MARGIN * (slack - 1)
 
 
 def _blend_weight(value: Tensor, other: Tensor, slack: float) -> Tensor:

@@ -15,7 +15,7 @@ from torch_modal.geometry.sparse import Solve, factorize, solve_by
 
 # Stiffness towards the start, relative to the mean edge: a vertex in a flat fan has none along its normal, and
 # a loose piece none against rigid motions.
-RIDGE = 1e-6
+MOVE_RIDGE = 1e-6
 
 # A step that is smaller than this leads to the minimum: the next would be its square.
 SMALL_STEP = 1e-8 * CANONICAL_SIZE
@@ -78,7 +78,7 @@ class FreeVertices(nn.Module):
 
     @staticmethod
     def _ridge(placement: Placement) -> Tensor:
-        return RIDGE * placement[1].records[0][..., 0, :].mean(-1, keepdim=True).clamp_min(1)
+        return MOVE_RIDGE * placement[1].records[0][..., 0, :].mean(-1, keepdim=True).clamp_min(1)
 
     # ------------------------------------------------------------------------------------------------ Newton's method
     @outside_inference_mode

@@ -37,10 +37,10 @@ N_SEGMENTS = 24
 NO_ERROR = 1e-6
 
 # Added to the stretching stiffness of modes, relative to its mean, for the bending that it leaves out.
-RIDGE = 1e-3
+BENDING_RIDGE = 1e-3
 
 # Rings of faces around the regions: one that is free, where the modes end; two for hinges, of two faces each.
-RINGS = 3
+RINGS_OF_REGIONS = 3
 
 # Newton steps at most: five or six, as a rule.
 N_STEPS = 100
@@ -84,7 +84,7 @@ def segments(space: PairedSpace, references: Tensor, n_segments: int = N_SEGMENT
     sums = []
     for end, x in zip((space.first, space.second), coarse.restrict(references), strict=True):
         stiffness = stretching_hessian(mesh, x, end.basis.coarse)
-        level = RIDGE * stiffness.diagonal().mean() * torch.eye(len(stiffness)).to(stiffness)
+        level = BENDING_RIDGE * stiffness.diagonal().mean() * torch.eye(len(stiffness)).to(stiffness)
         lower = torch.linalg.cholesky(stiffness + level)
         modes = torch.linalg.solve_triangular(lower, end.basis.coarse.flatten(1), upper=False)
         sums.append(_moments(x.numpy(), modes.unflatten(1, (-1, 3)).numpy(), area))
@@ -159,7 +159,7 @@ class LocalInterpolation(nn.Module):
     def __init__(self, mesh: Mesh, fine: Energy, region: Tensor) -> None:
         super().__init__()
         faces, rings = mesh.faces, [region]
-        for _ in range(RINGS):
+        for _ in range(RINGS_OF_REGIONS):
             rings.append(rings[-1].index_fill(0, faces[rings[-1][faces].any(1)].flatten(), True))
         used, numbered = faces[rings[-1][faces].all(1)].unique(return_inverse=True)
         # Smooth at half a turn, where squared differences of angles have a kink that minimisers would end at.

@@ -18,7 +18,7 @@ from torch_modal.elastic.term import Mesh, Term
 from torch_modal.inbetween.alignment import KeyframeAlignment, Pose
 from torch_modal.inbetween.blend import RotationBlend
 from torch_modal.inbetween.coarse import CoarseMesh
-from torch_modal.inbetween.comparison import SLACK, blend_towards_starts
+from torch_modal.inbetween.comparison import DISTORTION_SLACK, blend_towards_starts
 from torch_modal.inbetween.joint import JointSpace
 from torch_modal.inbetween.paired import PairedSpace
 from torch_modal.inbetween.regions import LocalInterpolation, worst_regions
@@ -105,7 +105,7 @@ class InBetweenSolver(nn.Module):
         x = self.relax(x, rests)
         # No shape is better for being far from a key-frame with a weight below zero.
         compared = rests._replace(weights=weights.clamp_min(0))
-        x, solution = blend_towards_starts(x, [base, straight], solution, self.distortion, compared, SLACK)
+        x, solution = blend_towards_starts(x, [base, straight], solution, self.distortion, compared, DISTORTION_SLACK)
         x, solution = self.finish(x, solution, rests)
         valid, x = solution.status != Status.INVALID, self.alignment.to_caller(x, pose)
         x = x if is_eager(valid) and valid.all() else torch.where(valid[:, None, None], x, torch.nan)

@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from torch_modal.arrays import FloatArray
 from torch_modal.errors import MeshWarning
-from torch_modal.geometry.skin import STEPS
+from torch_modal.geometry.skin import WEIGHT_STEPS
 from torch_modal.io.files import read_companion
 
 Json = dict[str, Any]
@@ -196,7 +196,7 @@ class Document:
         """Add the four largest weights of bones at points; returns attributes. *Shape:* ``(P, J)``."""
         wide = np.pad(weights, ((0, 0), (0, max(0, 4 - weights.shape[1]))))
         joints = np.argsort(-wide, axis=1, kind="stable")[:, :4]
-        parts = np.rint(np.take_along_axis(wide, joints, axis=1) * STEPS).astype("<u2")
+        parts = np.rint(np.take_along_axis(wide, joints, axis=1) * WEIGHT_STEPS).astype("<u2")
         joints = np.where(parts > 0, joints, 0).astype("<u1" if weights.shape[1] <= 256 else "<u2")
         added = self.add(parts, "VEC4", ARRAY_BUFFER, normalized=True)
         return {"JOINTS_0": self.add(joints, "VEC4", ARRAY_BUFFER), "WEIGHTS_0": added}

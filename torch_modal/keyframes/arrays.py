@@ -10,7 +10,7 @@ from torch_modal.arrays import IntArray
 from torch_modal.autograd import broadcast_shapes
 from torch_modal.errors import MeshError
 
-UNITS = 8.0
+LARGEST_UNIT_RATIO = 8.0
 """Points that extend over more or less than known ones by this factor are in other units."""
 
 
@@ -130,11 +130,11 @@ def require_units(name: str, points: Tensor, of: str, known: Tensor, unit: float
         unit: Length of a coordinate of 1, for the message.
 
     Raises:
-        ValueError: By more than :data:`UNITS`.
+        ValueError: By more than :data:`LARGEST_UNIT_RATIO`.
     """
     # By medians, which a few outliers do not change.
     extent, *others = [float((x - x.median(0).values).norm(dim=-1).median()) * unit for x in (points, *known)]
-    if not min(others) / UNITS <= extent <= max(others) * UNITS:
+    if not min(others) / LARGEST_UNIT_RATIO <= extent <= max(others) * LARGEST_UNIT_RATIO:
         raise ValueError(
             f"{name} extend over {extent:.3g} around their middle, {of} over {min(others):.3g} to {max(others):.3g}: "
             "they are in other units; scale them to the units of the key-frames"

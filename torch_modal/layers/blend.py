@@ -17,7 +17,7 @@ from torch_modal.layers.base import Bases, InBetweenLayer, basis_buffers
 MOST_BELOW_ZERO = 0.25
 """Largest sum of the weights below zero with which energies still have a minimum."""
 
-ROUNDING = 1e-5
+SUM_TOLERANCE = 1e-5
 """Sums of weights may differ from one by so much, or by the rounding of their dtype."""
 
 
@@ -99,7 +99,7 @@ class Blend(InBetweenLayer):
 
 
 def _check_weights(weights: Tensor) -> None:
-    known, rounding = weights.double(), max(ROUNDING, torch.finfo(weights.dtype).eps)
+    known, rounding = weights.double(), max(SUM_TOLERANCE, torch.finfo(weights.dtype).eps)
     off, below = (known.sum(-1) - 1).abs(), -known.clamp_max(0).sum(-1)
     wrong = ~((off <= rounding) & (below <= MOST_BELOW_ZERO + rounding))
     if bool(wrong.any()):

@@ -8,7 +8,7 @@ import numpy as np
 from torch_modal.arrays import BoolArray, FloatArray, IntArray
 from torch_modal.modes.tetrahedra import EDGES, Tetrahedra, orient
 
-UNITS = 256
+CUBE_UNITS = 256
 """Integer coordinates along the edge of a cube, so that edges can be bisected eight times."""
 _ORDERS = np.array(list(itertools.permutations(range(3))))
 """Orders of the axes, each a path from the lowest corner of a cube to the highest. *Shape:* ``(6, 3)``."""
@@ -61,9 +61,9 @@ class _Mesh:
 
     def __init__(self, cubes: IntArray, points: FloatArray) -> None:
         counts = cubes.max(axis=0) + 1
-        sides = (counts + 1) * UNITS
+        sides = (counts + 1) * CUBE_UNITS
         self.stride = np.array([sides[1] * sides[2], sides[2], 1])
-        self.tets: IntArray = (UNITS * (cubes[:, None, None] + _PATHS) @ self.stride).reshape(-1, 4)
+        self.tets: IntArray = (CUBE_UNITS * (cubes[:, None, None] + _PATHS) @ self.stride).reshape(-1, 4)
         self.halvings = np.zeros(len(self.tets), dtype=np.int64)
         self.inner = np.zeros(len(self.tets), dtype=bool)
         self.vertices: IntArray = np.unique(self.tets)
@@ -78,7 +78,7 @@ class _Mesh:
     def coordinates(self, keys: IntArray) -> FloatArray:
         """Positions of vertices, in cube edges. *Shape:* ``(...) -> (..., 3)``."""
         x, rest = np.divmod(keys, self.stride[0])
-        return np.stack([x, *np.divmod(rest, self.stride[1])], axis=-1) / UNITS
+        return np.stack([x, *np.divmod(rest, self.stride[1])], axis=-1) / CUBE_UNITS
 
     def drop(self, is_inside: Callable[[FloatArray], BoolArray]) -> None:
         """Remove tetrahedra outside."""

@@ -17,12 +17,12 @@ from torch_modal.modes.tetrahedra import solid_volumes, tet_volumes
 
 FIT_WEIGHT = 1e4
 """Weight of the surface term relative to the deformation energy; both are dimensionless."""
-N_STEPS = 5
+LOCAL_GLOBAL_STEPS = 5
 """Local-global steps after the first solve; the energy has then nearly converged."""
 MAX_FIT_RMS = 5e-3
 MAX_FIT = 0.1
 """Largest root mean square and maximum distances from the key-frame, in bounding-box diagonals."""
-FLAT = 1e-3
+SINGULAR = 1e-3
 """Determinant over the cubed norm, below which a matrix counts as singular; a rotation has 0.19."""
 MOST_POLAR_STEPS = 20
 MAX_INVERTED = 0.04
@@ -71,7 +71,7 @@ class Carrier:
         field = self.factors.solve(self.pull.T @ turns.reshape(-1, 9)).reshape(-1, 3, 3)
         gradients = field[rest.tets].mean(axis=1)
         corners, n = rest.tets.reshape(-1), len(rest.vertices)
-        for _ in range(N_STEPS + 1):
+        for _ in range(LOCAL_GLOBAL_STEPS + 1):
             # Minimises sum_t vol_t |∇x - R_t|² with the surface pulled to the target.
             rotations = nearest_rotations(gradients)
             forces = np.einsum("t,tij,taj->tai", self.volumes, rotations, self.gradients).reshape(-1, 3)
@@ -117,7 +117,7 @@ def nearest_rotations(matrices: NDArray[Any]) -> FloatArray:
     ``s = det(X)^(-1/3)`` (Higham 1986), in a third of the time of a singular value decomposition. The latter serves
     mirrored and singular matrices.
     """
-    sound = np.linalg.det(matrices) > FLAT * np.linalg.norm(matrices, axis=(1, 2)) ** 3
+    sound = np.linalg.det(matrices) > SINGULAR * np.linalg.norm(matrices, axis=(1, 2)) ** 3
     u, _, vt = np.linalg.svd(matrices[~sound])
     u[:, :, 2] *= np.sign(np.linalg.det(u @ vt))[:, None]
     x = np.ascontiguousarray(np.moveaxis(matrices[sound], 0, -1))

@@ -17,10 +17,10 @@ PUSH = 0.005
 of the mesher (0.004), below the thickness of a limb."""
 MAX_AMPLIFICATION = 4.0
 """Largest sum of the magnitudes of a point's weights; 1 inside, larger where it extrapolates."""
-FLAT = 1e-7
+COPLANAR = 1e-7
 """Determinant of the neighbours' covariance over its cubed trace, below which they count as coplanar."""
 N_CANDIDATES = (6, 32)
-CHUNK = 4096
+POINTS_PER_CHUNK = 4096
 """Points whose neighbours are found at once, to bound memory."""
 
 
@@ -71,7 +71,7 @@ def find_neighbours(points: FloatArray, tetrahedra: Tetrahedra, normals: FloatAr
     for rings in range(2, MAX_RINGS + 1):
         reached = sp.csr_matrix(reached @ adjacency)
         rows = np.flatnonzero(left)
-        for chunk in np.array_split(rows, len(rows) // CHUNK + 1):
+        for chunk in np.array_split(rows, len(rows) // POINTS_PER_CHUNK + 1):
             nearest, kernel, number = _nearest_reached(points[chunk], vertices, closest[chunk], incidence, reached)
             fit = _moving_least_squares(points[chunk], vertices, nearest, kernel)
             good = (number >= wanted) & (np.abs(fit).sum(axis=1) <= MAX_AMPLIFICATION) | (rings == MAX_RINGS)
@@ -143,7 +143,7 @@ def _moving_least_squares(
     centered = offset - mean[:, None]
     covariance = (theta[..., None] * centered).transpose(0, 2, 1) @ centered
     # Coplanar neighbours determine no slope across their plane: a pseudo-inverse makes it zero.
-    flat = np.linalg.det(covariance) <= FLAT * np.trace(covariance, axis1=1, axis2=2) ** 3
+    flat = np.linalg.det(covariance) <= COPLANAR * np.trace(covariance, axis1=1, axis2=2) ** 3
     inverse = np.empty_like(covariance)
     inverse[~flat] = np.linalg.inv(covariance[~flat])
     inverse[flat] = np.linalg.pinv(covariance[flat], rcond=1e-9, hermitian=True)

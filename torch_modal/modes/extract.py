@@ -35,7 +35,7 @@ METHODS: tuple[Method, ...] = ("auto", "solid", "shell")
 MESHERS: dict[str, Callable[[], Mesher]] = {"auto": Auto, "lattice": Lattice, "tetwild": TetWild}
 """Constructors of meshers by name."""
 
-THIN = 0.01
+THINNEST_SOLID = 0.01
 """Mean thickness, in roots of the area, below which the shell is taken."""
 VERTICES_AT_ONCE = 30_000
 """Total size of concurrent eigenproblems: about 2 GiB."""
@@ -192,7 +192,7 @@ def why_shell(surfaces: list[CanonicalSurface]) -> str:
         what = f"key-frame {index} is" if len(surfaces) > 1 else "the shape is"
         if holes > OPEN:
             return f"{what} open: a round hole with its boundary would have {holes:.2g} times its area"
-        if thickness < THIN:
+        if thickness < THINNEST_SOLID:
             return f"{what} thin: its mean thickness is {thickness:.2g} times the root of its area"
     return ""
 

@@ -31,13 +31,13 @@ VERSION = "whole"
 """Part of the cache key: change it when the algorithm changes."""
 COARSER = 1.1
 """Factor by which cubes grow until their number is within the limit."""
-TURN = np.array([[2.0, -1.0, 2.0], [2.0, 2.0, -1.0], [-1.0, 2.0, 2.0]]) / 3
+GENERIC_ROTATION = np.array([[2.0, -1.0, 2.0], [2.0, 2.0, -1.0], [-1.0, 2.0, 2.0]]) / 3
 """Rotation that aligns no axis with another."""
 ROOT = 2.0
 """Edge length of the root cubes, relative to the cubes at the surface."""
 ACROSS = 2.0
 """Tetrahedra across the thickness; a gap has one."""
-SMALLEST = 1 / 12
+SMALLEST_TETRAHEDRON = 1 / 12
 """Smallest tetrahedron size, relative to the largest at the surface."""
 MOST_TETRAHEDRA = 12_000
 """Approximate limit before the fit to the surface; it grows with the volume in units of finer cubes."""
@@ -59,7 +59,7 @@ RAMP = 0.25
 """Width of the corrected transition, in grid spacings."""
 LEAST_INSIDE = 0.02
 """Inside fraction below which tetrahedra are removed; lower bound for those that contain surface samples."""
-REACH = 0.7
+LARGEST_MOVE = 0.7
 """Largest displacement onto the surface, relative to the smallest incident tetrahedron."""
 LEAST_VOLUME = 0.05
 """Smallest volume ratio of moved tetrahedra; otherwise their vertices retreat."""
@@ -69,7 +69,7 @@ FITTED_INSIDE = 0.4
 MOST_BRIDGES = 4
 LEAST_KEPT = 0.8
 """Volume fraction that the fit must retain; otherwise the body is too thin for it."""
-SPREAD = np.concatenate([np.eye(4) * 2 / 3 + 1 / 12, np.full((1, 4), 0.25)])
+QUADRATURE_POINTS = np.concatenate([np.eye(4) * 2 / 3 + 1 / 12, np.full((1, 4), 0.25)])
 """Barycentric coordinates of the quadrature points of a tetrahedron."""
 
 
@@ -102,9 +102,9 @@ class Lattice:
         tetrahedra = lattice(surface, self.cube)
         if (n_pieces := face_connected_pieces(tetrahedra.tets).max()) <= surface.mesh.vertex_pieces.max():
             return tetrahedra
-        rotated = lattice(replace(surface, points=surface.points @ TURN.T), self.cube)
+        rotated = lattice(replace(surface, points=surface.points @ GENERIC_ROTATION.T), self.cube)
         better = face_connected_pieces(rotated.tets).max() < n_pieces
-        return rotated._replace(vertices=rotated.vertices @ TURN) if better else tetrahedra
+        return rotated._replace(vertices=rotated.vertices @ GENERIC_ROTATION) if better else tetrahedra
 
 
 class Indicator:
@@ -153,7 +153,7 @@ class Indicator:
 
     def inside(self, corners: FloatArray) -> FloatArray:
         """Inside fraction of tetrahedra. *Shape:* ``(T, 4, 3) -> (T,)``."""
-        values = self.at(np.einsum("qa,tai->tqi", SPREAD, corners).reshape(-1, 3))
+        values = self.at(np.einsum("qa,tai->tqi", QUADRATURE_POINTS, corners).reshape(-1, 3))
         return values.reshape(len(corners), -1).mean(axis=1)
 
     def at(self, points: FloatArray) -> FloatArray:
@@ -187,7 +187,7 @@ def lattice(surface: CanonicalSurface, cube: float) -> Tetrahedra:
             break
         largest *= COARSER
     thickness, gap = clearances(surface)
-    sizes = np.clip(np.minimum(thickness / ACROSS, gap), SMALLEST * largest, largest)
+    sizes = np.clip(np.minimum(thickness / ACROSS, gap), SMALLEST_TETRAHEDRON * largest, largest)
     samples = SurfaceSamples(surface, np.minimum(SAMPLES_APART * sizes, (surface.area / FEWEST_SAMPLES) ** 0.5))
     points, wanted = samples.points, sizes[samples.faces]
     spacing = max(GRID_SPACING * wanted.min(), (np.prod(counts * root) / MOST_POINTS) ** (1 / 3))
@@ -222,7 +222,7 @@ def _fit(filled: Tetrahedra, indicator: Indicator) -> Tetrahedra:
     np.minimum.at(sizes, filled.tets.reshape(-1), np.repeat(np.cbrt(6 * volumes), 4))
     rim = np.unique(filled.tets[np.asarray(filled.inside) < 1 - LEAST_INSIDE])
     distance, nearest = samples.tree.query(filled.vertices[rim], workers=n_threads())
-    near = distance < REACH * sizes[rim]
+    near = distance < LARGEST_MOVE * sizes[rim]
     rim, nearest = rim[near], nearest[near]
     height = np.einsum("vi,vi->v", filled.vertices[rim] - samples.points[nearest], samples.normals[nearest])
     vertices = filled.vertices.copy()

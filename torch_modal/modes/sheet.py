@@ -21,25 +21,25 @@ from torch_modal.modes.tetrahedra import small_pieces
 
 THICKNESS = 0.01
 """Thickness of the sheet whose mass the modes have, in sizes of the surface."""
-COARSE_FACES = 4000
+SHEET_FACES = 4000
 """Faces of the mesh that modes are computed on: with 2,000 or 8,000, in-betweens are as good."""
 FACES_PER_MODE = 50
 """Faces for each requested mode, where there are many."""
-SHORTEST = 1e-6
+SHORTEST_EDGE = 1e-6
 """Length of an edge over the mean up to which its ends are one vertex: it would have no stiffness."""
 LEAST_MASS = 1e-3
 """Smallest mass of a vertex over the mean."""
-LARGEST_RESIDUAL = 0.1
+LARGEST_SHEET_RESIDUAL = 0.1
 """Largest residual of a mode: rounding of ``K phi`` at slivers, which are stiffer than the rest by many orders."""
 SHIFT = 50 * 100 * 2 * BETA / (CANONICAL_SIZE**4 * THICKNESS * CANONICAL_SIZE)
 """Shift of the eigenproblem: 50 times the lowest eigenvalue of a flat sheet."""
-SPREAD = 1.5
+AVERAGES_PER_RADIUS = 1.5
 """Averages over neighbours that carry displacements from clusters to vertices, per radius of a cluster in edges."""
 
 
 def n_coarse_faces(n_modes: int) -> int:
     """Faces of the mesh that a number of modes is computed on."""
-    return max(COARSE_FACES, FACES_PER_MODE * n_modes)
+    return max(SHEET_FACES, FACES_PER_MODE * n_modes)
 
 
 def sheet_body(surface: CanonicalSurface, n_modes: int) -> ElasticBody:
@@ -54,7 +54,7 @@ def sheet_body(surface: CanonicalSurface, n_modes: int) -> ElasticBody:
     large = surface.faces[~small_pieces(amounts, surface.points[surface.faces], piece)[piece]]
     # Modes do not mind needles, for which `coarsen` would collapse several times.
     coarsening = collapse(surface.points, large, n_coarse_faces(n_modes))
-    coarsening = join_clusters(surface.points, large, coarsening, SHORTEST)
+    coarsening = join_clusters(surface.points, large, coarsening, SHORTEST_EDGE)
     points, mesh = coarsening.restrict(surface.points), Connectivity(coarsening.faces, coarsening.n_vertices)
 
     coarser = _mean_length(points, mesh) / _mean_length(surface.points, fine)
@@ -78,7 +78,7 @@ def sheet_body(surface: CanonicalSurface, n_modes: int) -> ElasticBody:
         blend = sp.hstack([weights, *slopes], format="csr")
         return (blend @ local.reshape(blend.shape[1], -1)).reshape(-1, *motions.shape[1:])
 
-    return ElasticBody(points, stiffness, mass, to_surface, SHIFT, LARGEST_RESIDUAL)
+    return ElasticBody(points, stiffness, mass, to_surface, SHIFT, LARGEST_SHEET_RESIDUAL)
 
 
 def _cluster_weights(
@@ -89,7 +89,7 @@ def _cluster_weights(
     clustered = np.flatnonzero(clusters >= 0)
     weights = sp.csr_matrix((np.ones(len(clustered)), (clustered, clusters[clustered])), shape=(n_fine, n))
     averages = _averages(fine)
-    for _ in range(round(SPREAD * (len(clustered) / n) ** 0.5)):
+    for _ in range(round(AVERAGES_PER_RADIUS * (len(clustered) / n) ** 0.5)):
         weights = averages @ weights
     total = np.asarray(weights.sum(axis=1)).reshape(-1)
     weights = sp.diags(1 / np.where(total > 0, total, 1)) @ weights

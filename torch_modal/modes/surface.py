@@ -18,15 +18,15 @@ _DIAGONAL_RANGE = (1e-90, 1e90)
 MOST_SAMPLES = 60_000
 LEAF = 32
 """Leaf size of the tree of samples: twice SciPy's, which is a third faster for queries near the surface."""
-NEAR = 0.03
+LARGEST_GAP = 0.03
 """Largest gap that counts as proximity, in sizes."""
 OPPOSED = -0.3
 """Largest cosine between the normals of opposing points."""
 SEEN_POINTS = 2000
 """Approximate number of points tested for proximity; larger surfaces are subsampled."""
-MOST = 0.06
+LARGEST_THICKNESS = 0.06
 """Largest measured thickness or gap, in sizes."""
-N_SAMPLES = 5000
+LEAST_SAMPLES = 5000
 """Minimum number of samples for thickness and gap."""
 SEEN_SAMPLES = 10_000
 """Approximate number of samples at which they are measured."""
@@ -153,23 +153,25 @@ def self_proximity(surface: CanonicalSurface) -> float:
     tree = cKDTree(points)
     opposed = np.zeros(len(points), dtype=bool)
     for gap in (1 / 16, 1 / 8, 1 / 4, 1 / 2):  # beyond half the gap, the opposing side is nearer than the point itself
-        nearest = tree.query(points + gap * NEAR * CANONICAL_SIZE * normals, workers=n_threads())[1]
+        nearest = tree.query(points + gap * LARGEST_GAP * CANONICAL_SIZE * normals, workers=n_threads())[1]
         opposed |= np.einsum("vi,vi->v", normals, normals[nearest]) < OPPOSED
     areas = vertex_areas(surface.points, surface.faces)[::step]
     return float(areas[opposed].sum() / areas.sum())
 
 
 def clearances(surface: CanonicalSurface) -> tuple[FloatArray, FloatArray]:
-    """Thickness of the body behind each face, and gap in front of it; infinite above `MOST`. *Shape:* ``(F,), (F,)``.
+    """Thickness of the body behind each face, and gap in front of it; infinite above `LARGEST_THICKNESS`.
+
+    *Shape:* ``(F,), (F,)``.
 
     They are diameters of balls tangent to the surface at samples, which shrink until they are empty (Ma, Bae and Choi
     2012) or touch a side that is not opposing, as in a corner.
     """
-    samples = SurfaceSamples(surface, np.full(len(surface.faces), np.sqrt(surface.area / N_SAMPLES)))
+    samples = SurfaceSamples(surface, np.full(len(surface.faces), np.sqrt(surface.area / LEAST_SAMPLES)))
     seen = np.arange(0, len(samples.points), max(len(samples.points) // SEEN_SAMPLES, 1))
     clearance = np.full((2, len(surface.faces)), np.inf)
     for smallest, side in zip(clearance, (-1.0, 1.0), strict=True):
-        left, radius = seen, np.full(len(seen), MOST * CANONICAL_SIZE / 2)
+        left, radius = seen, np.full(len(seen), LARGEST_THICKNESS * CANONICAL_SIZE / 2)
         for _ in range(MOST_SHRINKINGS):
             point, direction = samples.points[left], side * samples.normals[left]
             nearest = samples.tree.query(point + radius[:, None] * direction, workers=n_threads())[1]

@@ -27,10 +27,10 @@ from torch_modal.times import check_times, locate_times
 UNIT = 0.01
 """An amplitude of 1 moves the vertices of the key-frame by this part of its diagonal, in the root mean square."""
 
-LEAST = 1e-4
+SMALLEST_SIDE = 1e-4
 """A triangle with less than this part of the mean side has no turn or strain of its own."""
 
-MOST = 30.0
+LARGEST_RATIO = 30.0
 """A triangle turns and strains by at most this many times the mode's mean over the area; only slivers do more."""
 
 
@@ -193,8 +193,8 @@ def bending_columns(reference: Tensor, faces: Tensor, displaced: Tensor) -> Tens
 def _limit_slivers(columns: Tensor, rest: Frames) -> Tensor:
     """Bound turns and strains of slivers; zero them for triangles without a size. *Shape:* ``(6, k, F)``."""
     areas = rest.twice_areas
-    columns = torch.where(areas / rest.size > LEAST * rest.size.mean(), columns, 0)
+    columns = torch.where(areas / rest.size > SMALLEST_SIDE * rest.size.mean(), columns, 0)
     squared = columns.square().sum(0) + columns[4].square()  # the off-diagonal entry counts twice
-    limit = MOST * ((areas * squared).sum(1, keepdim=True) / areas.sum()).sqrt()
+    limit = LARGEST_RATIO * ((areas * squared).sum(1, keepdim=True) / areas.sum()).sqrt()
     bound = (limit / squared.sqrt().clamp_min(torch.finfo(squared.dtype).tiny)).clamp_max(1)
     return (bound * columns).movedim(0, 1).contiguous()

@@ -8,7 +8,7 @@ from torch_modal.keyframes.arrays import check_tensor
 from torch_modal.motion.path import Path
 from torch_modal.times import fill_times
 
-SLIGHT = 1e-6
+UNSEEN_CHANGE = 1e-6
 """An interval is computed again where an edit moves its shapes by more than about this part of the diagonal."""
 
 
@@ -82,7 +82,7 @@ class PathEditor:
         at, intervals = self.times(), []
         for i, (made, needed) in enumerate(zip(self._made, self._dependencies(), strict=True)):
             same = made is not None and torch.equal(made[1][0], needed[0])
-            if made is None or not same or not bool(((made[1][1] - needed[1]).abs() <= SLIGHT).all()):
+            if made is None or not same or not bool(((made[1][1] - needed[1]).abs() <= UNSEEN_CHANGE).all()):
                 times = at[i * self.steps : (i + 1) * self.steps]
                 made = outside_inference_mode(self.path)(self.keyframes, times), needed
                 self._made[i] = made

@@ -20,20 +20,20 @@ from torch_modal.geometry.connectivity import merge_seams
 from torch_modal.geometry.inspect import diagonals
 from torch_modal.geometry.rigid import best_rotation
 from torch_modal.geometry.rotations import exp, log, matrix
-from torch_modal.geometry.skin import STEPS, Skin, blend_bones
+from torch_modal.geometry.skin import WEIGHT_STEPS, Skin, blend_bones
 from torch_modal.io.write import check_frames
 from torch_modal.times import Times, check_times
 
-ROUNDS = 20  # at most; fewer where one lowers the error by less than a hundredth
+MOST_ROUNDS = 20  # at most; fewer where one lowers the error by less than a hundredth
 SWEEPS = 2  # over the bones in a round
-LEAST = 4  # vertices of a new bone; fewer leave its rotation undetermined
+LEAST_BONE_VERTICES = 4  # vertices of a new bone; fewer leave its rotation undetermined
 EQUAL = 1e-5  # distance of motions that count as one, over the diagonal
-CHUNK = 2**22  # products of bones at vertices, in memory at a time
+PRODUCTS_AT_ONCE = 2**22  # products of bones at vertices, in memory at a time
 TINY, RIDGE = 1e-30, 1e-10
 TIED = 8  # further rounds, in which the rotations of a bone are tied to the rotations in the neighbouring frames
 TIES = 0.01, 1.0  # first and largest weight of it, over the squared error of all vertices; fourfold where bones turn on
-TURN = np.cos(np.radians(15))  # of a bone between frames, relative to its vertices
-THIN = 1e-4  # part of the identity in the rotation of a bone's vertices, which may lie on a line
+LARGEST_TURN = np.cos(np.radians(15))  # of a bone between frames, relative to its vertices
+IDENTITY_SHARE = 1e-4  # part of the identity in the rotation of a bone's vertices, which may lie on a line
 
 
 @torch.no_grad()
@@ -73,8 +73,8 @@ def bake(
     """
     shapes, triangles = check_frames(frames, faces)
     n, n_vertices = shapes.shape[:2]
-    if n < 2 or n_vertices < LEAST:
-        raise ValueError(f"bones need 2 frames and {LEAST} vertices or more, got {n} of {n_vertices}")
+    if n < 2 or n_vertices < LEAST_BONE_VERTICES:
+        raise ValueError(f"bones need 2 frames and {LEAST_BONE_VERTICES} vertices or more, got {n} of {n_vertices}")
     if not isinstance(bones, int) or not 1 <= bones <= n_vertices:
         raise ValueError(f"bones must be a whole number from 1 to the number of vertices, {n_vertices}; got {bones!r}")
     if influences not in (1, 2, 3, 4):
@@ -132,10 +132,10 @@ class _Decomposition:
         self.still = torch.eye(3, 4).to(x).repeat(len(x), 1, 1, 1)
 
     def solve(self, most: int) -> tuple[Tensor, Tensor]:
-        """Weights in whole parts of :data:`STEPS`, and bones."""
+        """Weights in whole parts of :data:`WEIGHT_STEPS`, and bones."""
         bones = self._cluster_bones(most)
         weights, error = self._fit_weights(bones, self.influences)
-        for _ in range(ROUNDS):
+        for _ in range(MOST_ROUNDS):
             last, bones = error.mean(), self._fit_bones(bones, weights)
             weights, error = self._fit_weights(bones, self.influences)
             if error.mean() > 0.98 * last:
@@ -144,13 +144,13 @@ class _Decomposition:
         for _ in range(TIED):
             bones = self._fit_bones(bones, weights, total * ties)
             steps = bones[1:, ..., :3] @ bones[:-1, ..., :3].mT
-            beyond = (steps * _frame_rotations(self.shapes, weights)[0]).sum((-2, -1)) < 1 + 2 * TURN
+            beyond = (steps * _frame_rotations(self.shapes, weights)[0]).sum((-2, -1)) < 1 + 2 * LARGEST_TURN
             ties = torch.where(beyond.any(0), (4 * ties).clamp_max(TIES[1]), ties)
             weights, error = self._fit_weights(bones, self.influences)
         weights, bones, ties = self._merge_bones(weights, bones, ties)
-        whole = (weights * STEPS).floor()
-        rank = (weights * STEPS - whole).argsort(1, descending=True).argsort(1)
-        weights = (whole + (rank < STEPS - whole.sum(1, keepdim=True))) / STEPS
+        whole = (weights * WEIGHT_STEPS).floor()
+        rank = (weights * WEIGHT_STEPS - whole).argsort(1, descending=True).argsort(1)
+        weights = (whole + (rank < WEIGHT_STEPS - whole.sum(1, keepdim=True))) / WEIGHT_STEPS
         return weights, self._fit_bones(bones, weights, total * ties)
 
     def _cluster_bones(self, most: int) -> Tensor:
@@ -163,7 +163,7 @@ class _Decomposition:
             total, halves = error.new_zeros(n).index_add(0, label, error), []
             for j in total.argsort(descending=True)[: most - n].tolist():
                 members = (label == j).nonzero()[:, 0]
-                if len(members) >= 2 * LEAST and total[j] > EQUAL**2 * len(members):
+                if len(members) >= 2 * LEAST_BONE_VERTICES and total[j] > EQUAL**2 * len(members):
                     away = (self.rest[members] - self.rest[members[error[members].argmax()]]).norm(dim=1)
                     halves.append(torch.zeros_like(error).index_fill(0, members[away <= away.median()], 1))
             if not halves:
@@ -183,7 +183,7 @@ class _Decomposition:
         n_frames, n = bones.shape[:2]
         columns, grams = bones.transpose(1, 2).reshape(3 * n_frames, 4 * n), _grams(bones).reshape(n * n, 16)
         weights, errors = self.rest.new_zeros(len(self.rest), n), []
-        for rows in torch.arange(len(self.rest), device=bones.device).split(max(1, CHUNK // n**2)):
+        for rows in torch.arange(len(self.rest), device=bones.device).split(max(1, PRODUCTS_AT_ONCE // n**2)):
             p, x = self.rest[rows], self.rows[:, rows]
             squares = ((p[:, :, None] * p[:, None]).flatten(1) @ grams.mT).unflatten(1, (n, n))
             products = ((columns.mT @ x).unflatten(0, (n, 4)) * p.mT).sum(1).mT
@@ -234,7 +234,7 @@ class _Decomposition:
 
     def _merge_bones(self, weights: Tensor, bones: Tensor, ties: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Drop bones that move nothing, and merge bones that move alike."""
-        kept = weights.sum(0) * STEPS >= 1
+        kept = weights.sum(0) * WEIGHT_STEPS >= 1
         while True:
             weights, bones, ties = weights[:, kept], bones[:, kept], ties[kept]
             weighted = weights[:, :, None] * self.rest[:, None]
@@ -262,7 +262,7 @@ def _frame_rotations(x: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
         sums.unflatten(1, (-1, 3)).unflatten(0, (-1, 3)).transpose(1, 2) - centres[..., None] * centres[0, :, None]
     )
     width = moments[0].diagonal(dim1=1, dim2=2).sum(1)[:, None, None]
-    turns = best_rotation(moments + THIN * width * torch.eye(3).to(x))
+    turns = best_rotation(moments + IDENTITY_SHARE * width * torch.eye(3).to(x))
     return turns[1:] @ turns[:-1].mT, centres
 
 

@@ -32,7 +32,7 @@ N_SIGNS, MORE_SIGNS = 4, 6
 """Number of eigenfunctions with both signs in the initial maps, and in the initial maps of a second attempt."""
 N_REFINED, N_DIFFERENT = 4, 2  # number of fully refined maps: the best ones, and others that differ from them
 SAME = 0.1  # largest difference of equal maps, for a surface of unit area
-N_SAMPLES = 40  # number of samples between which distances are compared
+DISTANCE_SAMPLES = 40  # number of samples between which distances are compared
 _STEP = 3
 _NEAR = 0.12  # largest geodesic distance of closest points from the image of a map, for a surface of unit area
 
@@ -97,7 +97,7 @@ class SpectralShape:
         """Samples far from each other, and the distances to them. *Shape:* ``(m,), (n, m)``."""
         chosen = [int(self.geodesics_from(np.zeros(1, dtype=np.int64)).argmax())]
         distances = self.geodesics_from(np.array(chosen))
-        while len(chosen) < min(N_SAMPLES, len(self)):
+        while len(chosen) < min(DISTANCE_SAMPLES, len(self)):
             chosen.append(int(distances.min(1).argmax()))
             distances = np.hstack([distances, self.geodesics_from(np.array(chosen[-1:]))])
         return np.array(chosen), distances

@@ -16,7 +16,7 @@ TRUSTED = 0.5  # confidence below which a result is doubtful
 
 SLIDING = 0.9, 0.65  # freedom to slide along the target: no confidence, full confidence
 LEAD = 0.0, 0.1  # advantage over the best fit along another map: no confidence, full confidence
-MIRRORED = 0.18, 0.06  # advantage of the best map onto the mirrored target: no confidence, full confidence
+MIRRORED_LEAD = 0.18, 0.06  # advantage of the best map onto the mirrored target: no confidence, full confidence
 LOG_ODDS = 7.0
 """Log-odds that a map is right whose score, likeness of curvatures and stretch are usual for right maps."""
 # Loss of log-odds per unit that each is worse, and the value where the loss begins. All are from a logistic regression
@@ -217,7 +217,7 @@ def judge(
         }
         reasons = "; ".join(what for what, loss in losses.items() if 2 * loss > max(losses.values()))
         criteria[reasons] = 1 / (1 + np.exp(sum(max(loss, 0) for loss in losses.values()) - LOG_ODDS))
-        criteria["the target looks like a mirror image of the template"] = ramp(mirrored_lead, *MIRRORED)
+        criteria["the target looks like a mirror image of the template"] = ramp(mirrored_lead, *MIRRORED_LEAD)
     advice = "look at the result, and give landmarks (five or more) on both meshes"
     if len(landmark_errors):
         worst, error = int(landmark_errors.argmax()), float(landmark_errors.max())

@@ -14,7 +14,7 @@ from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.inspect import volume_of
 from torch_modal.geometry.surface import Surface
 
-LEAN = 0.01
+NORMAL_WEIGHT = 0.01
 """Weight of normals relative to positions, in diagonals; distinguishes sheets closer than twice this distance."""
 DUST = 0.01  # part of the area below which a connected piece is ignored
 CUT = 0.04  # widest cut through a surface that is closed, in diagonals
@@ -81,11 +81,11 @@ class MeshSurface(Surface):
 
     @cached_property
     def _tree_with_normals(self) -> cKDTree:
-        return cKDTree(np.hstack([self.vertices, LEAN * self.diagonal * self.vertex_normals]))
+        return cKDTree(np.hstack([self.vertices, NORMAL_WEIGHT * self.diagonal * self.vertex_normals]))
 
     def nearest_alike(self, points: FloatArray, normals: FloatArray) -> IntArray:
         """Nearest vertex in position and normal, to tell sheets that touch. *Shape:* ``(n, 3), (n, 3) -> (n,)``."""
-        rows = np.hstack([points, LEAN * self.diagonal * normals])
+        rows = np.hstack([points, NORMAL_WEIGHT * self.diagonal * normals])
         return self._tree_with_normals.query(rows)[1].astype(np.int64)
 
     def looks_away(self, points: FloatArray, normals: FloatArray) -> BoolArray:

@@ -20,7 +20,7 @@ STIFFNESS, LARGEST_STIFFNESS = 2000.0, 100.0
 FIRST_ROUND, NEXT_ROUND, N_ROUNDS = (6, 40), (4, 40), 3
 
 # Mean distance, in sizes, by which the result may be farther from the points than a given shape.
-SLACK = 1e-3
+DISTANCE_SLACK = 1e-3
 
 
 class Fitted(NamedTuple):
@@ -108,7 +108,7 @@ def _fit_one(variation: Variation, every: Observations, about: Tensor, robust: b
         missed = [to.distances_after_fit(shape) for shape in variation.shapes]
         *errors, error = ((to.weights * each.square()).sum() for each in (*missed, to.distances(pose.apply(x))))
         least, k = torch.stack(errors).min(0)
-    if error > least + to.weights.sum() * (SLACK * variation.size) ** 2:
+    if error > least + to.weights.sum() * (DISTANCE_SLACK * variation.size) ** 2:
         shape = to.pose(variation.shapes[k]).apply(variation.shapes[k])
         mixed = one_hot(k, len(errors)).to(x)[:, None].expand_as(mixed)
     else:

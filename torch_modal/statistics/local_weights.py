@@ -22,7 +22,7 @@ NOISE, COARSE_NOISE = 0.01, (10.0, 3.0)
 FEW_STEPS, MOST_STEPS, TOLERANCE, ROBUST_ROUNDS, LAST_STEPS, PRODUCTS = 5, 30, 1e-6, 8, 2, 20
 
 # Rows of the Jacobian that are computed together.
-CHUNK = 32
+ROWS_AT_ONCE = 32
 
 
 class Observations(NamedTuple):
@@ -135,7 +135,9 @@ class LocalWeights:
         moves = variation.coordinates.size * torch.eye(3, 6).to(bending)[..., None]
         carries = (variation.coordinates.centres[:, self.to.vertices].mT > 0).to(bending)
         rows = []
-        for first, second, carried in zip(*(column.split(CHUNK) for column in (*self.influence, carries)), strict=True):
+        for first, second, carried in zip(
+            *(column.split(ROWS_AT_ONCE) for column in (*self.influence, carries)), strict=True
+        ):
             at_faces = first[:, None, None] * one + second[:, None, None] * other
             at = torch.cat([at_faces, carried[:, None, None] * moves], -1)  # (n, 3, 6, E)
             parts = [(at * deviation).sum(2) @ fields.mT for deviation in variation.deviations]

@@ -32,7 +32,7 @@ OVERLAP = 1.5
 EVENNESS = 0.01
 
 # Largest sum of the weights below zero.
-MOST_BELOW_ZERO = 2.0
+LARGEST_EXTRAPOLATION = 2.0
 
 # Length over which local weights vary, relative to the largest distance on the surface: best of 0.1, 0.2 and 0.4.
 LENGTH = 0.2
@@ -232,7 +232,7 @@ class LocalMixtures:
 def bound_weights(weights: Tensor) -> Tensor:
     """Move weights towards even ones where the negative ones add up to more than a bound. *Shape:* ``(K, V)``."""
     below = -weights.clamp_max(0).sum(0)
-    ratio = (MOST_BELOW_ZERO / below.clamp_min(MOST_BELOW_ZERO)).clamp_max(1)
+    ratio = (LARGEST_EXTRAPOLATION / below.clamp_min(LARGEST_EXTRAPOLATION)).clamp_max(1)
     return 1 / len(weights) + ratio * (weights - 1 / len(weights))
 
 

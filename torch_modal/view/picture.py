@@ -24,7 +24,7 @@ BETWEEN_COLOR = (0.62, 0.71, 0.82)  # cool: computed
 DOT_COLOR = (0.71, 0.35, 0.10)
 ERROR_COLORS = ["#e4e4e2", "#f6c9a0", "#e8804f", "#b2182b", "#5c0a20"]
 CELL_PIXELS = 420  # the longer side of a cell
-MARGIN = 1.06  # of a cell against the largest shape in it
+CELL_MARGIN = 1.06  # of a cell against the largest shape in it
 
 
 def check_view(view: tuple[float, float] | None, up: str | None) -> None:
@@ -88,7 +88,7 @@ def fit_into_cells(points: FloatArray) -> tuple[FloatArray, FloatArray]:
         size = (high - low).max(axis=(0, 1, 2))
         if (size[:2] <= 1.4 * extent[:2]).all():
             break
-    half = 0.5 * size[:2] * MARGIN
+    half = 0.5 * size[:2] * CELL_MARGIN
     # Neither needles nor points: labels need some width.
     half = np.maximum(half, max(0.4 * float(half.max()), np.finfo(np.float64).tiny))
     return points - 0.5 * (low + high), half
