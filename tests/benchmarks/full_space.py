@@ -3,7 +3,6 @@
 No modes, no coarse mesh: sparse Newton steps on 3V unknowns (the discrete-shell mean of Heeren et al. 2012, at any t).
 """
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -12,7 +11,7 @@ from scipy import sparse
 from torch import Tensor
 
 from torch_modal.elastic.bend import SquaredBend
-from torch_modal.elastic.energy import Energy, Linearised, Reference, Rest
+from torch_modal.elastic.energy import Energy, EnergyAt, Reference, Rest, RestShapes
 from torch_modal.elastic.stretch import Stretch
 from torch_modal.elastic.term import Mesh
 from torch_modal.elastic.volume import Volume
@@ -92,8 +91,8 @@ def full_space(
     at_t = torch.tensor([t], dtype=torch.float64)
     rests = [energy.rest(energy.extend(y.T[:, None].contiguous())) for y in (first, aligned)]
     stiffness = [500.0, 10.0, 1000.0]
-    both = Rest(*(tuple(torch.stack(each, -2) for each in zip(*own, strict=True)) for own in zip(*rests, strict=True)))
-    reference = energy.merge_rests(both, torch.stack([1 - at_t, at_t], -1), stiffness)
+    both, weights_of_both = torch.stack([first, aligned])[None], torch.stack([1 - at_t, at_t], -1)
+    reference = RestShapes(both, weights_of_both, [at_t.new_full((1, 1), k) for k in stiffness]).reference(energy)
     if example_based:
         reference = energy.reference_of(_interpolated(energy, rests[0], rests[1], t), stiffness)
     fixed = torch.zeros(len(first), dtype=torch.bool) if fixed is None else fixed
@@ -118,7 +117,7 @@ def _minimise(
     energies = [float(energy.value(energy.extend(rows), reference))]
     for _ in range(max_steps):
         held = _held(faces, rows) | fixed
-        direction = assembly.direction(energy.linearise(energy.extend(rows), reference), held)
+        direction = assembly.direction(EnergyAt(energy, energy.extend(rows), reference), held)
         for length in STEP_LENGTHS:
             moved = rows + length * torch.where(fixed, 0, direction)
             found = float(energy.value(energy.extend(moved), reference))
@@ -153,11 +152,11 @@ class _Assembly:
     def __init__(self, energy: Energy) -> None:
         self.energy, self.n = energy, energy.n_vertices
 
-    def direction(self, at: Sequence[Linearised], held: Tensor) -> Tensor:
+    def direction(self, at: EnergyAt, held: Tensor) -> Tensor:
         """Newton's direction, or a convex one where the Hessian is not positive definite. *Shape:* ``(3, 1, V)``."""
         energy = self.energy
-        volume = torch.where(held, 0, energy.fold(at[2].gradients)[:, 0])
-        gradient = torch.where(held, 0, energy.fold(energy.gradient(at))[:, 0])
+        volume = torch.where(held, 0, energy.fold(at.terms[2].gradients)[:, 0])
+        gradient = torch.where(held, 0, energy.fold(at.gradient())[:, 0])
         right = torch.stack([gradient, volume], -1)
         for convex in (False, True):
             solved = self._solve(self._matrix(at, held, convex), right)
@@ -167,14 +166,14 @@ class _Assembly:
             raise RuntimeError("the convex Hessian is not positive definite: the shape has numbers out of range")
         by_gradient, by_volume = solved.unbind(-1)
         # Sherman and Morrison.
-        weight = at[2].curvature
+        weight = at.terms[2].curvature
         part = weight * (volume * by_gradient).sum() / (1 + weight * (volume * by_volume).sum())
         return (part * by_volume - by_gradient)[:, None]
 
-    def _matrix(self, at: Sequence[Linearised], held: Tensor, convex: bool) -> sparse.csc_matrix:
+    def _matrix(self, at: EnergyAt, held: Tensor, convex: bool) -> sparse.csc_matrix:
         axes, size = torch.arange(3), 3 * self.energy.n_extended
         total = sparse.csc_matrix((size, size))
-        for part, one in zip(self.energy.parts, at, strict=True):
+        for part, one in zip(self.energy.parts, at.terms, strict=True):
             n, gradients = len(part.corners), one.gradients
             # Second derivatives of edges that pull are never negative.
             curved = isinstance(part.term, Stretch) or not convex
