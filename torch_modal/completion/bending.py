@@ -36,6 +36,7 @@ class ModalBending:
         self.reconstruction = Reconstruction(reference, faces)
         #: What an amplitude of 1 does to each triangle, in its own coordinates. *Shape:* ``(k, 6, F)``.
         self.columns = bending_columns(reference, faces, modes)
+        self._by_face = self.columns.permute(2, 1, 0).contiguous()
 
     def still(self) -> ModalPose:
         """No deformation."""
@@ -66,9 +67,17 @@ class ModalBending:
         with torch.enable_grad():
             ends = torch.cat(self._sides(base, copies, 6))[:, 0].view(6, 6, -1).diagonal()
             slopes = torch.autograd.grad(ends.sum(), copies)[0].view(6, 6, -1).permute(2, 1, 0)
-        changes = (slopes @ self.columns.permute(2, 1, 0)).permute(1, 2, 0)  # (6, k, F)
-        still = base.new_zeros(len(self.columns), len(base), 3)
-        fields = self.reconstruction.fit((changes[:3], changes[3:]), still).permute(1, 2, 0)
+        # The right-hand side of the Poisson problem at the corners of each face, by its bending: faster than by edges.
+        of_first, of_second = slopes.split(3, 1)  # (F, 3, 6) each
+        one, other, last = self.reconstruction.weights.view(3, -1)[..., None, None]
+        corners = [
+            -one * of_first - last * of_second,
+            (one + other) * of_first - other * of_second,
+            (other + last) * of_second - other * of_first,
+        ]
+        moved = (torch.cat(corners, 1) @ self._by_face).view(3 * len(self.faces), -1)
+        right = moved.new_zeros(len(base), moved.shape[1]).index_add(0, self.faces.flatten(), moved)
+        fields = self.reconstruction.poisson(right, torch.zeros_like(right)).view(len(base), 3, -1)
         return x, torch.cat([pose.rotation @ fields, motions], -1)
 
     @staticmethod
