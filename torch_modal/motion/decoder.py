@@ -33,6 +33,9 @@ SMALLEST_SIDE = 1e-4
 LARGEST_RATIO = 30.0
 """A triangle turns and strains by at most this many times the mode's mean over the area; only slivers do more."""
 
+VERTICES_OF_CHUNK = 40_000
+"""Vertices of all shapes that are decoded at a time: more would not fit into caches."""
+
 
 class ModalDecoder(nn.Module):
     """Amplitudes in the modes of one key-frame, and times, to shapes: differentiable in both and in the key-frames.
@@ -152,10 +155,14 @@ class ModalDecoder(nn.Module):
         lead = broadcast_leading(amplitudes=amplitudes.shape[:-1], t=t.shape)
         a = amplitudes.expand(*lead, -1).reshape(-1, self.n_modes)
         segment, u = self.locate(t.expand(lead).reshape(-1))
-        shapes, order = evaluate_by_interval(
-            segment, len(self.times) - 1, lambda i, rows: self._shapes(knots, i, a[rows], u[rows])
-        )
-        x = torch.cat(shapes)[order]
+        size = max(1, VERTICES_OF_CHUNK // self.keyframes.shape[1])
+
+        def shapes(i: int, rows: Tensor | slice) -> Tensor:
+            chunks = [rows] if isinstance(rows, slice) else rows.split(size)
+            return torch.cat([self._shapes(knots, i, a[chunk], u[chunk]) for chunk in chunks])
+
+        parts, order = evaluate_by_interval(segment, len(self.times) - 1, shapes)
+        x = torch.cat(parts)[order]
         if motions is not None:
             turns, moves = motions.expand(*lead, 6).reshape(-1, 1, 6).split(3, -1)
             centre = x.mean(1, keepdim=True)
