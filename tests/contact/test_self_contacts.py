@@ -124,13 +124,13 @@ def test_what_only_touches_does_not_cross(apart: float, search: str) -> None:
 @pytest.mark.parametrize("n_faces", [1, 2, 3, 20, 500])
 def test_kernels_find_the_triangles_that_cross(n_faces: int, generator: torch.Generator) -> None:
     pytest.importorskip("warp")
-    from torch_modal.elastic.crossings import ROOM, WarpPairs
+    from torch_modal.elastic.crossings import FIRST_ROOM, WarpPairs
 
     corners = torch.stack([torch.randperm(n_faces + 3, generator=generator)[:3] for _ in range(n_faces)]).numpy()
     mesh = Connectivity(corners, n_faces + 3)
     first, x = torch.rand(2, n_faces + 3, 3, dtype=torch.float64, generator=generator).numpy()
     wanted = Crossings(mesh, first[None]).pairs(x)
-    assert n_faces < 500 or len(wanted) > ROOM  # which has to be made larger
+    assert n_faces < 500 or len(wanted) > FIRST_ROOM  # which has to be made larger
     np.testing.assert_array_equal(Crossings(mesh, first[None], search=WarpPairs(mesh, first[None])).pairs(x), wanted)
     if n_faces < 500:
         assert set(map(tuple, wanted.tolist())) == pairs_by_fractions(x, corners)
