@@ -143,5 +143,7 @@ def test_nothing_is_overwritten_and_one_shape_is_no_motion(
     assert "is one shape; a motion has two frames or more" in capsys.readouterr().err
     assert main(["bake", str(folder), "--out", str(tmp_path / "b.obj")]) == 1
     assert "must end in" in capsys.readouterr().err
+    assert main(["bake", str(folder), "--smooth", "0", "--out", str(tmp_path / "b.glb")]) == 1
+    assert "smooth must be a positive number of frames, got 0.0" in capsys.readouterr().err
     assert main(["bake", str(folder), "--across", "--out", str(tmp_path / "b.glb")]) == 1
     assert "pass register=True (--register)" in capsys.readouterr().err
