@@ -5,6 +5,8 @@ import torch
 from torch import Tensor
 
 from torch_modal.geometry.connectivity import Connectivity
+from torch_modal.geometry.rigid import RigidMotion, best_fit
+from torch_modal.geometry.rotations import exp, log
 
 
 def largest(x: Tensor) -> float:
@@ -32,3 +34,18 @@ def edge_error(x: Tensor, truth: Tensor, faces: Tensor | np.ndarray) -> float:
     """Mean relative error of edge lengths."""
     found, wanted = (edge_lengths(y, faces) for y in (x, truth))
     return float(((found - wanted).abs() / wanted).mean())
+
+
+def fraction(motion: RigidMotion, t: Tensor) -> RigidMotion:
+    """Motion at the time ``t`` of the geodesic from rest to a motion. *Shape:* ``(...,)``."""
+    rotation = exp(t[..., None] * log(motion.rotation))
+    return RigidMotion(rotation, motion.source, torch.lerp(motion.source, motion.target, t[..., None]))
+
+
+def rigid_blend(x: Tensor, y: Tensor, t: Tensor, weights: Tensor) -> Tensor:
+    """Linear interpolation of aligned shapes, on the geodesic of the rigid motion between them.
+
+    *Shape:* ``(..., V, 3), (..., V, 3), (...,), (V,)``.
+    """
+    back = best_fit(y, x, weights)
+    return fraction(back.inverse(), t).apply(torch.lerp(x, back.apply(y), t[..., None, None]))

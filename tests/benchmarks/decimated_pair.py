@@ -11,11 +11,12 @@ import torch
 from full_space import full_space
 from scipy import sparse
 from scipy.spatial import cKDTree
+from shapes import rigid_blend
 from torch import Tensor
 
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.poisson import Reconstruction
-from torch_modal.geometry.rigid import best_fit, blend
+from torch_modal.geometry.rigid import best_fit
 from torch_modal.modes.coarsening import coarsen
 
 FLAT = 1e-6
@@ -105,7 +106,7 @@ def froehlich_botsch(reduced: ReducedPair, t: float) -> Tensor:
     """
     x_a, x_b = reduced.coarse
     weights = torch.ones(len(x_a), dtype=x_a.dtype)
-    straight = blend(x_a, x_b, torch.tensor([t], dtype=x_a.dtype), weights)[0]
+    straight = rigid_blend(x_a, x_b, torch.tensor([t], dtype=x_a.dtype), weights)[0]
     found = full_space(x_a, x_b, reduced.faces, t, start=straight, example_based=True).shape
     return reduced.expand(best_fit(found, straight, weights).apply(found), t)
 

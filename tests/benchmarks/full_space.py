@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from scipy import sparse
+from shapes import fraction
 from torch import Tensor
 
 from torch_modal.elastic.bend import SquaredBend
@@ -82,7 +83,7 @@ def full_space(
     first, second = first * scale, second * scale
     back = best_fit(second, first, weights)
     aligned = back.apply(second)
-    motion = back.inverse().fraction(torch.tensor(t, dtype=torch.float64))
+    motion = fraction(back.inverse(), torch.tensor(t, dtype=torch.float64))
     x = torch.lerp(first, aligned, t)
     if start is not None:
         x = motion.inverse().apply(start.double() * scale)

@@ -19,6 +19,7 @@ from decimated_pair import ReducedPair
 from numpy.typing import NDArray
 from scipy import sparse
 from scipy.optimize import minimize
+from shapes import fraction
 from torch import Tensor
 
 from torch_modal.geometry.canonical import CANONICAL_SIZE
@@ -85,7 +86,7 @@ def geodesic(x_a: Tensor, x_b: Tensor, faces: Tensor) -> Geodesic:
         path, count = metric.minimise(path, ITERATIONS["fine"])
         iterations.append(count)
     whole = torch.cat([finest[:1], path, finest[1:]])
-    motion = back.inverse().fraction(torch.linspace(0, 1, N_STEPS + 1, dtype=torch.float64))
+    motion = fraction(back.inverse(), torch.linspace(0, 1, N_STEPS + 1, dtype=torch.float64))
     return Geodesic((motion.apply(whole) / scale).to(x_a), iterations)
 
 

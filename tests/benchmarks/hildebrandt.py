@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
+from shapes import fraction
 from torch import Tensor
 
 import torch_modal as tm
@@ -160,6 +161,6 @@ def spacetime(
         shapes, u = modes.shapes(motion.within(i, times[own])), times[own] - i
         # Modes have no rigid motion: it follows the geodesic.
         straight = torch.lerp(aligned[i], aligned[last], u[:, None, None])
-        rigid = best_fit(keyframes[i], keyframes[last], weights).fraction(u)
+        rigid = fraction(best_fit(keyframes[i], keyframes[last], weights), u)
         found[own] = rigid.apply(best_fit(shapes, straight, weights).apply(shapes))
     return found

@@ -22,10 +22,10 @@ from cases import HALF, Case
 from decimated_pair import ReducedPair, froehlich_botsch
 from full_space import full_space
 from geodesic import geodesic
+from shapes import rigid_blend
 from timing import timed
 
 import torch_modal as tm
-from torch_modal.geometry.rigid import blend
 
 PEER, PEER_SECONDS = "TORCH_MODAL_PEER_PYTHON", 180
 MOST_VERTICES = 5_000  # over all vertices: more take minutes
@@ -59,7 +59,7 @@ def linear(case: Case) -> Outcome:
     """Straight lines between the first key-frame and the second laid upon it; the rigid motion along its geodesic."""
     times = torch.tensor(case.times, dtype=case.x_a.dtype)
     weights = torch.ones(len(case.x_a), dtype=case.x_a.dtype)
-    return Outcome(*timed(lambda: blend(case.x_a, case.x_b, times, weights)))
+    return Outcome(*timed(lambda: rigid_blend(case.x_a, case.x_b, times, weights)))
 
 
 def paper(case: Case) -> Outcome:

@@ -51,6 +51,7 @@ from typing import Any
 import numpy as np
 import torch
 from results import geometric_mean, number, wanted
+from shapes import rigid_blend
 from timing import limit_threads
 from tqdm import tqdm
 from wild_bodies import bent_and_twisted
@@ -59,7 +60,6 @@ from wild_making import BODIES, WildBody
 import torch_modal as tm
 from torch_modal.elastic.minimise import Status
 from torch_modal.geometry.connectivity import Connectivity
-from torch_modal.geometry.rigid import blend
 from torch_modal.modes.extract import METHODS, Method
 
 N_MODES = 30
@@ -196,7 +196,7 @@ def straight(x_a: torch.Tensor, x_b: torch.Tensor, faces: np.ndarray, time: floa
     """Linear interpolation, the second shape laid upon the first. *Shape:* ``(V, 3)``."""
     weights = torch.zeros(len(x_a), dtype=x_a.dtype)
     weights[np.unique(faces)] = 1
-    return blend(x_a, x_b, torch.tensor([time], dtype=x_a.dtype), weights)[0]
+    return rigid_blend(x_a, x_b, torch.tensor([time], dtype=x_a.dtype), weights)[0]
 
 
 def edge_error(found: torch.Tensor, truth: torch.Tensor, faces: np.ndarray) -> float:

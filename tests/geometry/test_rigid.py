@@ -5,12 +5,12 @@ import pytest
 import torch
 import trimesh
 from conftest import random_rotation
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 from torch.autograd import gradcheck, gradgradcheck
 
 import torch_modal as tm
-from torch_modal.geometry.rigid import RigidMotion, best_fit, best_rotation, blend, centroid, volumes_of
+from torch_modal.geometry.rigid import best_fit, best_rotation, centroid, volumes_of
 from torch_modal.geometry.rotations import exp
 
 EYE = torch.eye(3, dtype=torch.float64)
@@ -30,10 +30,6 @@ def about(axis: list[float], angle: float) -> Tensor:
     """Rotation matrix, by SciPy."""
     unit = np.array(axis) / np.linalg.norm(axis)
     return torch.from_numpy(Rotation.from_rotvec(angle * unit).as_matrix())
-
-
-def motion_by(rotation: Tensor, source: Tensor, target: Tensor) -> RigidMotion:
-    return RigidMotion(rotation, source, target)
 
 
 # ------------------------------------------------------------------------------------------------ the best fit
@@ -174,62 +170,11 @@ def test_derivative_at_a_sphere_by_hand() -> None:
     torch.testing.assert_close(derivative, (change - change.mT) / 5, atol=1e-12, rtol=0)
 
 
-def test_gradcheck_best_fit_and_blend_of_symmetric_shape() -> None:
+def test_gradcheck_best_fit_of_symmetric_shape() -> None:
     cube = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0], dtype=torch.float64)] * 3).requires_grad_()
     turned = (cube.detach() @ about([1, 2, 3], 0.8).mT + 2).requires_grad_()
     weights = torch.ones(8, dtype=torch.float64)
-    t = torch.tensor(0.3, dtype=torch.float64, requires_grad=True)
     assert gradcheck(lambda x, y: best_fit(x, y, weights).apply(x), (cube, turned), atol=1e-7)
-    assert gradcheck(lambda x, y, t: blend(x, y, t, weights), (cube, turned, t), atol=1e-7)
-
-
-# ---------------------------------------------------------------------------------------------------- geodesic
-
-
-@pytest.fixture
-def motion(cloud: Tensor, weights: Tensor) -> RigidMotion:
-    rotation = about([1, -2, 0.5], 2.3)
-    return motion_by(rotation, centroid(cloud, weights), torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64))
-
-
-def time(t: float) -> Tensor:
-    return torch.tensor(t, dtype=torch.float64)
-
-
-def test_constant_speed_as_scipys_slerp(motion: RigidMotion) -> None:
-    times = np.linspace(0, 1, 7)
-    truth = Slerp([0, 1], Rotation.from_matrix(np.stack([np.eye(3), motion.rotation.numpy()])))(times)
-    part = motion.fraction(torch.from_numpy(times))
-    np.testing.assert_allclose(part.rotation.numpy(), truth.as_matrix(), atol=1e-12)
-    steps = part.target.diff(dim=0)
-    torch.testing.assert_close(steps, steps[:1].expand_as(steps), atol=1e-12, rtol=0)
-
-
-@pytest.mark.parametrize("axis", [[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, -2, 0.5], [-1, -1, -1]])
-def test_half_turn_is_a_choice_and_no_nan(axis: list[float], cloud: Tensor) -> None:
-    turn = about(axis, np.pi).requires_grad_()
-    origin = torch.zeros(3, dtype=torch.float64)
-    half = motion_by(turn, origin, origin).fraction(time(0.5))
-    torch.testing.assert_close(half.rotation @ half.rotation, turn, atol=1e-7, rtol=0)
-    unit = torch.tensor(axis, dtype=torch.float64) / torch.tensor(axis, dtype=torch.float64).norm()
-    torch.testing.assert_close(half.rotation @ unit, unit, atol=1e-7, rtol=0)
-    (gradient,) = torch.autograd.grad((half.apply(cloud) ** 2).sum() + half.rotation.sum(), turn)
-    assert gradient.isfinite().all()
-
-
-# ------------------------------------------------------------------------------------------------------- blend
-
-
-def distances(x: Tensor) -> Tensor:
-    return torch.linalg.norm(x[..., None, :, :] - x[..., None, :], dim=-1)
-
-
-def test_blend_of_a_rigid_motion_stays_congruent(cloud: Tensor, weights: Tensor) -> None:
-    turned = cloud @ about([1, 0, 1], 2.9).mT - 4
-    times = torch.linspace(0, 1, 5, dtype=torch.float64)
-    between = blend(cloud.expand(5, -1, -1), turned.expand(5, -1, -1), times, weights)
-    truth = distances(cloud).expand(5, -1, -1)
-    torch.testing.assert_close(distances(between), truth, atol=1e-11, rtol=0)
 
 
 def test_signed_volumes_of_ellipsoids_and_their_mirror_images() -> None:

@@ -3,12 +3,12 @@
 import pytest
 import torch
 from conftest import Shapes, modal, placement_of
+from shapes import rigid_blend
 from torch import Tensor
 from torch.func import hessian, jacrev
 
 from torch_modal.elastic.shell import ShellEnergy
 from torch_modal.geometry import connectivity
-from torch_modal.geometry.rigid import blend
 from torch_modal.layers.in_between import InBetween
 from torch_modal.layers.mid_shape import MidShape
 
@@ -88,7 +88,7 @@ def test_small_mu_is_linear_interpolation(bars: Shapes) -> None:
         [torch.from_numpy(connectivity.vertex_areas(x.numpy(), bars.faces.numpy())) for x in (x_a, x_b)]
     )
     weights = (areas / areas.sum(1, keepdim=True)).sum(0)
-    mean = blend(x_a, x_b, torch.tensor(0.5, dtype=torch.float64), weights)
+    mean = rigid_blend(x_a, x_b, torch.tensor(0.5, dtype=torch.float64), weights)
     distances = []
     for mu in (1e-3, 1e-6, 1e-9):
         found = MidShape(bars.bases[1:], bars.faces, "paired", mu, **modal(coarse_faces=200))(x_a, x_b)

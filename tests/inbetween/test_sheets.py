@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
-from shapes import edge_error, edge_lengths
+from shapes import edge_error, edge_lengths, rigid_blend
 from sheets import cylinder, folded, rectangle, rolled
 from torch import Tensor
 
@@ -17,7 +17,6 @@ from torch_modal.elastic.minimise import Status
 from torch_modal.elastic.term import Mesh
 from torch_modal.elastic.volume import encloses
 from torch_modal.geometry.connectivity import Connectivity
-from torch_modal.geometry.rigid import blend
 from torch_modal.inbetween.coarse import coarsen_until_resolved
 from torch_modal.modes.coarsening import coarsen, collapse
 
@@ -51,7 +50,7 @@ def bases(*shapes: Tensor, k: int = 20) -> list[tm.ModalBasis]:
 
 
 def linear(x_a: Tensor, x_b: Tensor) -> Tensor:
-    return blend(x_a, x_b, torch.tensor(0.5, dtype=torch.float64), torch.ones(len(x_a), dtype=torch.float64))
+    return rigid_blend(x_a, x_b, torch.tensor(0.5, dtype=torch.float64), torch.ones(len(x_a), dtype=torch.float64))
 
 
 @pytest.mark.parametrize("backend", BACKENDS)

@@ -6,14 +6,13 @@ from typing import Any
 import pytest
 import torch
 from conftest import Shapes, modal
-from shapes import diagonal, edge_error, largest
+from shapes import diagonal, edge_error, largest, rigid_blend
 from torch import Tensor
 
 from torch_modal.elastic.bend import Bend
 from torch_modal.elastic.shell import ShellEnergy
 from torch_modal.elastic.term import Term
 from torch_modal.geometry import connectivity
-from torch_modal.geometry.rigid import blend
 from torch_modal.inbetween.settings import Objective, Solver
 from torch_modal.layers.mid_shape import MidShape
 
@@ -22,7 +21,7 @@ SPACES = ["joint", "paired"]
 
 def linear(x_a: Tensor, x_b: Tensor, faces: Tensor) -> Tensor:
     weights = torch.from_numpy(connectivity.vertex_areas(x_a.numpy(), faces.numpy()))
-    return blend(x_a, x_b, torch.tensor(0.5, dtype=torch.float64), weights)
+    return rigid_blend(x_a, x_b, torch.tensor(0.5, dtype=torch.float64), weights)
 
 
 @pytest.fixture(scope="module", params=SPACES)

@@ -20,7 +20,7 @@ from torch_modal.modes import eigen, extract
 from torch_modal.modes import lattice as lattice_module
 from torch_modal.modes.eigen import ElasticModes, ModalAnalysisError
 from torch_modal.modes.extract import extract_bases, extract_modes
-from torch_modal.modes.stiffness import HESSIAN_FORMS, arap_hessian, mass_matrix
+from torch_modal.modes.stiffness import arap_hessian, mass_matrix
 from torch_modal.modes.tetrahedra import Tetrahedra, TetrahedralizationError
 from torch_modal.modes.tetwild import TetWild
 
@@ -28,8 +28,8 @@ Mesh = tuple[np.ndarray, np.ndarray]
 BOX = box((6, 3, 2), (3.0, 1.5, 1.0), jitter=0.1)
 
 
-def solve(solid: Tetrahedra, n_modes: int, form: str = "edge") -> ElasticModes:
-    return eigenmodes(arap_hessian(solid, form), mass_matrix(solid), solid.vertices, n_modes)
+def solve(solid: Tetrahedra, n_modes: int) -> ElasticModes:
+    return eigenmodes(arap_hessian(solid), mass_matrix(solid), solid.vertices, n_modes)
 
 
 def inertia(solid: Tetrahedra) -> sp.csr_matrix:
@@ -39,11 +39,10 @@ def inertia(solid: Tetrahedra) -> sp.csr_matrix:
 # ------------------------------------------------------------------------------------------- the eigenproblem
 
 
-@pytest.mark.parametrize("form", HESSIAN_FORMS)
-def test_modes_of_a_meshed_surface(form: str, capsule_tetrahedra: Tetrahedra) -> None:
+def test_modes_of_a_meshed_surface(capsule_tetrahedra: Tetrahedra) -> None:
     """The numbers that everything later leans on, on the mesher's own tetrahedra."""
-    result = solve(capsule_tetrahedra, 20, form)
-    k, m = arap_hessian(capsule_tetrahedra, form), inertia(capsule_tetrahedra)
+    result = solve(capsule_tetrahedra, 20)
+    k, m = arap_hessian(capsule_tetrahedra), inertia(capsule_tetrahedra)
     assert m.shape[0] > eigen.DENSE_BELOW
     phi, lam = result.modes, result.eigenvalues
     assert np.abs(result.rigid_eigenvalues).max() < 1e-8 * lam[0]
@@ -60,12 +59,11 @@ def test_modes_of_a_meshed_surface(form: str, capsule_tetrahedra: Tetrahedra) ->
             assert np.abs(momentum @ phi).max() < 1e-12 * np.sqrt(momentum @ motion.reshape(-1))
 
 
-@pytest.mark.parametrize("form", HESSIAN_FORMS)
 @pytest.mark.parametrize("cells", [(4, 3, 2), (10, 4, 4)])  # a dense and a sparse solve
-def test_agrees_with_dense_eigh(form: str, cells: tuple[int, int, int]) -> None:
+def test_agrees_with_dense_eigh(cells: tuple[int, int, int]) -> None:
     # A square cross-section, so that bending modes come in pairs of equal eigenvalues.
     solid = box(cells, (5.0, 1.0, 1.0))
-    k = arap_hessian(solid, form)
+    k = arap_hessian(solid)
     assert (k.shape[0] > eigen.DENSE_BELOW) == (cells[0] == 10)
     for mass in (mass_matrix(solid), sp.diags(lumped_mass(solid))):
         m = sp.kron(mass, sp.identity(3)).toarray()
@@ -308,7 +306,6 @@ def test_threads_change_nothing(boxed: Mesh, monkeypatch: pytest.MonkeyPatch) ->
         *(("n_modes", value, "n_modes is .*; give a whole number") for value in (0, -1, 2.5, True)),
         ("n_modes", 10_000, "at most 216 ways to deform; give 1 to 216"),
         *((name, "spokes", f"the {what} is 'spokes'; give") for name, what in (("mesher",) * 2, ("method",) * 2)),
-        ("form", "spokes", "the Hessian form is 'spokes'; give"),
     ],
 )
 def test_impossible_options(boxed: Mesh, name: str, value: Any, says: str) -> None:

@@ -1,4 +1,4 @@
-"""Rigid motions between shapes: best fit, interpolation, and detection of mirrored shapes."""
+"""Rigid motions between shapes: best fit, and detection of mirrored shapes."""
 
 from typing import NamedTuple
 
@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from torch_modal.autograd import is_traced, is_transformed
-from torch_modal.geometry.rotations import exp, log
+from torch_modal.geometry.rotations import exp
 from torch_modal.geometry.vectors import pick
 
 # Required gain of a reflection, in mean cosine between normals: mirrored poses of one body have at least 0.44, poses of
@@ -31,17 +31,6 @@ class RigidMotion(NamedTuple):
     def inverse(self) -> "RigidMotion":
         """Inverse motion."""
         return RigidMotion(self.rotation.mT, self.target, self.source)
-
-    def fraction(self, t: Tensor) -> "RigidMotion":
-        """Motion at the time ``t`` of the geodesic from rest (0) to this motion (1).
-
-        The rotation has constant angular velocity, the centroid moves on a straight line. A half turn has two shortest
-        geodesics: :func:`~torch_modal.geometry.rotations.log` chooses one. Times broadcast against the motion's leading
-        dimensions. *Shape:* ``(...,)``.
-        """
-        t = t[..., None]
-        rotation = exp(t * log(self.rotation))
-        return RigidMotion(rotation, self.source, self.source + t * (self.target - self.source))
 
 
 def infinitesimal_motions(x: Tensor) -> Tensor:
@@ -125,15 +114,6 @@ def align(x: Tensor, y: Tensor, weights: Tensor | None = None) -> Tensor:
     if weights is not None and weights.shape != x.shape[-2:-1]:
         raise ValueError(f"weights must have shape ({x.shape[-2]},), one for each vertex; got {tuple(weights.shape)}")
     return best_fit(x, y, None if weights is None else weights.to(x)).apply(x)
-
-
-def blend(x: Tensor, y: Tensor, t: Tensor, weights: Tensor) -> Tensor:
-    """Interpolate two shapes, at 0 and 1: linear in the shape, geodesic in the rigid motion.
-
-    The weights of the vertices are for the alignment. *Shape:* ``(..., V, 3), (..., V, 3), (...,), (V,)``.
-    """
-    back = best_fit(y, x, weights)
-    return back.inverse().fraction(t).apply(torch.lerp(x, back.apply(y), t[..., None, None]))
 
 
 @torch.no_grad()

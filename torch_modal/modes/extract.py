@@ -23,7 +23,6 @@ from torch_modal.modes.eigen import N_RIGID, ElasticBody, ModalAnalysisError, lo
 from torch_modal.modes.lattice import Lattice
 from torch_modal.modes.sheet import n_coarse_faces, sheet_body
 from torch_modal.modes.solid import Solid
-from torch_modal.modes.stiffness import HESSIAN_FORMS, HessianForm
 from torch_modal.modes.surface import CanonicalSurface, self_proximity
 from torch_modal.modes.tetrahedra import Mesher, TetrahedralizationError
 from torch_modal.modes.tetwild import Auto, TetWild
@@ -62,7 +61,6 @@ def extract_bases(
     n_modes: int = 30,
     *,
     method: Method = "auto",
-    form: HessianForm = "edge",
     mesher: Mesher | str = "auto",
     cache_dir: str | None = None,
     cache: bool = True,
@@ -85,8 +83,6 @@ def extract_bases(
         method: ``"solid"``; ``"shell"``, for the surface itself, which may be open, flat or not manifold; or
             ``"auto"``: the solid, but the shell where a key-frame is open or thin or the solid fails
             (:func:`why_shell`), which a line of the log says. All key-frames have the same.
-        form: Form of the solid's Hessian: ``"edge"``, or ``"vertex"``, the paper's
-            (:func:`~torch_modal.modes.stiffness.arap_hessian`).
         mesher: Fills the surface with tetrahedra: ``"lattice"``, which is deterministic, finer where the body is thin,
             and accepts every surface; ``"tetwild"``, fTetWild in a child process; ``"auto"``, the lattice unless parts
             of every key-frame touch, which it would fuse; or an object with settings,
@@ -109,7 +105,7 @@ def extract_bases(
         MeshWarning: The warnings of `check_keyframes`; a shape of several loose pieces.
     """
     store = Cache.at(cache_dir, enabled=cache)
-    return bases_of_checked(*check_keyframes(keyframes, faces), n_modes, method, form, mesher, store, progress)
+    return bases_of_checked(*check_keyframes(keyframes, faces), n_modes, method, mesher, store, progress)
 
 
 def bases_of_checked(
@@ -117,15 +113,13 @@ def bases_of_checked(
     faces: torch.Tensor,
     n_modes: int,
     method: Method = "auto",
-    form: HessianForm = "edge",
     mesher: Mesher | str = "auto",
     cache: Cache | None = None,
     progress: Progress = None,
 ) -> list[ModalBasis]:
     """`extract_bases` for the output of :func:`~torch_modal.keyframes.check.check_keyframes`."""
-    for what, choice, choices in (("method", method, METHODS), ("Hessian form", form, HESSIAN_FORMS)):
-        if choice not in choices:
-            raise ValueError(f"the {what} is {choice!r}; give one of {choices}")
+    if method not in METHODS:
+        raise ValueError(f"the method is {method!r}; give one of {METHODS}")
     if isinstance(mesher, str):
         if mesher not in MESHERS:
             raise ValueError(f"the mesher is {mesher!r}; give a Mesher or one of {tuple(MESHERS)}")
@@ -143,9 +137,9 @@ def bases_of_checked(
     several = bodies(shapes, mesh)
     if len(several) > 1:
         with contextlib.suppress(MeshError, ModalAnalysisError):  # the whole may have modes, nevertheless
-            return _bases_of_bodies(several, torch.from_numpy(shapes), n_modes, method, form, mesher, cache, progress)
+            return _bases_of_bodies(several, torch.from_numpy(shapes), n_modes, method, mesher, cache, progress)
     with one_blas_thread(), ProgressReport(len(shapes), "vibration modes", progress) as bar:
-        extraction = _Extraction(len(shapes), int(n_modes), form, mesher, cache or Cache.at(None), bar)
+        extraction = _Extraction(len(shapes), int(n_modes), mesher, cache or Cache.at(None), bar)
         for index, shape in enumerate(shapes):
             with extraction.stage(index, "checks"):
                 extraction.surfaces.append(CanonicalSurface.of(shape, triangles))
@@ -203,7 +197,6 @@ class _Extraction:
 
     n_keyframes: int
     n_modes: int
-    form: HessianForm
     mesher: Mesher
     cache: Cache
     bar: ProgressReport
@@ -252,18 +245,18 @@ class _Extraction:
 
         def compute(index: int) -> Arrays:
             if index == first:
-                return self._modes_of(index, lambda: solid.body(self.form))
+                return self._modes_of(index, solid.body)
             # A singular system, or modes of tetrahedra that are too distorted.
             with self.stage(index, "carrying tetrahedra"), contextlib.suppress(RuntimeError, np.linalg.LinAlgError):
                 carried = make_carrier().carry(self.surfaces[index])
                 if carried is not None:
-                    return self._modes_of(index, lambda: carried.body(self.form))
+                    return self._modes_of(index, carried.body)
             mesh = self._mesh(index)
-            return self._modes_of(index, lambda: mesh.body(self.form))
+            return self._modes_of(index, mesh.body)
 
         inputs = {"points": solid.surface.points, **solid.tetrahedra.arrays()}
         inputs = {f"rest_{name}": array for name, array in inputs.items()}
-        return self._all(compute, inputs, {"form": self.form, **self.mesher.key()}, len(solid.tetrahedra.vertices))
+        return self._all(compute, inputs, {"form": "edge", **self.mesher.key()}, len(solid.tetrahedra.vertices))
 
     def _all(
         self, compute: Callable[[int], Arrays], inputs: Arrays, parameters: dict[str, Any], n_vertices: int
