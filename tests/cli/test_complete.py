@@ -12,7 +12,6 @@ from test_cli import fails, misused
 
 import torch_modal as tm
 from torch_modal.cli import main as cli
-from torch_modal.view import drawing
 
 
 @pytest.fixture
@@ -20,7 +19,6 @@ def files(capsule: tuple[np.ndarray, np.ndarray], tmp_path: Path, monkeypatch: p
     """A folder with a template, the same moved by 3, ten scans of it and markers on the way."""
     x, faces = (torch.from_numpy(each) for each in capsule)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(drawing, "SMOOTH_FACES", 1000)
     tm.save_mesh(x, faces, "template.obj")
     tm.save_mesh(x + torch.tensor([3.0, 0, 0]), faces, "later.obj")
     for i in range(10):

@@ -15,7 +15,7 @@ from torch_modal.io.formats import ANIMATION_FORMATS, Animation, Timing, resampl
 from torch_modal.io.write import check_frames, check_indices, check_suffix, refuse_existing
 from torch_modal.motion.skin import bake
 from torch_modal.progress import Progress, ProgressReport
-from torch_modal.view.drawing import ByteArray, draw_shape
+from torch_modal.view.drawing import ByteArray, draw_image
 from torch_modal.view.picture import BETWEEN_COLOR, fit_into_cells, view_rotation
 
 PIXELS = 640  # the longer side of a picture of a video
@@ -157,6 +157,6 @@ def _pictures(animation: Animation) -> list[ByteArray]:
     images: list[ByteArray] = []
     with ProgressReport(len(unique), "pictures", animation.progress, unit="picture") as report:
         for shape in points[0]:
-            images.append(draw_shape(shape, paint, faces, half, size))
+            images.append(draw_image(shape, paint, faces, half, size))
             report.update()
     return [images[number] for number in which.reshape(-1)]

@@ -1,6 +1,5 @@
-"""Shapes and points drawn into images by matplotlib, in view coordinates, the cell centred at the origin."""
+"""Shapes and points drawn by matplotlib into cells of a figure, in view coordinates, a cell centred at the origin."""
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -11,68 +10,68 @@ from torch_modal.geometry.vectors import vertex_normals
 
 ByteArray = NDArray[np.uint8]
 
-SMOOTH_FACES = 30_000  # drawn at least
+DPI = 128  # a power of two: sizes in inches are exact
+GAP = 12  # pixels between cells
 LIGHTS = (((-2, 3, 4), 0.82), ((4, 1, 3), 0.30), ((0, -3, 2), 0.14))  # directions as the viewer sees them; brightness
-OVERSAMPLING = 2  # drawn larger without antialiasing (which would show every seam), then averaged
 
 
-def draw_shape(
-    points: FloatArray, colors: FloatArray, faces: IntArray, half_size: FloatArray, pixels: IntArray
-) -> ByteArray:
-    """Faces from back to front, each in one shade. *Shape:* ``(V, 3), (V, 3), (F, 3) -> (height, width, 3)``.
+def make_cells(n_rows: int, n_columns: int, half_size: FloatArray, pixels: IntArray) -> Any:
+    """Blank axes ``(n_rows, n_columns)`` that fill a new figure.
 
     Args:
-        points: Vertices.
-        colors: RGB in [0, 1].
-        faces: Vertex indices.
-        half_size: Half width and half height of the cell.
-        pixels: Width and height of the image.
+        n_rows: Number of rows.
+        n_columns: Number of columns.
+        half_size: Half width and half height of a cell.
+        pixels: Width and height of a cell.
     """
-    from matplotlib.collections import PolyCollection
-
-    lights = np.array([brightness / np.linalg.norm(place) * np.array(place) for place, brightness in LIGHTS])
-    # Position, normal and colour of each corner of each face, in small enough faces to look smooth.
-    corners = np.concatenate([points, vertex_normals(points, faces), colors], axis=1)[faces]
-    while len(corners) < SMOOTH_FACES:  # each as four, cut at the middles of its sides
-        a, b, c = corners.swapaxes(0, 1)
-        ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
-        quarters = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
-        corners = np.concatenate([np.stack(quarter, axis=1) for quarter in quarters])
-    middle = corners.mean(axis=1)
-    normals = middle[:, 3:6] / np.maximum(np.linalg.norm(middle[:, 3:6], axis=1, keepdims=True), 1e-12)
-    normals *= np.where(normals[:, 2:] < 0, -1.0, 1.0)  # open meshes show their inside too
-    shade = 0.25 + 0.85 * np.clip(normals @ lights.T, 0, None).sum(axis=1)
-    rim = 0.75 + 0.25 * np.clip(normals[:, 2], 0, 1) ** 0.5  # darker outlines separate what overlaps
-    face_colors = np.clip(middle[:, 6:] * (shade * rim)[:, None], 0, 1)
-    order = np.argsort(middle[:, 2], kind="stable")
-    polygons = PolyCollection(
-        list(corners[order, :, :2]), facecolors=face_colors[order], linewidths=0, antialiaseds=False
-    )
-    return _draw_axes(half_size, pixels, lambda axes: axes.add_collection(polygons))
-
-
-def draw_points(points: FloatArray, color: tuple[float, ...], half_size: FloatArray, pixels: IntArray) -> ByteArray:
-    """Dots, near ones darker and over far ones. *Shape:* ``(n, 3) -> (height, width, 3)``."""
-    points = points[:: len(points) // 20_000 + 1]
-    points = points[points[:, 2].argsort(kind="stable")]
-    diameter = OVERSAMPLING * np.clip(120 / max(len(points), 1) ** 0.5, 3, 11)
-    paint = 1 - np.linspace(0.4, 1, len(points))[:, None] * (1 - np.array(color))
-    x, y = points[:, 0], points[:, 1]
-    return _draw_axes(half_size, pixels, lambda axes: axes.scatter(x, y, diameter**2, paint, linewidths=0))
-
-
-def _draw_axes(half_size: FloatArray, pixels: IntArray, add: Callable[[Any], object]) -> ByteArray:
-    """Image of axes that fill it. *Shape:* ``(height, width, 3)``."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     (x, y), (width, height) = half_size, pixels.tolist()
-    figure = Figure(figsize=(OVERSAMPLING * width / 72, OVERSAMPLING * height / 72), dpi=72)  # a point is a pixel
-    canvas = FigureCanvasAgg(figure)
-    axes = figure.add_axes((0, 0, 1, 1), xlim=(-x, x), ylim=(-y, y))
-    axes.set_axis_off()
-    add(axes)
+    size = n_columns * (width + GAP) - GAP, n_rows * (height + GAP) - GAP
+    figure = Figure(figsize=(size[0] / DPI, size[1] / DPI), dpi=DPI)
+    layout = {"left": 0, "right": 1, "bottom": 0, "top": 1, "wspace": GAP / width, "hspace": GAP / height}
+    limits = {"xlim": (-x, x), "ylim": (-y, y)}
+    cells = figure.subplots(n_rows, n_columns, squeeze=False, subplot_kw=limits, gridspec_kw=layout)
+    for cell in cells.flat:
+        cell.set_axis_off()
+    return cells
+
+
+def draw_shape(cell: Any, points: FloatArray, colors: FloatArray, faces: IntArray) -> None:
+    """Draw faces into a cell, from back to front. *Shape:* ``(V, 3), (V, 3), (F, 3)``; colours are RGB in [0, 1]."""
+    from matplotlib.collections import TriMesh
+    from matplotlib.tri import Triangulation
+
+    lights = np.array([brightness / np.linalg.norm(place) * np.array(place) for place, brightness in LIGHTS])
+    corners = points[faces]
+    order = corners[..., 2].mean(axis=1).argsort(kind="stable")
+    normals = vertex_normals(points, faces)[faces]
+    normals *= np.where(normals[..., 2].sum(axis=1) < 0, -1.0, 1.0)[:, None, None]  # open meshes show their inside too
+    shade = 0.25 + 0.85 * np.clip(normals @ lights.T, 0, None).sum(axis=2)
+    rim = 0.75 + 0.25 * np.clip(normals[..., 2], 0, 1) ** 0.5  # darker outlines separate what overlaps
+    paint = np.clip(colors[faces] * (shade * rim)[..., None], 0, 1)
+    x, y, _ = corners[order].reshape(-1, 3).T
+    triangles = Triangulation(x, y, np.arange(len(x)).reshape(-1, 3))
+    cell.add_collection(TriMesh(triangles, facecolors=paint[order].reshape(-1, 3), rasterized=True))
+
+
+def draw_points(cell: Any, points: FloatArray, color: tuple[float, ...]) -> None:
+    """Draw dots into a cell, near ones darker and over far ones. *Shape:* ``(n, 3)``."""
+    points = points[:: len(points) // 20_000 + 1]
+    x, y, _ = points[points[:, 2].argsort(kind="stable")].T
+    diameter = 72 / DPI * np.clip(120 / max(len(x), 1) ** 0.5, 3, 11)
+    paint = 1 - np.linspace(0.4, 1, len(x))[:, None] * (1 - np.array(color))
+    cell.scatter(x, y, diameter**2, paint, linewidths=0, rasterized=True)
+
+
+def draw_image(
+    points: FloatArray, colors: FloatArray, faces: IntArray, half_size: FloatArray, pixels: IntArray
+) -> ByteArray:
+    """Image of a shape alone. Arguments as above. *Shape:* ``(height, width, 3)``."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    ((cell,),) = make_cells(1, 1, half_size, pixels)
+    draw_shape(cell, points, colors, faces)
+    canvas = FigureCanvasAgg(cell.figure)
     canvas.draw()
-    image = np.asarray(canvas.buffer_rgba())[..., :3].astype(np.float64)
-    blocks = image.reshape(height, OVERSAMPLING, width, OVERSAMPLING, 3)
-    return blocks.mean(axis=(1, 3)).round().astype(np.uint8)
+    return np.array(canvas.buffer_rgba())[..., :3]

@@ -1,7 +1,6 @@
 """A picture that compares rows of shapes: one row a method, one column a time.
 
-All shapes are turned into view coordinates (x right, y up, z to the viewer), drawing.py draws each into an
-image of its own, and the sheet is set from these images.
+All shapes are turned into view coordinates (x right, y up, z to the viewer), and drawing.py draws each into a cell.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from torch_modal.arrays import Array, FloatArray, IntArray
 from torch_modal.io.files import write_files
 from torch_modal.io.formats import PICTURES
 from torch_modal.io.write import check_frames, check_indices, check_suffix, refuse_existing, to_numpy
-from torch_modal.view.drawing import ByteArray, draw_points, draw_shape
+from torch_modal.view.drawing import DPI, draw_points, draw_shape, make_cells
 
 KEYFRAME_COLOR = (0.91, 0.60, 0.36)  # warm: given
 BETWEEN_COLOR = (0.62, 0.71, 0.82)  # cool: computed
@@ -94,56 +93,6 @@ def fit_into_cells(points: FloatArray) -> tuple[FloatArray, FloatArray]:
     return points - 0.5 * (low + high), half
 
 
-def _sheet(
-    images: ByteArray,  # (R, C, height, width, 3)
-    rows: list[str],
-    column_labels: list[tuple[str, str]],  # text and colour
-    color_bar: tuple[Any, str] | None,  # ScalarMappable and label
-    fmt: str,
-) -> bytes:
-    """Put the images on white paper with their labels. Measures are in pixels of the result."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-    from matplotlib.font_manager import FontProperties
-    from matplotlib.textpath import TextPath
-
-    n_rows, n_columns, height, width = images.shape[:4]
-    dpi, gap = 200, 12
-    text = min(11.0, 0.13 * width * 72 / dpi)  # points; the longest column label has about twelve letters
-    line = round(text * dpi / 72)
-    font = FontProperties(size=text + 1)
-    lines = [words for row in rows for words in row.split("\n") if words.strip()]  # TextPath fails on blanks
-    widest = max((TextPath((0, 0), words, prop=font).get_extents().width for words in lines), default=0.0)
-    left, top, right = round(widest * dpi / 72) + 2 * line, round(2.6 * line), 7 * line if color_bar else line
-    cells = np.pad(images, [(0, 0), (0, 0), (0, gap), (0, gap), (0, 0)], constant_values=255)
-    cells = cells.transpose(0, 2, 1, 3, 4).reshape(n_rows * (height + gap), n_columns * (width + gap), 3)
-    sheet = np.pad(cells, [(top, line), (left, right), (0, 0)], constant_values=255)
-    total_height, total_width = sheet.shape[:2]
-    figure = Figure(figsize=(total_width / dpi, total_height / dpi), dpi=dpi, facecolor="white")
-    FigureCanvasAgg(figure)
-    axes = figure.add_axes((0, 0, 1, 1))
-    axes.set_axis_off()
-    axes.imshow(sheet, aspect="auto", interpolation="none", extent=(0, total_width, total_height, 0))
-    for r, row in enumerate(rows):
-        axes.text(line, top + r * (height + gap) + height / 2, row, fontproperties=font, va="center", ha="left")
-    for c, (label, color) in enumerate(column_labels):
-        x = left + c * (width + gap) + width / 2
-        axes.text(x, 1.6 * line, label, fontsize=text, color=color, ha="center", va="center")
-    if color_bar:
-        mappable, label = color_bar
-        tall = min(len(cells) - gap, 2 * height)
-        box = (total_width - right + line, top + (len(cells) - gap - tall) / 2, 0.8 * line, tall)
-        beyond = "max" if mappable.get_array().max() > mappable.norm.vmax else "neither"
-        bar_axes = axes.inset_axes(box, transform=axes.transData)
-        bar = figure.colorbar(mappable, cax=bar_axes, extend=beyond, extendfrac=0.03)
-        bar.ax.tick_params(labelsize=0.8 * text)
-        bar.set_label(label, fontsize=0.9 * text)
-        bar.outline.set_visible(False)
-    stream = io.BytesIO()
-    figure.savefig(stream, format=fmt, dpi=dpi)
-    return stream.getvalue()
-
-
 def render_sequence(
     frames_by_row: Mapping[str, Array],
     faces: Array,
@@ -216,51 +165,53 @@ def render_sequence(
     ends = [0, n_frames - 1]
     keyframes = check_indices(ends if keyframe_indices is None else keyframe_indices, n_frames, "keyframe_indices")
 
-    shown = np.stack([frames[chosen] for frames in shapes])  # (R, C, V, 3)
+    values = {row: to_numpy(numbers).astype(np.float64) for row, numbers in (colors or {}).items()}
+    for row, numbers in values.items():
+        size = checked[row].shape[:2] if row in checked else f"of a row {', '.join(rows)}"
+        if numbers.shape != size or not np.isfinite(numbers).all():
+            raise ValueError(f"colors[{row!r}] must be finite numbers of shape {size}, got shape {numbers.shape}")
+    scale = _color_scale(np.stack([numbers[chosen] for numbers in values.values()])) if values else None
     rotation = view_rotation(shapes[0][0], view, up)
-    placed, half = fit_into_cells(shown @ rotation.T)
-    paint = np.empty(shown.shape)
-    paint[:] = np.array([KEYFRAME_COLOR if n in keyframes else BETWEEN_COLOR for n in chosen])[:, None]
-    color_bar = None
-    if colors:
-        color_bar = _paint(paint, colors, rows, shapes[0].shape[:2], chosen), color_label
+    turned = np.stack([frames[chosen] for frames in shapes]) @ rotation.T  # (R, C, V, 3)
+    placed, half = fit_into_cells(turned)
+    moves = (placed - turned)[0, :, 0]  # of the first row, into the cells
     pixels = np.maximum((CELL_PIXELS * half / half.max()).round(), 1).astype(np.int64)
-    each = (-1, *shown.shape[2:])
-    painted = zip(placed.reshape(each), paint.reshape(each), strict=True)
-    images = np.stack([draw_shape(x, color, triangles, half, pixels) for x, color in painted])
-    images = images.reshape(*shown.shape[:2], *images.shape[1:])
-    moved = placed[0, :, 0] - shown[0, :, 0] @ rotation.T  # of the first row, into the cells
-    for label, row in reversed(clouds.items()):
-        seen = [row[n] @ rotation.T + move for n, move in zip(chosen, moved, strict=True)]
-        dots = np.stack([draw_points(cloud, DOT_COLOR, half, pixels) for cloud in seen])
-        rows, images = [label, *rows], np.concatenate([dots[None], images])
-    labels = [(title, "#b4581a" if n in keyframes else "#333333") for n, title in zip(chosen, titles, strict=True)]
-    write_files([(path, _sheet(images, rows, labels, color_bar, fmt))])
+    labels = [*clouds, *rows]
+    cells = make_cells(len(labels), len(chosen), half, pixels)
+    points_of_text = min(17.0, 0.13 * pixels[0] * 72 / DPI)  # the longest title has about twelve letters
+    for cell, label in zip(cells[:, 0], labels, strict=True):
+        text = {"fontsize": 1.1 * points_of_text, "va": "center", "ha": "right", "transform": cell.transAxes}
+        cell.text(-0.05, 0.5, label, **text)
+    for column, (n, title) in enumerate(zip(chosen, titles, strict=True)):
+        color = "#b4581a" if n in keyframes else "#333333"
+        cells[0, column].set_title(title, fontsize=points_of_text, color=color)
+        plain = np.broadcast_to(KEYFRAME_COLOR if n in keyframes else BETWEEN_COLOR, shapes[0][0].shape)
+        for cell, cloud in zip(cells[:, column], clouds.values(), strict=False):
+            draw_points(cell, cloud[n] @ rotation.T + moves[column], DOT_COLOR)
+        for cell, row, shape in zip(cells[len(clouds) :, column], rows, placed[:, column], strict=True):
+            paint = scale.to_rgba(values[row][n])[:, :3] if row in values else plain
+            draw_shape(cell, shape, paint, triangles)
+    figure = cells[0, 0].figure
+    if scale:
+        width, height = (pixels / DPI / figure.get_size_inches()).tolist()
+        tall = min(1.0, 2 * height)
+        box = (1 + 0.1 * width, (1 - tall) / 2, 0.06 * width, tall)
+        bar = figure.colorbar(scale, cax=figure.add_axes(box), extendfrac=0.03)
+        bar.ax.tick_params(labelsize=0.8 * points_of_text)
+        bar.set_label(color_label, fontsize=0.9 * points_of_text)
+        bar.outline.set_visible(False)
+    stream = io.BytesIO()
+    figure.savefig(stream, format=fmt, dpi=DPI, bbox_inches="tight", pad_inches=0.2)
+    write_files([(path, stream.getvalue())])
     return path
 
 
-def _paint(
-    paint: FloatArray, colors: Mapping[str, Array], rows: list[str], size: tuple[int, ...], chosen: list[int]
-) -> Any:
-    """Paint the rows with colours, RGB in [0, 1]; returns their colour scale. *Shape:* ``(R, C, V, 3)``."""
+def _color_scale(numbers: FloatArray) -> Any:
+    """Colours of numbers, a ScalarMappable; a few extreme ones do not hide the rest."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import LinearSegmentedColormap, Normalize
 
-    values = {}
-    for row, numbers in colors.items():
-        array = to_numpy(numbers)
-        if row not in rows:
-            raise ValueError(f"colors has a row {row!r} that frames_by_row does not have ({', '.join(rows)})")
-        if array.shape != size or not np.isfinite(array).all():
-            raise ValueError(
-                f"colors[{row!r}] must hold finite numbers, one a vertex, shape {size}, got shape {array.shape}"
-            )
-        values[rows.index(row)] = array[chosen].astype(np.float64)
-    everything = np.concatenate([v.reshape(-1) for v in values.values()])
-    low, high = everything.min(), np.percentile(everything, 99.5)  # a few extreme vertices must not hide the rest
-    norm = Normalize(low, high if high > low else low + 1.0)
-    mappable = ScalarMappable(norm, LinearSegmentedColormap.from_list("error", ERROR_COLORS))
-    mappable.set_array(everything)
-    for r, v in values.items():
-        paint[r] = mappable.to_rgba(v)[..., :3]
-    return mappable
+    low, high = numbers.min(), np.percentile(numbers, 99.5)
+    palette = LinearSegmentedColormap.from_list("error", ERROR_COLORS)
+    palette.colorbar_extend = "max" if numbers.max() > high else "neither"
+    return ScalarMappable(Normalize(low, high if high > low else low + 1.0), palette)
