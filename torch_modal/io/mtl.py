@@ -18,36 +18,30 @@ _OPTIONS = re.compile(r"(?:-(?:[ost](?:\s+-?[\d.]+){1,3}|mm\s+\S+\s+\S+|\w+\s+\S
 LARGEST_LIBRARY = 2**24  # bytes
 
 
-def read_libraries(path: Path, lines: dict[int, str]) -> tuple[dict[str, Material], dict[str, bytes], dict[int, str]]:
-    """Read the material libraries that lines of an OBJ file name, by line number; warn of libraries that are not read.
+def read_libraries(path: Path, lines: list[str]) -> tuple[dict[str, Material], dict[str, bytes]]:
+    """Read the material libraries that lines of an OBJ file name; warn of libraries and textures that are not read.
 
-    Returns the materials; the libraries and their textures, by their paths below the folder of the file or of a copy;
-    and the lines whose names differ in a copy, with these names.
+    Returns the materials; the libraries and their textures, by their paths below the folder of the file or of a copy.
     """
     materials: dict[str, Material] = {}
     files: dict[str, bytes] = {}
-    changed: dict[int, str] = {}
     read = cache(partial(try_companion, path))  # materials share textures
-    for line, written in lines.items():
+    for line in lines:
         # One name may contain blanks; blanks also separate several names.
-        names = [written] if os.path.isfile(path.parent / written) else written.split()
-        for number, name in enumerate(names):
+        for name in [line] if os.path.isfile(path.parent / line) else line.split():
             if companion := read(name, "a material library", LARGEST_LIBRARY):
-                files[companion[0]] = _read_library(path, *companion, read, materials, files)
-                if posixpath.normpath(name) != companion[0]:
-                    names[number] = companion[0]
-                    changed[line] = " ".join(names)
-    return materials, files, changed
+                files |= [companion]
+                _read_library(path, *companion, read, materials, files)
+    return materials, files
 
 
 def _read_library(
     path: Path, library: str, data: bytes, read: Any, materials: dict[str, Material], files: dict[str, bytes]
-) -> bytes:
-    """Add the materials and files of a library to the results; returns its content for a copy."""
+) -> None:
+    """Add the materials and textures of a library to the results."""
     folder = posixpath.dirname(library)
-    lines = re.split(r"(\r\n|\n|\r)", data.decode("utf-8", errors="surrogateescape"))  # and their ends
     material = ""
-    for number, line in enumerate(lines):
+    for line in re.split(r"\r\n|\n|\r", data.decode("utf-8", errors="surrogateescape")):
         key, *words = line.partition("#")[0].split() or [""]
         key = key.lower()
         if key == "newmtl":
@@ -55,25 +49,22 @@ def _read_library(
             materials[material] = Material(material, (0.8, 0.8, 0.8, 1.0))
         elif words and (key.startswith("map_") or key in ("bump", "norm", "disp", "decal", "refl")):
             # The file name follows the options, and may contain blanks.
-            written = _OPTIONS.sub("", line.strip().split(None, 1)[1], count=1)
-            texture = written.replace("\\", "/")
+            texture = _OPTIONS.sub("", line.strip().split(None, 1)[1], count=1).replace("\\", "/")
             base = folder if os.path.isfile(path.parent / folder / texture) else ""
             if not (companion := read(posixpath.join(base, texture), f"a texture of {library}")):
                 continue
-            place, files[companion[0]] = companion
-            if posixpath.normpath(texture) != (kept := posixpath.relpath(place, folder or ".")):
-                lines[number] = line.rstrip().removesuffix(written) + kept
+            files |= [companion]
             if key == "map_kd" and material in materials:
                 old = materials[material]
                 # Exporters that paint by the texture alone leave black here, which would multiply it away.
                 color = (1.0, 1.0, 1.0, old.color[3]) if not any(old.color[:3]) else old.color
-                image = as_png_or_jpeg(files[place])
+                image = as_png_or_jpeg(companion[1])
                 if image is None:
-                    warnings.warn(f"{path.name} is without a texture: {place} is no picture", MeshWarning, stacklevel=6)
+                    message = f"{path.name} is without a texture: {companion[0]} is no picture"
+                    warnings.warn(message, MeshWarning, stacklevel=6)
                 materials[material] = old._replace(texture=image, color=color)
         elif material in materials:
             materials[material] = _with_property(materials[material], key, words)
-    return "".join(lines).encode("utf-8", errors="surrogateescape")
 
 
 def _with_property(material: Material, key: str, words: list[str]) -> Material:

@@ -1,6 +1,7 @@
 """Wavefront OBJ: the lines of the file, in which positions and normals are replaced."""
 
 import re
+from collections import defaultdict
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -31,63 +32,56 @@ class ObjAsset(Asset):
         text = path.read_bytes().decode("utf-8", errors="surrogateescape")
         text = re.sub(r"\\(\r\n|\n|\r)", " ", text)
         self.lines = re.split(r"\r\n|\n|\r", text.removesuffix("\n").removesuffix("\r"))
-        numbers: dict[str, list[list[float]]] = {"v": [], "vt": [], "vn": []}
-        self._line_of: dict[str, list[int]] = {"v": [], "vt": [], "vn": [], "f": []}
-        self._libraries: dict[int, str] = {}
-        materials: dict[str, int] = {}
-        corners: list[tuple[int, ...]] = []  # vertex, texture coordinate, normal; -1 where there is none
-        known: dict[str, tuple[int, ...]] = {}
-        triangles: list[tuple[int, int, int]] = []  # polygons as fans, of corners of the file
-        sizes, material_of, material, groups = [], [], -1, set()
+        #: Line numbers and contents of each kind of line.
+        self._line_of: dict[str, list[int]] = defaultdict(list)
+        contents: dict[str, list[str]] = defaultdict(list)
         for number, line in enumerate(self.lines):
-            content = line.partition("#")[0].strip()
-            kind, *words = content.split() or [""]
-            rest = content[len(kind) :].strip()
-            if kind in self._line_of:
-                self._line_of[kind].append(number)
-            if kind == "v" and len(words) < 3:
-                raise MeshError(f"{path}: vertex line with fewer than three numbers: {line.strip()[:60]!r}")
-            if kind in numbers:
-                numbers[kind].append([float(word) for word in words])
-            elif kind == "f":
-                counts = tuple(map(len, numbers.values()))
-                place = f"{path}: face line {line.strip()[:60]!r}"
-                if len(words) < 3:
-                    raise MeshError(f"{place} has fewer than three corners")
-                first, n_triangles = len(corners), len(words) - 2
-                triangles += [(first, first + i, first + i + 1) for i in range(1, n_triangles + 1)]
-                material_of += [material] * n_triangles
-                for word in words:
-                    if word not in known or "-" in word:  # negative indices count back from the place of the line
-                        known[word] = _corner(word, counts, place)
-                    corners.append(known[word])
-                sizes.append(len(words))
-            elif kind == "usemtl":
-                material = materials.setdefault(rest, len(materials))
-            elif kind == "mtllib":
-                self._libraries[number] = rest
-            elif kind in ("g", "o", "s"):
-                groups.add(line.strip())
-        self._materials = list(materials)
-        self.positions = np.array([row[:3] for row in numbers["v"]], np.float64).reshape(-1, 3)
-        self._texcoords = np.array([[*row, 0.0, 0.0][:2] for row in numbers["vt"]], np.float64).reshape(-1, 2)
-        self._normals = np.array([row[:3] for row in numbers["vn"]], np.float64).reshape(-1, 3)
-        colored = all(len(row) >= 6 for row in numbers["v"])
-        self._colors = np.array([row[3:6] for row in numbers["v"]]) if colored else None
-        self._corners = np.array(corners, dtype=np.int64).reshape(-1, 3)
-        for column, count in ((1, len(self._texcoords)), (2, len(self._normals))):
-            self._corners[self._corners[:, column] >= count, column] = -1  # faces may name what the file does not have
-        self._sizes = np.array(sizes, dtype=np.int64)
+            kind, *rest = line.partition("#")[0].split(None, 1) or [""]
+            self._line_of[kind].append(number)
+            contents[kind].append(rest[0].rstrip() if rest else "")
+        rows = {kind: [row.split() for row in contents[kind]] for kind in ("v", "vt", "vn", "f")}
+        self.positions = _numbers([row[:3] for row in rows["v"]], 3)
+        self._texcoords = _numbers([[*row, "0", "0"][:2] for row in rows["vt"]], 2)
+        self._normals = _numbers([row[:3] for row in rows["vn"]], 3)
+        colored = bool(rows["v"]) and min(map(len, rows["v"])) >= 6
+        self._colors = _numbers([row[3:6] for row in rows["v"]], 3) if colored else None
+        self._sizes = np.array([len(row) for row in rows["f"]], dtype=np.int64)
+        if self._sizes.min(initial=3) < 3:
+            raise MeshError(f"{path}: a face line with fewer than three corners")
         self._starts = np.cumsum(self._sizes) - self._sizes
-        self._triangles = np.array(triangles, dtype=np.int64).reshape(-1, 3)
-        self._material_of = np.array(material_of, dtype=np.int64)
+        #: Vertex, texture coordinate and normal of each corner of the polygons; -1 where there is none.
+        self._corners = self._read_corners(rows["f"])
+        # Polygons are fans of triangles, of corners of the file.
+        polygon = np.repeat(np.arange(len(self._sizes)), self._sizes - 2)
+        second = np.arange(len(polygon)) + 2 * polygon + 1
+        self._triangles = np.stack([self._starts[polygon], second, second + 1], axis=1)
         self.faces = self._corners[self._triangles, 0]
+        # Faces have the material of the last line before them.
+        self._materials = list(dict.fromkeys(["", *contents["usemtl"]]))
+        numbers = np.array([self._materials.index(name) for name in ["", *contents["usemtl"]]])
+        self._material_of = numbers[np.searchsorted(self._line_of["usemtl"], self._line_of["f"])][polygon]
+        n_materials, groups = len({*contents["usemtl"]}), {(kind, row) for kind in "gos" for row in contents[kind]}
+        self._libraries = contents["mtllib"]
         self._note("polygons", "quads" if (self._sizes <= 4).all() else "polygons", (self._sizes > 3).any())
         self._note("texcoords", "texture coordinates", (self._corners[:, 1] >= 0).any())
         self._note("normals", "normals", (self._corners[:, 2] >= 0).any())
         self._note("colors", "vertex colours", self._colors is not None)
-        self._note("materials", f"{len(materials)} material{'s' * (len(materials) > 1)}", materials)
+        self._note("materials", f"{n_materials} material{'s' * (n_materials > 1)}", n_materials)
         self._note("groups", "groups", len(groups) > 1)
+
+    def _read_corners(self, faces: list[list[str]]) -> IntArray:
+        """Indices from 0 of corners such as ``1/2/3`` or ``-1//-1``; -1 where there is none. *Shape:* ``(C, 3)``."""
+        unique: dict[str, int] = {}
+        which = [unique.setdefault(word, len(unique)) for row in faces for word in row]
+        table = np.array([[int(index or 0) for index in f"{word}//".split("/")[:3]] for word in unique] or [[0] * 3])
+        corners = table[which]
+        # Negative indices count back from the line.
+        before = [np.searchsorted(self._line_of[kind], self._line_of["f"]) for kind in ("v", "vt", "vn")]
+        corners = np.where(corners < 0, corners + np.repeat(before, self._sizes, axis=1).T, corners - 1)
+        # Faces may name texture coordinates and normals that the file does not have.
+        there = [len(self.positions), len(self._texcoords), len(self._normals)]
+        corners[:, 1:][(corners < 0)[:, 1:] | (corners >= there)[:, 1:]] = -1
+        return corners
 
     # ------------------------------------------------------------------------------------------------ the file again
     def with_positions(self, positions: FloatArray) -> bytes:
@@ -95,8 +89,6 @@ class ObjAsset(Asset):
         lines = list(self.lines)
         for number, (x, y, z) in zip(self._line_of["v"], positions.tolist(), strict=True):
             lines[number] = " ".join([f"v {x!r} {y!r} {z!r}", *lines[number].split(None, 4)[4:]])
-        for number, names in self._library_content[2].items():
-            lines[number] = f"mtllib {names}"
         if "normals" in self.carries:
             self._write_normals(lines, positions)
         return ("\n".join(lines) + "\n").encode("utf-8", errors="surrogateescape")
@@ -136,7 +128,7 @@ class ObjAsset(Asset):
             lines[number] = " ".join([kind, *words])
 
     @cached_property
-    def _library_content(self) -> tuple[dict[str, Material], dict[str, bytes], dict[int, str]]:
+    def _library_content(self) -> tuple[dict[str, Material], dict[str, bytes]]:
         return read_libraries(self.path, self._libraries)
 
     @property
@@ -159,7 +151,7 @@ class ObjAsset(Asset):
             corners = self._corners[self._triangles[self._material_of == number]].reshape(-1, 3)
             points, triangles = np.unique(corners, axis=0, return_inverse=True)
             vertices, texcoords, normals = points.T
-            name = self._materials[number] if number >= 0 else ""
+            name = self._materials[number]
             bare = Material(name or "clay", CLAY if colors is None else (1.0, 1.0, 1.0, 1.0))
             material = self._library_content[0].get(name, bare)
             uv = self._texcoords[texcoords] * [1, -1] + [0, 1] if (texcoords >= 0).all() else None
@@ -169,16 +161,8 @@ class ObjAsset(Asset):
         return parts
 
 
-def _corner(word: str, counts: tuple[int, ...], place: str) -> tuple[int, ...]:
-    """Indices from 0 of a corner such as ``1/2/3`` or ``-1//-1``; -1 where there is none."""
-    indices = [int(number) if number else None for number in (*word.split("/"), "", "")[:3]]
-    if 0 in indices or indices[0] is None:
-        raise MeshError(f"{place} has the index 0 (OBJ counts from 1) or a corner without a vertex")
-    v, *others = [
-        -1 if index is None else index - 1 if index > 0 else count + index
-        for index, count in zip(indices, counts, strict=True)
-    ]
-    return v, *(max(index, -1) for index in others)
+def _numbers(rows: list[list[str]], width: int) -> FloatArray:
+    return np.array(rows, dtype=np.float64).reshape(-1, width)
 
 
 def obj_bytes(vertices: FloatArray, faces: IntArray, asset: Any = None) -> bytes:

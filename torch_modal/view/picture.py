@@ -166,11 +166,11 @@ def render_sequence(
     keyframes = check_indices(ends if keyframe_indices is None else keyframe_indices, n_frames, "keyframe_indices")
 
     values = {row: to_numpy(numbers).astype(np.float64) for row, numbers in (colors or {}).items()}
-    for row, numbers in values.items():
-        size = checked[row].shape[:2] if row in checked else f"of a row {', '.join(rows)}"
+    for label, numbers in values.items():
+        size = checked[label].shape[:2] if label in checked else f"of a row {', '.join(rows)}"
         if numbers.shape != size or not np.isfinite(numbers).all():
-            raise ValueError(f"colors[{row!r}] must be finite numbers of shape {size}, got shape {numbers.shape}")
-    scale = _color_scale(np.stack([numbers[chosen] for numbers in values.values()])) if values else None
+            raise ValueError(f"colors[{label!r}] must be finite numbers of shape {size}, got shape {numbers.shape}")
+    scale: Any = _color_scale(np.stack([numbers[chosen] for numbers in values.values()])) if values else None
     rotation = view_rotation(shapes[0][0], view, up)
     turned = np.stack([frames[chosen] for frames in shapes]) @ rotation.T  # (R, C, V, 3)
     placed, half = fit_into_cells(turned)
@@ -188,8 +188,8 @@ def render_sequence(
         plain = np.broadcast_to(KEYFRAME_COLOR if n in keyframes else BETWEEN_COLOR, shapes[0][0].shape)
         for cell, cloud in zip(cells[:, column], clouds.values(), strict=False):
             draw_points(cell, cloud[n] @ rotation.T + moves[column], DOT_COLOR)
-        for cell, row, shape in zip(cells[len(clouds) :, column], rows, placed[:, column], strict=True):
-            paint = scale.to_rgba(values[row][n])[:, :3] if row in values else plain
+        for cell, label, shape in zip(cells[len(clouds) :, column], rows, placed[:, column], strict=True):
+            paint = scale.to_rgba(values[label][n])[:, :3] if label in values else plain
             draw_shape(cell, shape, paint, triangles)
     figure = cells[0, 0].figure
     if scale:
@@ -212,6 +212,6 @@ def _color_scale(numbers: FloatArray) -> Any:
     from matplotlib.colors import LinearSegmentedColormap, Normalize
 
     low, high = numbers.min(), np.percentile(numbers, 99.5)
-    palette = LinearSegmentedColormap.from_list("error", ERROR_COLORS)
+    palette: Any = LinearSegmentedColormap.from_list("error", ERROR_COLORS)
     palette.colorbar_extend = "max" if numbers.max() > high else "neither"
     return ScalarMappable(Normalize(low, high if high > low else low + 1.0), palette)
