@@ -112,7 +112,7 @@ def test_what_only_touches_does_not_cross(apart: float, search: str) -> None:
         pytest.importorskip("warp")
         from torch_modal.elastic.crossings import WarpPairs
 
-        kernels = WarpPairs(mesh, points[None])
+        kernels = WarpPairs(mesh, points)
     assert len(Crossings(mesh, points[None], search=kernels).pairs(points)) == 0
     # As deep as a quarter of an edge, the edges of both meet, and each pair is counted once.
     points[len(second) :, 0] -= 0.0625
@@ -131,7 +131,7 @@ def test_kernels_find_the_triangles_that_cross(n_faces: int, generator: torch.Ge
     first, x = torch.rand(2, n_faces + 3, 3, dtype=torch.float64, generator=generator).numpy()
     wanted = Crossings(mesh, first[None]).pairs(x)
     assert n_faces < 500 or len(wanted) > FIRST_ROOM  # which has to be made larger
-    np.testing.assert_array_equal(Crossings(mesh, first[None], search=WarpPairs(mesh, first[None])).pairs(x), wanted)
+    np.testing.assert_array_equal(Crossings(mesh, first[None], search=WarpPairs(mesh, first)).pairs(x), wanted)
     if n_faces < 500:
         assert set(map(tuple, wanted.tolist())) == pairs_by_fractions(x, corners)
 

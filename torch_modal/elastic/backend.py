@@ -63,7 +63,7 @@ class TorchBackend:
         return Distortion(mesh, further)
 
     def crossings(self, mesh: Connectivity, shape: FloatArray) -> Callable[[FloatArray], IntArray] | None:
-        """A search for pairs of triangles that cross, near a shape; None for ``geometry/crossings.py``."""
+        """A search for pairs of triangles that may cross, near a shape; None for ``geometry/crossings.py``."""
         return None
 
 
@@ -111,7 +111,7 @@ class WarpBackend(TorchBackend):
 
     def crossings(self, mesh: Connectivity, shape: FloatArray) -> Callable[[FloatArray], IntArray]:
         """Overrides the base class."""
-        return WarpPairs(mesh, shape[None])
+        return WarpPairs(mesh, shape)
 
 
 BACKENDS: dict[str, Callable[[], TorchBackend]] = {"torch": TorchBackend, "warp": WarpBackend}
