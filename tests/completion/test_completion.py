@@ -311,7 +311,7 @@ def test_gradients_in_points(tube, kind):
         springs = copy.copy(last.points)
         springs.points = last.points.points + sign * step * (moves @ axes)[last.points.numbers]
         fine = FineEnergy(Mesh.of(faces, len(x[1])), [part.term for part in last.energy.parts])
-        ends.append(fine.relax(last.x, last.rests, ((12, 200),), lambda *_, own=springs: [own]))
+        ends.append(fine.relax(last.x, last.rests, 12 * [200], lambda *_, own=springs: [own]))
     moved = ((ends[1] - ends[0])[0] / (2 * step)) @ axes.mT / scale**2
     assert float((moved * probe).sum()) == pytest.approx(float((slope * moves).sum()), rel=1e-4)
 

@@ -76,11 +76,11 @@ class Case:
 
     def by_torch(self, x: Tensor, *rests: Tensor) -> Tensor:
         own = TermsTowards(self.energy, self.rests(*rests).reference(self.energy))
-        return descend(SumOfEnergies([own]), x, 2, 4)
+        return descend(SumOfEnergies([own]), x, [4, 4])
 
     def by_warp(self, x: Tensor, *rests: Tensor) -> Tensor:
         to = self.fused.reference(self.rests(*rests))
-        return _Relaxation(self.fused, 2, 4)(x, *to.records)[0]
+        return _Relaxation(self.fused, [4, 4])(x, *to.records)[0]
 
 
 @pytest.fixture(params=["closed", "open", "flat"])
@@ -152,7 +152,7 @@ def test_steps_that_would_go_uphill_are_shortened(small_bars: Shapes) -> None:
     case = Case(small_bars, small_bars.faces, 10.0)
     case.given[5] *= 1e5
     to, taken = case.fused.reference(case.rests(*case.given[1:])), []
-    found = descend(KernelProblem(case.fused, to), case.given[0].contiguous(), 2, 4, taken)
+    found = descend(KernelProblem(case.fused, to), case.given[0].contiguous(), [4, 4], taken)
     lengths = torch.stack([step[3] for step in taken])
     assert float(lengths.min()) < 0.5 < float(lengths.max()), "no step is shortened, or all are"
     torch.testing.assert_close(found, case.by_torch(*case.given), rtol=0, atol=1e-8 * CANONICAL_SIZE)

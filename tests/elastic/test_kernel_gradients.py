@@ -135,7 +135,7 @@ def test_gradients_of_steps_of_all_vertices(elastic: Elastic) -> None:
 
     def run(x: Tensor, *factors: Tensor) -> Tensor:
         own = [factor * record for factor, record in zip(factors, records, strict=True)]
-        return _Relaxation(elastic.kernels, 2, 3)(x, *own)[0]
+        return _Relaxation(elastic.kernels, [3, 3])(x, *own)[0]
 
     assert_differences(run, [x, *map(torch.ones_like, records)], to=1e-7)
 

@@ -25,7 +25,7 @@ BATCH = 2
 
 
 def relax(core: Energy, x: Tensor, reference: Reference, n_steps: int, n_products: int) -> Tensor:
-    return descend(SumOfEnergies([TermsTowards(core, reference)]), x, n_steps, n_products)
+    return descend(SumOfEnergies([TermsTowards(core, reference)]), x, n_steps * [n_products])
 
 
 class Case:

@@ -57,7 +57,7 @@ def test_closed_forms_agree_with_torch_func(surface: tuple[Mesh, Tensor], genera
             [
                 *derivatives,
                 space.value_and_gradient(a, placement)[1],
-                descend(SumOfEnergies([TermsTowards(energy, reference)]), x[1:3], 2, 4),
+                descend(SumOfEnergies([TermsTowards(energy, reference)]), x[1:3], [4, 4]),
             ]
         )
     for mine, truth in zip(*found, strict=True):

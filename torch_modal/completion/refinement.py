@@ -33,7 +33,7 @@ the first and in the last.
 """
 ROUNDS, STEPS, PRODUCTS = 12, 2, 20
 """Rounds of new pairs, in each of which all vertices take steps, each with iterations of conjugate gradients."""
-LAST = (6, 60)
+LAST = 6 * [60]
 """Steps after the last round, and their iterations."""
 
 
@@ -72,10 +72,10 @@ class Refinement:
         x, of_known = followed, OF_KNOWN
         for k in range(ROUNDS + 1):
             shapes = torch.cat([followed, self.problem.whole, x])[numbers]
-            steps, solves = LAST if k == ROUNDS else (STEPS, PRODUCTS), []
+            products, solves = LAST if k == ROUNDS else STEPS * [PRODUCTS], []
             for i, frame in enumerate(frames):
                 rests = RestShapes(shapes[i : i + 1], weights[i : i + 1], self.stiffness, self.anchors)
-                solves.append(self._relax(frame, x[i : i + 1], rests, steps, of_known))
+                solves.append(self._relax(frame, x[i : i + 1], rests, products, of_known))
                 report.update(k < ROUNDS)
             x = torch.cat([solve.x for solve in solves])
             # Points of known places are missed by their noise, neither more nor less (Morozov's discrepancy).
@@ -105,7 +105,7 @@ class Refinement:
             x = elastic.follow(x, pulls)
         return torch.from_numpy(x)
 
-    def _relax(self, frame: Frame, x: Tensor, rests: RestShapes, steps: tuple[int, int], of_known: float) -> LastSolve:
+    def _relax(self, frame: Frame, x: Tensor, rests: RestShapes, products: list[int], of_known: float) -> LastSolve:
         """Steps of all vertices of a frame, with pairs found where they start. *Shape:* ``(1, V, 3)``."""
         surface, springs = SampledSurface(x[0].numpy(), self.problem.mesh), []
         for seen in frame.seen:
@@ -114,7 +114,7 @@ class Refinement:
             weights = factor / seen.noise**2 * len(seen.points) * pairs.weights * trust
             springs.append(pairs._replace(weights=weights))
         points = PointEnergy(springs)
-        x = self.fine.relax(x, rests, (steps,), lambda *_: [points])
+        x = self.fine.relax(x, rests, products, lambda *_: [points])
         return LastSolve(x, self.fine.energy, rests, points)
 
     def _separate(self, solves: list[LastSolve]) -> Tensor:
@@ -129,8 +129,7 @@ class Refinement:
         for solve in solves:
 
             def relax(x: Tensor, _: Tensor, extra: ExtraEnergies, solve: LastSolve = solve) -> Tensor:
-                one_step = ((1, PRODUCTS),)
-                return self.fine.relax(x, solve.rests, one_step, lambda *chunk: [solve.points, *extra(*chunk)])
+                return self.fine.relax(x, solve.rests, [PRODUCTS], lambda *chunk: [solve.points, *extra(*chunk)])
 
             search.watched[:] = False  # each shape by itself
             shapes.append(separate(solve.x, relax, search)[0])

@@ -130,4 +130,4 @@ def contact_search(core: InBetweenSolver, ends: Tensor, n_shapes: int) -> Contac
 
 def _steps(core: InBetweenSolver, rests: RestShapes) -> Callable[[Tensor, Tensor, ExtraEnergies], Tensor]:
     """Newton steps of all vertices of some of the shapes, with further energies."""
-    return lambda x, some, extra: core.fine.relax(x, trees.rows(rests, some), [(1, PRODUCTS)], extra)
+    return lambda x, some, extra: core.fine.relax(x, trees.rows(rests, some), [PRODUCTS], extra)

@@ -18,7 +18,6 @@ from torch_modal.elastic.steps import (
     SumOfEnergies,
     TermsTowards,
     descend,
-    descend_in_stages,
     step_length,
 )
 from torch_modal.elastic.term import Mesh, Term
@@ -37,34 +36,28 @@ class KernelFineEnergy(FineEnergy):
         self.further = Energy(mesh, [terms[i] for i in self.others]) if self.others else None
         self.kernels = KernelEnergy(shell, [term for term in parts if term is not None])
 
-    def relax_chunk(
-        self, x: Tensor, rests: RestShapes, stages: Sequence[tuple[int, int]], extra: Sequence[FreeEnergy]
-    ) -> Tensor:
+    def relax_chunk(self, x: Tensor, rests: RestShapes, products: Sequence[int], extra: Sequence[FreeEnergy]) -> Tensor:
         """Overrides the base class. With further terms or energies, gradients are left to torch."""
         alone = self.further is None and not extra
         tensors = trees.leaves((x, *rests))  # the start may have no gradient where stiffnesses have one
         recorded = torch.is_grad_enabled() and any(value.requires_grad for value in tensors)
         if not (alone and self.kernels.exact) and (recorded or not is_eager(*tensors)):
-            return super().relax_chunk(x, rests, stages, extra)
+            return super().relax_chunk(x, rests, products, extra)
         others = [*extra, *([] if self.further is None else [TermsTowards.of_terms(self.further, self.others, rests)])]
         to = self.kernels.reference(rests._replace(stiffness=[rests.stiffness[i] for i in self.own]), x, relative=True)
         if alone:
-            moved = x
-            for n_steps, n_products in stages:
-                if n_steps:
-                    moved = _Relaxation(self.kernels, n_steps, n_products)(moved, *to.records)[0]
-            return moved.to(x)
+            return _Relaxation(self.kernels, products)(x, *to.records)[0].to(x)
         with torch.no_grad():
-            return descend_in_stages(KernelProblem(self.kernels, to, others), x.double().contiguous(), stages).to(x)
+            return descend(KernelProblem(self.kernels, to, others), x.double().contiguous(), products).to(x)
 
     def descend_towards(
-        self, x: Tensor, reference: Reference, n_steps: int, n_products: int, extra: Sequence[FreeEnergy] = ()
+        self, x: Tensor, reference: Reference, products: Sequence[int], extra: Sequence[FreeEnergy] = ()
     ) -> Tensor:
         """Overrides the base class. Gradients are left to torch."""
         if self.further is not None or (torch.is_grad_enabled() and x.requires_grad) or not is_eager(x):
-            return super().descend_towards(x, reference, n_steps, n_products, extra)
+            return super().descend_towards(x, reference, products, extra)
         problem = KernelProblem(self.kernels, reference.transpose(), extra)
-        return descend(problem, x.double().contiguous(), n_steps, n_products).to(x)
+        return descend(problem, x.double().contiguous(), products).to(x)
 
 
 class KernelProblem:
@@ -128,13 +121,13 @@ class KernelProblem:
 class _Relaxation(Operation):
     """Steps of all vertices from shapes, towards the records of a reference."""
 
-    def __init__(self, kernels: KernelEnergy, n_steps: int, n_products: int) -> None:
-        self.kernels, self.n_steps, self.n_products = kernels, n_steps, n_products
+    def __init__(self, kernels: KernelEnergy, products: Sequence[int]) -> None:
+        self.kernels, self.products = kernels, products
 
     def run(self, kept: list[Any] | None, x: Tensor, *records: Tensor) -> tuple[Tensor, ...]:
         problem = KernelProblem(self.kernels, Reference.of_records(records))
         with torch.no_grad():
-            return (descend(problem, x, self.n_steps, self.n_products, kept),)
+            return (descend(problem, x, self.products, kept),)
 
     def back(self, kept: list[Any], grads: Sequence[Tensor], x: Tensor, *records: Tensor) -> tuple[Tensor | None, ...]:
         if not kept:
@@ -146,7 +139,7 @@ class _Relaxation(Operation):
 
     def by_torch(self, x: Tensor, *records: Tensor) -> tuple[Tensor, ...]:
         terms = TermsTowards(self.kernels.energy, Reference.of_records(records).transpose())
-        return (descend(SumOfEnergies([terms]), x, self.n_steps, self.n_products),)
+        return (descend(SumOfEnergies([terms]), x, self.products),)
 
     def _step_back(self, step: Any, to: Reference, to_reached: Tensor, to_records: Sequence[Tensor]) -> Tensor:
         """Gradient at the start of a step from the gradient at its end; gradients of the records are added.

@@ -59,7 +59,7 @@ def inverse_of_symmetric(blocks: Tensor) -> Tensor:
     return (cofactors / (determinant * trace)).unflatten(0, (3, 3))
 
 
-def descend(problem: Any, x: Tensor, n_steps: int, n_products: int, taken: list[Any] | None = None) -> Tensor:
+def descend(problem: Any, x: Tensor, products: Sequence[int], taken: list[Any] | None = None) -> Tensor:
     """Steps of a truncated Newton method on all vertices, shortened where the energy would rise.
 
     Each step solves with a convex Hessian by conjugate gradients, preconditioned by its diagonal blocks and cut short:
@@ -69,8 +69,7 @@ def descend(problem: Any, x: Tensor, n_steps: int, n_products: int, taken: list[
     Args:
         problem: A :class:`SumOfEnergies`, or one that kernels solve.
         x: Where to start. *Shape:* ``(B, V, 3)``.
-        n_steps: Newton steps.
-        n_products: Iterations of conjugate gradients in each.
+        products: Iterations of conjugate gradients in each Newton step.
         taken: A list to which each step is added: its start, the energy there, the whole step, its length, and what
             the solver kept.
 
@@ -78,11 +77,11 @@ def descend(problem: Any, x: Tensor, n_steps: int, n_products: int, taken: list[
         *Shape:* ``(B, V, 3)``.
     """
     at = None
-    for k in range(n_steps):
+    for k, n_products in enumerate(products, 1):
         at = problem.at(x) if at is None else at
         solution, *kept = problem.newton_direction(at, n_products, taken is not None)
         reached, there = x + solution, None
-        if k < n_steps - 1 and is_eager(reached):  # the whole step is nearly always the one that is taken
+        if k < len(products) and is_eager(reached):  # the whole step is nearly always the one that is taken
             there = problem.at(reached)
         after = problem.value(reached) if there is None else there.value
         length = step_length(at.value, at.slope(solution), after, solution.abs().amax((1, 2)))
@@ -259,38 +258,23 @@ class FineEnergy(nn.Module):
         self.energy = Energy(mesh, terms)
 
     def relax(
-        self, x: Tensor, rests: RestShapes, stages: Sequence[tuple[int, int]], extra: ExtraEnergies | None = None
+        self, x: Tensor, rests: RestShapes, products: Sequence[int], extra: ExtraEnergies = lambda *_: ()
     ) -> Tensor:
-        """Steps of all vertices, never uphill: stages of :func:`descend` by numbers of steps and products.
-
-        *Shape:* ``(B, V, 3)``.
-        """
-        size, parts = (
-            max(1, (VERTICES_AT_ONCE_OF_CPU if x.device.type == "cpu" else VERTICES_AT_ONCE_OF_GPU) // x.shape[1]),
-            [],
-        )
-        for i in range(0, len(x), size):
-            some = slice(i, i + size)
-            start, others = x[some], () if extra is None else extra(some, x[some])
-            parts.append(self.relax_chunk(start, trees.rows(rests, some), stages, others))
+        """Steps of all vertices, never uphill, by :func:`descend`. *Shape:* ``(B, V, 3)``."""
+        most = VERTICES_AT_ONCE_OF_CPU if x.device.type == "cpu" else VERTICES_AT_ONCE_OF_GPU
+        parts = []
+        for i in range(0, len(x), max(1, most // x.shape[1])):
+            some = slice(i, i + max(1, most // x.shape[1]))
+            parts.append(self.relax_chunk(x[some], trees.rows(rests, some), products, extra(some, x[some])))
         return torch.cat(parts)
 
-    def relax_chunk(
-        self, x: Tensor, rests: RestShapes, stages: Sequence[tuple[int, int]], extra: Sequence[FreeEnergy]
-    ) -> Tensor:
+    def relax_chunk(self, x: Tensor, rests: RestShapes, products: Sequence[int], extra: Sequence[FreeEnergy]) -> Tensor:
         """:meth:`relax` of samples that fit into the caches, with their own further energies."""
         terms = TermsTowards(self.energy, rests.reference(self.energy, x, relative=True), rests.anchors)
-        return descend_in_stages(SumOfEnergies([terms, *extra]), x, stages)
+        return descend(SumOfEnergies([terms, *extra]), x, products)
 
     def descend_towards(
-        self, x: Tensor, reference: Reference, n_steps: int, n_products: int, extra: Sequence[FreeEnergy] = ()
+        self, x: Tensor, reference: Reference, products: Sequence[int], extra: Sequence[FreeEnergy] = ()
     ) -> Tensor:
         """Steps of all vertices towards a reference that is known. *Shape:* ``(B, V, 3)``."""
-        return descend(SumOfEnergies([TermsTowards(self.energy, reference), *extra]), x, n_steps, n_products)
-
-
-def descend_in_stages(problem: Any, x: Tensor, stages: Sequence[tuple[int, int]]) -> Tensor:
-    """:func:`descend` in stages."""
-    for n_steps, n_products in stages:
-        x = descend(problem, x, n_steps, n_products)
-    return x
+        return descend(SumOfEnergies([TermsTowards(self.energy, reference), *extra]), x, products)

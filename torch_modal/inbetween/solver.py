@@ -142,7 +142,5 @@ class InBetweenSolver(nn.Module):
 
     def relax(self, x: Tensor, rests: RestShapes) -> Tensor:
         """Local steps and polish: deformation that the modes cannot represent. *Shape:* ``(B, V, 3)``."""
-        if not len(x) or not (self.solver.local_steps or self.solver.polish):
-            return x
-        stages = (self.solver.local_steps, LOCAL_PRODUCTS), (self.solver.polish, POLISH_PRODUCTS)
-        return self.fine.relax(x, rests, stages)
+        products = [LOCAL_PRODUCTS] * self.solver.local_steps + [POLISH_PRODUCTS] * self.solver.polish
+        return self.fine.relax(x, rests, products) if len(x) and products else x

@@ -16,8 +16,8 @@ from torch_modal.statistics.variation import Variation, bound_weights
 # points, it falls with the square of their standard deviation.
 STIFFNESS, LARGEST_STIFFNESS = 2000.0, 100.0
 
-# Newton steps and products of the first elastic round, and of each of the next, with weights computed anew.
-FIRST_ROUND, NEXT_ROUND, N_ROUNDS = (6, 40), (4, 40), 3
+# Products in the Newton steps of the first elastic round, and of each of the next, with weights computed anew.
+FIRST_ROUND, NEXT_ROUND, N_ROUNDS = 6 * [40], 4 * [40], 3
 
 # Mean distance, in sizes, by which the result may be farther from the points than a given shape.
 DISTANCE_SLACK = 1e-3
@@ -100,10 +100,10 @@ def _fit_one(variation: Variation, every: Observations, about: Tensor, robust: b
         there = to._replace(points=variation.scale * pose.inverse().apply(to.points))
         springs = point_springs(there, stiffness, len(assembled))
         mixed = bound_weights(weights)
-        x = variation.relax(assembled, mixed, *FIRST_ROUND, springs)
+        x = variation.relax(assembled, mixed, FIRST_ROUND, springs)
         for _ in range(N_ROUNDS):
             mixed = variation.mixtures.weights(x)
-            x = variation.relax(x, mixed, *NEXT_ROUND, springs)
+            x = variation.relax(x, mixed, NEXT_ROUND, springs)
         step = x - assembled
         missed = [to.distances_after_fit(shape) for shape in variation.shapes]
         *errors, error = ((to.weights * each.square()).sum() for each in (*missed, to.distances(pose.apply(x))))

@@ -1,5 +1,7 @@
 """Variation of a set of shapes, with weights of its own for each part of the surface."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from scipy import sparse
@@ -37,8 +39,8 @@ LARGEST_EXTRAPOLATION = 2.0
 # Length over which local weights vary, relative to the largest distance on the surface: best of 0.1, 0.2 and 0.4.
 LENGTH = 0.2
 
-# Newton steps and products with which drawn shapes relax.
-STEPS, PRODUCTS = 4, 30
+# Products with the Hessian in each of the Newton steps with which drawn shapes relax.
+PRODUCTS = 4 * [30]
 
 # Neighbours whose normals have a smaller cosine lie on each other.
 FOLDED = -0.9
@@ -100,9 +102,7 @@ class Variation:
         return self.coordinates.shapes(self.bending(weights)[None])[0]
 
     @torch.no_grad()
-    def relax(
-        self, x: Tensor, weights: Tensor, n_steps: int, n_products: int, springs: FreeEnergy | None = None
-    ) -> Tensor:
+    def relax(self, x: Tensor, weights: Tensor, products: Sequence[int], springs: FreeEnergy | None = None) -> Tensor:
         """Newton steps of all vertices towards weighted means of the lengths and angles of the given shapes.
 
         The shape is in the pose of the mean; the springs are an energy at a size of 100. *Shape:* ``(V, 3), (K, V)``.
@@ -111,7 +111,7 @@ class Variation:
         rest = trees.map_leaves(energy.mix_rests(self.rest, weights), lambda measure: measure[None])
         reference = energy.reference_of(rest, self.stiffness)
         further = [] if springs is None else [springs]
-        return self.fine.descend_towards(self.scale * x[None], reference, n_steps, n_products, further)[0] / self.scale
+        return self.fine.descend_towards(self.scale * x[None], reference, products, further)[0] / self.scale
 
     # ----------------------------------------------------------------------------------------------------- new members
     def draw(
@@ -150,7 +150,7 @@ class Variation:
         for i in range(ROUNDS + 1):
             locality = 0 if i == ROUNDS else SMOOTHER**i
             local = torch.softmax(logarithms + locality * factors @ self.fields[1:], 0)
-            x = self.relax(self.assemble(local), local, STEPS, PRODUCTS)
+            x = self.relax(self.assemble(local), local, PRODUCTS)
             if self.folds(x) <= self.most_folds:
                 return x, local
         first = int(weights.argmax())
