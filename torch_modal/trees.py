@@ -1,8 +1,9 @@
 """Nested tuples and lists of tensors of one batch."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
+import torch
 from torch import Tensor
 
 HERE = "here"
@@ -40,3 +41,8 @@ def fill(tree: Any, tensors: Iterable[Tensor]) -> Any:
 def rows(tree: Any, samples: Tensor | slice) -> Any:
     """Pick some of the samples."""
     return map_leaves(tree, lambda tensor: tensor[samples])
+
+
+def join(trees: Sequence[Any]) -> Any:
+    """Join the samples of trees of one structure."""
+    return fill(trees[0], map(torch.cat, zip(*map(leaves, trees), strict=True)))

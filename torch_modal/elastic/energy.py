@@ -225,11 +225,8 @@ class Energy(nn.Module):
             anchors: Zeros where None, for displacements. *Shape:* ``(3, ..., P)``.
         """
         centre = pick(rows, self.used).mean(-1, keepdim=True)
-        n_anchors = self.n_extended - self.n_vertices - 1
-        if not n_anchors:
-            return torch.cat([rows, centre], -1)
-        fixed = rows.new_zeros(*rows.shape[:-1], n_anchors) if anchors is None else anchors
-        return torch.cat([rows, centre, fixed.expand(*rows.shape[:-1], n_anchors)], -1)
+        shape = *rows.shape[:-1], self.n_extended - self.n_vertices - 1
+        return torch.cat([rows, centre, rows.new_zeros(shape) if anchors is None else anchors.expand(shape)], -1)
 
     def fold(self, extended: Tensor) -> Tensor:
         """The adjoint of :meth:`extend`: distributes the centre's value to the vertices. *Shape:* ``(3, ..., V)``."""

@@ -83,8 +83,6 @@ class ModalEnergy(nn.Module):
 
     def __init__(self, energy: Energy | ShellEnergy, columns: Tensor) -> None:
         super().__init__()
-        #: True if the shapes are in the caller's coordinates, as the anchors of terms are.
-        self.unscaled = isinstance(energy, ShellEnergy)
         self.energy = energy.energy if isinstance(energy, ShellEnergy) else energy
         rows = self.energy.extend(columns.movedim(-1, 0))
         self.register_buffer("columns", rows.transpose(0, 1).contiguous(), persistent=False)
@@ -99,11 +97,6 @@ class ModalEnergy(nn.Module):
         first, *others = (values.index_select(0, corner) for corner in corners)
         return torch.cat([other - first for other in others], 1)
 
-    @property
-    def n_amplitudes(self) -> int:
-        """Number of amplitudes, n."""
-        return len(self.columns)
-
     def reference(self, rests: RestShapes, base: Tensor | None = None) -> Any:
         """Merge rest shapes into the reference of a :class:`Placement`; arguments as :meth:`RestShapes.reference`."""
         return rests.reference(self.energy, base)
@@ -114,10 +107,10 @@ class ModalEnergy(nn.Module):
         Args:
             base: The shape at amplitudes of zero. *Shape:* ``(B, V, 3)``.
             reference: What is compared with, for example of :meth:`torch_modal.ShellEnergy.reference_of`.
-            anchors: Anchors of the energy's terms; by default the anchors of a :class:`torch_modal.ShellEnergy`.
+            anchors: Anchors of the energy's terms; by default in the coordinates in which the terms have them.
                 *Shape:* ``(B, P, 3)``.
         """
-        if anchors is None and self.unscaled and self.energy.anchors is not None:
+        if anchors is None and self.energy.anchors is not None:
             anchors = self.energy.anchors.to(base)[None]
         fixed = None if anchors is None else anchors.movedim(-1, 0)
         return Placement(self.energy.extend(base.movedim(-1, 0), fixed).movedim(0, -2), reference)
@@ -154,10 +147,7 @@ class ModalEnergy(nn.Module):
             if second_order:
                 curved.append(_second_order(summand.term, one, columns))
         gauss_newton = reduce(torch.add, inner)
-        stiffness = sum(one.curvature.sum(-1) for one in at.terms)
-        stiffest = gauss_newton.diagonal(dim1=-2, dim2=-1).amax(-1)
-        rounding = torch.finfo(x.dtype).eps * x.abs().amax((0, -1))
-        resolution = rounding * (stiffest * stiffness).sqrt()
+        resolution = _resolution(x.movedim(0, 1), gauss_newton, sum(one.curvature.sum(-1) for one in at.terms))
         beyond = reduce(torch.add, curved) if second_order else None
         return Derivatives(at.value, reduce(torch.add, gradients), gauss_newton, beyond, resolution)
 
@@ -175,6 +165,12 @@ def gram(rows: Tensor, exact: bool) -> Tensor:
     """``J^T J``, or the same of single precision in half of the time. *Shape:* ``(B, m, n) -> (B, n, n)``."""
     rows, like = rows if exact else rows.float(), rows
     return (rows.mT @ rows).to(like)
+
+
+def _resolution(x: Tensor, gauss_newton: Tensor, stiffness: Any) -> Tensor:
+    """Gradient norm due to the rounding of shapes, from the sum of all stiffnesses, ``(B,)``. *Shape:* ``(B, ...)``."""
+    stiffest = gauss_newton.diagonal(dim1=-2, dim2=-1).amax(-1)
+    return torch.finfo(x.dtype).eps * x.abs().flatten(1).amax(1) * (stiffest * stiffness).sqrt()
 
 
 def _normal_equations(one: Linearised, columns: Tensor, exact: bool) -> tuple[Tensor, Tensor]:
@@ -262,17 +258,12 @@ class KernelModalEnergy(ModalEnergy):
             self._derivatives(a[i : i + most], trees.rows(placement, slice(i, i + most)), second_order)
             for i in range(0, max(len(a), 1), most)
         ]
-        joined = [None if each[0] is None else torch.cat(each) for each in zip(*parts, strict=True)]
-        return parts[0] if len(parts) == 1 else Derivatives(*joined)  # type: ignore[arg-type]
+        return parts[0] if len(parts) == 1 else trees.join(parts)  # type: ignore[no-any-return]
 
     def _derivatives(self, a: Tensor, placement: Placement, second_order: bool) -> Derivatives:
-        x, to, kernels, blocks = (
-            self.shapes(a, placement.base),
-            placement.reference,
-            self.kernels,
-            self.blocks.double(),
-        )
-        (b, n_vertices, _), n, n_blocks = x.shape, len(self.columns), self.blocks.shape[1] // _BLOCK
+        (base, to), kernels, blocks = placement, self.kernels, self.blocks.double()
+        x, n, n_blocks = self.shapes(a, base), len(self.columns), blocks.shape[1] // _BLOCK
+        b, n_vertices = x.shape[:2]
         terms = [(kernels.parts[i], to.records[i]) for i in kernels.terms]
         starts = [0, *itertools.accumulate(len(term.elements) for term, _ in terms)]
         n_rows, totals = starts[-1] + len(kernels.volumes), x.new_zeros(b, 2)
@@ -292,9 +283,7 @@ class KernelModalEnergy(ModalEnergy):
             stiffness, value, moment = stiffness + 2 * weight, value + weight * off**2, 2 * weight * off
         gradient = (jacobian.mT @ jacobian[..., n : n + 1])[:, :n, 0]
         inner = gram(jacobian, second_order)[:, :n, :n]
-        stiffest = inner.diagonal(dim1=-2, dim2=-1).amax(-1)
-        rounding = torch.finfo(x.dtype).eps * x.abs().amax((-1, -2))
-        curved = None
+        resolution, curved = _resolution(x, inner, stiffness), None
         if second_order:
             pushed = x.new_zeros(b, *blocks.shape)
             for term, record in terms:
@@ -306,8 +295,7 @@ class KernelModalEnergy(ModalEnergy):
                 extended = kernels.parts[i].extend(x)
                 kernels.parts[i].of_faces("curved", extended, moment, blocks, n_vertices + 1, n_blocks, pushed)
             curved = (blocks.mT @ pushed)[:, :n, :n]
-        value = value + to.constant
-        return Derivatives(value, gradient, inner, curved, rounding * (stiffest * stiffness).sqrt())
+        return Derivatives(value + to.constant, gradient, inner, curved, resolution)
 
     def value_and_gradient(self, a: Tensor, placement: Placement) -> tuple[Tensor, Tensor]:
         """Overrides the base class; the value has no gradient."""
