@@ -21,7 +21,7 @@ class Setting:
     def __init__(self, bars: Shapes, coarse_faces: int) -> None:
         layer = MidShape(bars.bases[:2], bars.faces, **modal(space="paired", coarse_faces=coarse_faces))
         core = layer.in_between.core
-        self.energy, self.ends = core.space, [core.space.first.basis, core.space.second.basis]
+        self.energy, self.ends = core.space, (core.space.first, core.space.second)
         self.coarse = core.space.first.coarse
         self.shell = ShellEnergy(self.coarse.mesh.faces)
         pairs, half = torch.stack([bars.keyframes[:2], bars.keyframes[1:3]]), torch.full((2, 2), 0.5).double()
@@ -32,8 +32,8 @@ class Setting:
 
     def energy_by_hand(self, a: Tensor) -> Tensor:
         """Eq. 4, d(x_a, x1) + mu |x1 - x2|^2 + d(x_b, x2), on the coarse mesh."""
-        parts = a.split([len(end) for end in self.ends], -1)
-        x1, x2 = (end.displace(x, part) for end, x, part in zip(self.ends, self.shapes, parts, strict=True))
+        parts = a.split([end.n_amplitudes for end in self.ends], -1)
+        x1, x2 = (end.lift(part, x) for end, x, part in zip(self.ends, self.shapes, parts, strict=True))
         restrict, (x_a, x_b) = self.coarse.restrict, self.shapes
         similarity = (restrict(x1 - x2) ** 2).sum((-1, -2))
         return self.shell(restrict(x1), restrict(x_a)) + MU * similarity + self.shell(restrict(x2), restrict(x_b))

@@ -63,7 +63,7 @@ def strip(generator: torch.Generator) -> tuple[Any, Tensor]:
     for _ in range(2):
         mode = torch.randn(1, 24, 3, dtype=x.dtype, generator=generator)
         mode = mode / (coarse.weights * mode.square().sum(-1)).sum().sqrt()
-        ends.append(SimpleNamespace(coarse=coarse, basis=SimpleNamespace(coarse=mode)))
+        ends.append(SimpleNamespace(coarse=coarse, coarse_basis=mode))
     return SimpleNamespace(first=ends[0], second=ends[1]), x
 
 
@@ -73,7 +73,7 @@ def test_segments_are_those_of_a_slow_search(strip: tuple[Any, Tensor]) -> None:
     mesh, areas = space.first.coarse.mesh, space.first.coarse.weights
     ends = []
     for end, x in zip((space.first, space.second), shapes, strict=True):
-        (mode,) = end.basis.coarse
+        (mode,) = end.coarse_basis
         side, rate = (y[mesh.edges[:, 1]] - y[mesh.edges[:, 0]] for y in (x, mode))
         stiffness = ((rate * side).sum(1) ** 2 / side.norm(dim=1) ** 3).sum()  # of the energy, but for a factor
         turns = torch.linalg.cross(torch.eye(3).to(x)[None], x[:, None]).mT
@@ -101,7 +101,7 @@ def test_fitting_error_is_that_of_weighted_least_squares(strip: tuple[Any, Tenso
     way, root = shapes[1] - shapes[0], space.first.coarse.weights.sqrt()[:, None]
     squares = torch.zeros(24, dtype=way.dtype)
     for end in (space.first, space.second):
-        (mode,) = end.basis.coarse
+        (mode,) = end.coarse_basis
         amplitude = torch.linalg.lstsq((root * mode).view(-1, 1), (root * way).view(-1, 1)).solution
         squares += (way - amplitude * mode).square().sum(1)
     torch.testing.assert_close(torch.from_numpy(fitting_error(space, shapes)), squares.sqrt())

@@ -66,7 +66,7 @@ def test_energy_is_below_linear_interpolation_and_at_a_minimum(bent: Shapes, mon
     (gradient,) = torch.autograd.grad(energy(x), x)
     half = torch.full((1, 2), 0.5, dtype=torch.float64)
     turn = layer.in_between.core.alignment(bent.keyframes[None], half)[1].rotation[0]
-    columns = layer.space.basis.fine @ turn.mT
+    columns = layer.space.basis @ turn.mT
     slopes = torch.einsum("nvc,vc->n", columns, gradient)
     assert len(slopes) == 16
     assert (slopes.abs() < 1e-7 * torch.linalg.norm(columns.flatten(1), dim=1) * gradient.norm()).all()

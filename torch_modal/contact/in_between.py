@@ -109,7 +109,7 @@ def push_apart(
         zeros = x.new_zeros(len(some), space.n_amplitudes)
         at = space.derivatives(zeros, placement, second_order=False)
         stiffness = at.gauss_newton - space.anchor * torch.eye(zeros.shape[1]).to(at.gauss_newton)
-        basis = space.basis.fine, core.alignment.weights, at.gradient.to(u), stiffness.to(u)
+        basis = space.basis, core.alignment.weights, at.gradient.to(u), stiffness.to(u)
         return modal_displacement(*basis, x[some], contact, accelerations)
 
     search = contact_search(core, ends[0], len(u))

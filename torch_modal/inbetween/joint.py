@@ -13,7 +13,6 @@ from torch_modal.elastic.modal import Derivatives, Placement
 from torch_modal.elastic.shell import N_SHELL_TERMS
 from torch_modal.elastic.steps import FineEnergy
 from torch_modal.inbetween.coarse import CoarseMesh
-from torch_modal.inbetween.subspace import SubspaceBasis
 
 
 class JointSpace(nn.Module):
@@ -29,16 +28,26 @@ class JointSpace(nn.Module):
         coarse: The coarse mesh.
         fine: All terms on the caller's mesh.
         backend: Makes the energies in the amplitudes.
-        basis: The basis of the subspace, ``U``.
+        basis: Directions of the subspace, ``U``, on the fine and on the coarse mesh, where they are orthonormal under
+            the weights of the vertices. *Shape:* ``(n, V, 3), (n, V_coarse, 3)``.
         anchor: ``rho``.
     """
 
     fine: FineEnergy
+    basis: Tensor
+    coarse_basis: Tensor
 
     def __init__(
-        self, coarse: CoarseMesh, fine: FineEnergy, backend: TorchBackend, basis: SubspaceBasis, anchor: float = 0.0
+        self,
+        coarse: CoarseMesh,
+        fine: FineEnergy,
+        backend: TorchBackend,
+        basis: tuple[Tensor, Tensor],
+        anchor: float = 0.0,
     ) -> None:
         super().__init__()
+        self.register_buffer("basis", basis[0], persistent=False)
+        self.register_buffer("coarse_basis", basis[1], persistent=False)
         mesh, terms = coarse.mesh, [summand.term for summand in fine.energy.parts]
         kinds = [2 if term.sampled else 1 if i >= N_SHELL_TERMS else 0 for i, term in enumerate(terms)]
         members = [[i for i, kind in enumerate(kinds) if kind == level] for level in range(3)]
@@ -49,10 +58,10 @@ class JointSpace(nn.Module):
         for numbers in self.members:
             sampled = terms[numbers[0]].sampled
             energy = Energy(fine.mesh if sampled else mesh, [terms[i] for i in numbers], sampled)
-            columns = basis.fine[:, energy.vertices] if sampled else basis.coarse
+            columns = self.basis[:, energy.vertices] if sampled else self.coarse_basis
             parts.append(backend.modal_energy(energy, mesh, columns))
         self.parts: Any = nn.ModuleList(parts)
-        self.coarse, self.basis, self.anchor = coarse, basis, anchor
+        self.coarse, self.anchor = coarse, anchor
         #: Steps of the minimisation.
         self.quasi_newton = backend.quasi_newton
         self.__dict__["fine"] = fine  # not registered here: it belongs to the solver
@@ -67,35 +76,27 @@ class JointSpace(nn.Module):
             mu: Not used.
             soften: True for less bending stiffness at needles of the base.
         """
-        restrict = self.coarse.restrict
-        bases, shapes = self._on_meshes(base, restrict(base)), self._on_meshes(rests.shapes, restrict(rests.shapes))
-        placed = []
-        for part, members, part_base, seen in zip(self.parts, self.members, bases, shapes, strict=True):
+        coarse, placed = self.coarse, []
+        on_coarse, on_fine = (coarse.restrict(base), coarse.restrict(rests.shapes)), (base, rests.shapes)
+        for part, members in zip(self.parts, self.members, strict=True):
+            energy, stiffness = part.energy, [rests.stiffness[i] for i in members]
+            if energy.sampled:
+                part_base, shapes = (x[..., energy.vertices, :] for x in on_fine)
+            else:
+                part_base, shapes = on_coarse
+                pairs = zip(stiffness, (self.fine.energy.parts[i] for i in members), energy.parts, strict=True)
+                stiffness = [coarse_values(*pair, coarse.clusters, coarse.n_vertices) for pair in pairs]
             anchors = rests.anchors
             if anchors is not None:
                 each = anchors.split(self.n_anchors, 1)
                 anchors = torch.cat([each[i] for i in members], 1)
-            stiffness = self._stiffness(part.energy, members, rests.stiffness)
-            reference = part.reference(RestShapes(seen, rests.weights, stiffness), part_base if soften else None)
+            reference = part.reference(RestShapes(shapes, rests.weights, stiffness), part_base if soften else None)
             placed.append(part.place(part_base, reference, anchors))
         return placed
 
     def lift(self, a: Tensor, base: Tensor) -> Tensor:
         """The fine shape of amplitudes. *Shape:* ``(B, n), (B, V, 3) -> (B, V, 3)``."""
-        return self.basis.displace(base, a)
-
-    def _on_meshes(self, x: Tensor, coarse: Tensor) -> list[Tensor]:
-        """Fine and coarse shapes as each energy sees them. *Shape:* ``(..., V, 3)``."""
-        return [x[..., part.energy.vertices, :] if part.energy.sampled else coarse for part in self.parts]
-
-    def _stiffness(self, energy: Energy, members: Sequence[int], values: Sequence[Tensor]) -> list[Tensor]:
-        """Stiffnesses of fine elements on the elements of a part. *Shape of each:* ``(B, M)``, ``(B, 1)``."""
-        stiffness = [values[i] for i in members]
-        if energy.sampled:
-            return stiffness
-        fine, coarse = self.fine.energy.parts, self.coarse
-        parts = zip(stiffness, members, energy.parts, strict=True)
-        return [coarse_values(value, fine[i], part, coarse.clusters, coarse.n_vertices) for value, i, part in parts]
+        return torch.addmm(base.flatten(1), a, self.basis.flatten(1)).view_as(base)
 
     # ------------------------------------------------------------------------------------ the energy in the amplitudes
     @property

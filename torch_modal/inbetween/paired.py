@@ -44,7 +44,7 @@ class PairedSpace(nn.Module):
     def __init__(self, first: JointSpace, second: JointSpace) -> None:
         super().__init__()
         self.first, self.second = first, second
-        gap = torch.cat([first.basis.coarse, -second.basis.coarse]).flatten(1)
+        gap = torch.cat([first.coarse_basis, -second.coarse_basis]).flatten(1)
         self.register_buffer("gap", gap, persistent=False)
         self.register_buffer("gap_gram", gap @ gap.mT, persistent=False)
 

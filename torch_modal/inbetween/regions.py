@@ -59,7 +59,7 @@ def fitting_error(space: PairedSpace, references: Tensor) -> FloatArray:
     coarse, squares = space.first.coarse, []
     first, second = coarse.restrict(references)
     for end, way in ((space.first, second - first), (space.second, first - second)):
-        basis = end.basis.coarse.flatten(1)  # orthonormal under the weights
+        basis = end.coarse_basis.flatten(1)  # orthonormal under the weights
         reached = (basis @ (coarse.weights[:, None] * way).flatten()) @ basis
         squares.append((way - reached.view_as(way)).square().sum(1))
     return (squares[0] + squares[1]).sqrt().numpy()
@@ -83,10 +83,10 @@ def segments(space: PairedSpace, references: Tensor, n_segments: int = N_SEGMENT
     area, mesh = coarse.weights.numpy(), coarse.mesh
     sums = []
     for end, x in zip((space.first, space.second), coarse.restrict(references), strict=True):
-        stiffness = stretching_hessian(mesh, x, end.basis.coarse)
+        stiffness = stretching_hessian(mesh, x, end.coarse_basis)
         level = BENDING_RIDGE * stiffness.diagonal().mean() * torch.eye(len(stiffness)).to(stiffness)
         lower = torch.linalg.cholesky(stiffness + level)
-        modes = torch.linalg.solve_triangular(lower, end.basis.coarse.flatten(1), upper=False)
+        modes = torch.linalg.solve_triangular(lower, end.coarse_basis.flatten(1), upper=False)
         sums.append(_moments(x.numpy(), modes.unflatten(1, (-1, 3)).numpy(), area))
     normal, right, whole = (np.stack(each, 1) for each in zip(*sums, strict=True))
 

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from torch_modal.geometry.rigid import infinitesimal_motions
 from torch_modal.inbetween.alignment import KeyframeAlignment
@@ -13,32 +13,9 @@ from torch_modal.inbetween.coarse import CoarseMesh
 DEPENDENT = 1e-9
 
 
-class SubspaceBasis(nn.Module):
-    """Directions that amplitudes belong to, on the fine and on the coarse mesh.
-
-    Args:
-        fine: *Shape:* ``(n, V, 3)``.
-        coarse: Orthonormal under the weights of the coarse vertices. *Shape:* ``(n, V_coarse, 3)``.
-    """
-
-    fine: Tensor
-    coarse: Tensor
-
-    def __init__(self, fine: Tensor, coarse: Tensor) -> None:
-        super().__init__()
-        self.register_buffer("fine", fine, persistent=False)
-        self.register_buffer("coarse", coarse, persistent=False)
-
-    def __len__(self) -> int:
-        """Number of directions, n."""
-        return len(self.fine)
-
-    def displace(self, x: Tensor, a: Tensor) -> Tensor:
-        """Fine shapes displaced by amplitudes. *Shape:* ``(B, V, 3), (B, n) -> (B, V, 3)``."""
-        return torch.addmm(x.flatten(1), a, self.fine.flatten(1)).view_as(x)
-
-
-def elastic_subspace(modes: Sequence[Tensor], alignment: KeyframeAlignment, coarse: CoarseMesh) -> SubspaceBasis:
+def elastic_subspace(
+    modes: Sequence[Tensor], alignment: KeyframeAlignment, coarse: CoarseMesh
+) -> tuple[Tensor, Tensor]:
     """Independent combinations of modes, without rigid motions, orthonormal on the coarse mesh.
 
     The energy does not see translations, and rotations only to second order: left in, they are null directions of its
@@ -50,7 +27,8 @@ def elastic_subspace(modes: Sequence[Tensor], alignment: KeyframeAlignment, coar
         coarse: The coarse mesh.
 
     Returns:
-        No more directions than two of the bases have modes: of more bases, what most of them have in common.
+        The directions on the fine and on the coarse mesh, *shape* ``(n, V, 3), (n, V_coarse, 3)``: no more than two of
+        the bases have modes; of more bases, what most of them have in common.
     """
     most = sum(sorted(len(each) for each in modes)[-2:])
     fine = torch.cat([infinitesimal_motions(alignment.references.mean(0)), *modes])
@@ -61,7 +39,7 @@ def elastic_subspace(modes: Sequence[Tensor], alignment: KeyframeAlignment, coar
     elastic = others - _combine(parts, rigid)
     sizes = elastic.flatten(1).norm(dim=1)[:, None].clamp_min(torch.finfo(elastic.dtype).tiny)
     mix = _orthonormalise(elastic / sizes[:, None], coarse.weights, most) / sizes.T
-    return SubspaceBasis(_combine(torch.cat([-mix @ parts @ to_rigid, mix], 1), fine), _combine(mix, elastic))
+    return _combine(torch.cat([-mix @ parts @ to_rigid, mix], 1), fine), _combine(mix, elastic)
 
 
 def _combine(mix: Tensor, fields: Tensor) -> Tensor:
