@@ -20,8 +20,8 @@ MOVE_RIDGE = 1e-6
 # A step that is smaller than this leads to the minimum: the next would be its square.
 SMALL_STEP = 1e-8 * CANONICAL_SIZE
 
-# Armijo's constant, and the part of a step that is the shortest.
-DECREASE, SHORTEST = 1e-4, 1e-6
+# Armijo's constant, and the parts of a step that are tried.
+DECREASE, LENGTHS = 1e-4, [0.5**k for k in range(20)]
 
 # Iterations of conjugate gradients at most; their residuals of a step, and of a gradient. With factors of all but the
 # volume, which is of low rank, two to five are enough.
@@ -67,11 +67,6 @@ class FreeVertices(nn.Module):
         gradient = self.energy.fold(at.gradient()).movedim(0, -1)[:, self.free].flatten(1)
         return at.value + 0.5 * (ridge * a * a).sum(-1), gradient + ridge * a
 
-    def value(self, a: Tensor, placement: Placement) -> Tensor:
-        """Energy at ``a``. *Shape:* ``(B, 3 n) -> (B,)``."""
-        rows = self.energy.extend(self.shapes(a, placement[0]).movedim(-1, 0))
-        return self.energy.value(rows, placement[1]) + 0.5 * (self._ridge(placement) * a * a).sum(-1)
-
     def _linearise(self, a: Tensor, placement: Placement) -> EnergyAt:
         rows = self.shapes(a, placement[0]).movedim(-1, 0).contiguous()
         return EnergyAt(self.energy, self.energy.extend(rows), placement[1])
@@ -91,29 +86,27 @@ class FreeVertices(nn.Module):
         each = [self._descend(a[i : i + 1], trees.rows(placement, slice(i, i + 1)), max_steps) for i in range(len(a))]
         if not each:
             return Solution(a, a.sum(-1), a.sum(-1), *(torch.zeros(0, dtype=torch.int64, device=a.device),) * 2)
-        amplitudes, energies, norms, n_steps, status = zip(*each, strict=True)
-        counts = (torch.tensor(values, device=a.device) for values in (n_steps, status))
-        return Solution(torch.cat(amplitudes), torch.cat(energies), torch.cat(norms), *counts)
+        return trees.join(each)  # type: ignore[no-any-return]
 
-    def _descend(self, a: Tensor, placement: Placement, max_steps: int) -> tuple[Tensor, Tensor, Tensor, int, Status]:
-        (value, gradient), status, n_steps = self.value_and_gradient(a, placement), Status.OUT_OF_STEPS, 0
-        first = gradient.norm(dim=-1).clamp_min(torch.finfo(a.dtype).tiny)
-        if not first.isfinite():
-            return a, value, first, 0, Status.INVALID
-        while n_steps < max_steps:
+    def _descend(self, a: Tensor, placement: Placement, max_steps: int) -> Solution:
+        value, gradient = self.value_and_gradient(a, placement)
+        first, n_steps = gradient.norm(dim=-1).clamp_min(torch.finfo(a.dtype).tiny), 0
+        status = Status.OUT_OF_STEPS if first.isfinite() else Status.INVALID
+        while status == Status.OUT_OF_STEPS and n_steps < max_steps:
             step = self._solver(a, placement, RESIDUAL_OF_STEP)(-gradient)
             if bool(step.abs().max() <= SMALL_STEP):  # energies do not resolve it
                 a, status = a + step, Status.CONVERGED
                 break
-            slope, length = (gradient * step).sum(), 1.0
-            slack = energy_rounding(a.dtype) * value.abs()
-            while not (there := self.value(a + length * step, placement)) <= value + DECREASE * length * slope + slack:
-                length *= 0.5
-                if not length > SHORTEST:
-                    return a, value, gradient.norm(dim=-1) / first, n_steps, Status.STALLED
-            a, value, n_steps = a + length * step, there, n_steps + 1
-            gradient = self.value_and_gradient(a, placement)[1]
-        return a, value, gradient.norm(dim=-1) / first, n_steps, status
+            slope, bound = (gradient * step).sum(), value + energy_rounding(a.dtype) * value.abs()
+            for length in LENGTHS:
+                there, gradient_there = self.value_and_gradient(a + length * step, placement)
+                if there <= bound + DECREASE * length * slope:
+                    a, value, gradient, n_steps = a + length * step, there, gradient_there, n_steps + 1
+                    break
+            else:
+                status = Status.STALLED
+        counts = (torch.tensor([number], device=a.device) for number in (n_steps, status))
+        return Solution(a, value, gradient.norm(dim=-1) / first, *counts)
 
     # -------------------------------------------------------------------------------------------- the Hessian's inverse
     def inverse(self, a: Tensor, placement: Placement, converged: Tensor) -> Solve:
@@ -164,16 +157,17 @@ class FreeVertices(nn.Module):
             precondition = self._factors(at, placement, False)
         except (ValueError, RuntimeError):  # the latter where it is singular
             precondition = self._factors(at, placement, True)
-
-        def product(field: Tensor) -> Tensor:
-            with torch.enable_grad():
-                leaf = a.detach().requires_grad_()
-                return torch.autograd.grad(self.value_and_gradient(leaf, placement)[1], leaf, field)[0]
-
-        def dot(a: Tensor, b: Tensor) -> Tensor:
-            return (a * b).sum()
-
-        return lambda right: conjugate_gradients(product, precondition, dot, right, MOST_ITERATIONS, tolerance)
+        with torch.enable_grad():
+            leaf = a.detach().requires_grad_()
+            slope = self.value_and_gradient(leaf, placement)[1]
+        return lambda right: conjugate_gradients(
+            lambda field: torch.autograd.grad(slope, leaf, field, retain_graph=True)[0],
+            precondition,
+            lambda a, b: (a * b).sum(),
+            right,
+            MOST_ITERATIONS,
+            tolerance,
+        )
 
     def _factors(self, at: EnergyAt, placement: Placement, convex: bool) -> Solve:
         """The inverse of the Hessian of all but totals, or of its part that is never negative.
