@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from torch_modal.autograd import outside_inference_mode
 from torch_modal.elastic.term import Mesh, Term
 from torch_modal.geometry.vectors import pick
 
@@ -69,14 +68,6 @@ class Linearised(NamedTuple):
     """Second derivative, or a bound that is never negative. *Shape:* ``(B, M)``."""
     beyond: Tensor | None
     """The second derivative beyond that, if any. *Shape:* ``(B, M)``."""
-
-
-def _outlasting_buffers(module: nn.Module) -> None:
-    """Replace buffers that are inference tensors: terms may have been made in inference mode."""
-    for child in module.modules():
-        for name, buffer in child.named_buffers(recurse=False):
-            if buffer.is_inference():
-                setattr(child, name, outside_inference_mode(buffer.clone)())
 
 
 def edge_vectors_of(rows: Tensor, corners: Tensor) -> Tensor:
@@ -180,7 +171,6 @@ class Energy(nn.Module):
         n, elements = mesh.n_vertices, []
         n_anchors = [0 if term.anchors is None else len(term.anchors) for term in terms]
         for term, more in zip(terms, n_anchors, strict=True):
-            _outlasting_buffers(term)
             corners, last = term.elements(mesh), n + more
             lowest, highest = (float(corners.min()), float(corners.max())) if corners.numel() else (0, last)
             rows = corners.dim() == 2 and corners.shape[1] >= 2 and not corners.is_floating_point()

@@ -44,15 +44,11 @@ class GaussNewtonStep(nn.Module):
 
     Args:
         energy: The energy of the amplitudes.
-        damping: Ridge on the Hessian, relative to its mean diagonal. The line search does the globalisation; the
-            ridge only keeps directions that do nothing (coincident key-frames) from breaking the factorisation.
-            Default: 1e-12 in float64, 1e-6 in float32.
     """
 
-    def __init__(self, energy: Any, damping: float | None = None) -> None:
+    def __init__(self, energy: Any) -> None:
         super().__init__()
         self.energy = energy
-        self.damping = damping
 
     @disable_compile
     @full_precision
@@ -72,7 +68,7 @@ class GaussNewtonStep(nn.Module):
                 "sample, pass a[None] and place start[None]"
             )
         derivatives = self.energy.derivatives(a, placement)
-        directions = _directions(derivatives, self.damping)
+        directions = _directions(derivatives)
         steps = torch.cat([length * directions for length in STEP_LENGTHS])
         usable = steps.isfinite().all(-1)
         candidates = a + torch.where(usable[..., None], steps, 0)
@@ -87,13 +83,12 @@ class GaussNewtonStep(nn.Module):
         return Step(reached, energy, derivatives.gradient.norm(dim=-1), moved)
 
 
-def _directions(derivatives: Derivatives, damping: float | None) -> Tensor:
+def _directions(derivatives: Derivatives) -> Tensor:
     """Directions ``-H^-1 g`` of Gauss-Newton and of the full Hessian; NaN where it is not positive definite.
 
     *Shape:* ``(2, B, n)``.
     """
-    hessians = torch.stack([derivatives.gauss_newton, derivatives.hessian])
-    hessians = add_ridge(hessians, damping)
+    hessians = add_ridge(torch.stack([derivatives.gauss_newton, derivatives.hessian]))
     factor, info = torch.linalg.cholesky_ex(hessians)
     definite = info == 0
     if torch.is_grad_enabled():

@@ -214,10 +214,11 @@ def bfgs_update(state: State, value: Tensor, slope: Tensor) -> State:
     )
 
 
-def add_ridge(hessian: Tensor, damping: float | None = None) -> Tensor:
-    """A Hessian with a ridge relative to its mean diagonal. *Shape:* ``(..., n, n)``."""
-    if damping is None:
-        damping = 1e-12 if hessian.dtype == torch.float64 else 1e-6
+def add_ridge(hessian: Tensor) -> Tensor:
+    """A Hessian with a ridge relative to its mean diagonal, for directions without stiffness. *Shape:* ``(..., n, n)``.
+
+    Such are those of coincident key-frames, which would break the factorisation.
+    """
     size = hessian.diagonal(dim1=-2, dim2=-1).mean(-1)
-    ridge = damping * size.abs() + torch.finfo(size.dtype).tiny
+    ridge = (1e-12 if hessian.dtype == torch.float64 else 1e-6) * size.abs() + torch.finfo(size.dtype).tiny
     return hessian + torch.diag_embed(ridge[..., None].expand(hessian.shape[:-1]))

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor, nn
 from torch.func import jacrev, vmap
 
+from torch_modal.autograd import as_normal_tensor, outside_inference_mode
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.vectors import inverse
 
@@ -139,7 +140,7 @@ class Term(nn.Module):
     def __init__(self, stiffness: float | Tensor = 1.0) -> None:
         super().__init__()
         if isinstance(stiffness, Tensor) and not isinstance(stiffness, nn.Parameter):
-            self.register_buffer("stiffness", stiffness)
+            self.register_buffer("stiffness", outside_inference_mode(as_normal_tensor)(stiffness))
         else:
             self.stiffness = stiffness
 

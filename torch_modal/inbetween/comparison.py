@@ -46,8 +46,6 @@ def blend_towards_starts(
         The shapes, and the solution with ratios of distortions and weights of the starts, in which shapes that a start
         has replaced are marked.
     """
-    if not len(x):
-        return x, solution._replace(distortion_ratio=solution.energy, start_weights=x.new_zeros(0, len(starts)))
     shapes = [x, *starts]
     with torch.no_grad():
         distortions = distortion(shapes, rests)

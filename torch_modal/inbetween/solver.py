@@ -1,7 +1,6 @@
 """The in-between of K key-frames with weights, top to bottom; all layers use it."""
 
 from collections.abc import Sequence
-from functools import partial
 from typing import Any
 
 import torch
@@ -12,7 +11,7 @@ from torch_modal.elastic.backend import TorchBackend, choose
 from torch_modal.elastic.energy import Energy, RestShapes
 from torch_modal.elastic.gauss_newton import newton
 from torch_modal.elastic.implicit import solve_implicit, solve_unrolled
-from torch_modal.elastic.minimise import Solution, Status
+from torch_modal.elastic.minimise import Solution, Status, minimise
 from torch_modal.elastic.shell import N_SHELL_TERMS
 from torch_modal.elastic.term import Mesh, Term
 from torch_modal.inbetween.alignment import KeyframeAlignment, Pose
@@ -126,12 +125,11 @@ class InBetweenSolver(nn.Module):
         """Amplitudes of least energy in the modal space. *Shape:* of ``mu`` and ``usable`` ``(B,)``."""
         if self.space is None:
             return trivial_solution(base, usable)
-        solve: Any = solve_implicit if self.solver.gradient == "implicit" else solve_unrolled
-        if self.blend is None and solve is solve_implicit:
-            solve = partial(solve_implicit, method=newton)
-        placement = self.space.place(base, rests, mu)
-        limits = self.solver.max_steps, self.solver.tolerance
-        solution = solve(self.space, placement, usable, *limits)
+        arguments = self.space, self.space.place(base, rests, mu), usable, self.solver.max_steps, self.solver.tolerance
+        if self.solver.gradient == "unroll":
+            solution = solve_unrolled(*arguments)
+        else:
+            solution = solve_implicit(*arguments, newton if self.blend is None else minimise)
         # Kernels compute in float64, whatever goes in and comes out.
         values = (value.to(base) if value.is_floating_point() else value for value in solution if value is not None)
         return Solution(*values)
