@@ -64,8 +64,7 @@ class ReducedPair:
         """The fine shape of a coarse one at a time. *Shape:* ``(V_coarse, 3) -> (V, 3)``."""
         wanted = [self._turned(coarse, shape, end) for end, coarse in zip(self.fine, self.coarse, strict=True)]
         first, second = (torch.lerp(a, b, t).T[:, None].contiguous() for a, b in zip(*wanted, strict=True))
-        rest = torch.lerp(*self.fine, t).T[:, None].contiguous()
-        found = self.reconstruction((first, second), rest)[:, 0].T
+        found = self.reconstruction((first, second), torch.lerp(*self.fine, t)[None])[0]
         return found + (shape - found[self.chosen]).mean(0)
 
     def _turned(self, coarse: Tensor, shape: Tensor, end: Tensor) -> tuple[Tensor, Tensor]:

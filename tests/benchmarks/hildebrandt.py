@@ -67,7 +67,7 @@ class WarpedModes:
         turn, _ = bend(displaced, self.own)
         pairs = zip(self.sides, displaced, strict=True)
         first, second = (rotate_by(turn, rest + u - cross(turn, rest.expand_as(u))) for rest, u in pairs)
-        return self.reconstruction((first, second), moved + self.basis.reference.T[:, None]).movedim(0, -1)
+        return self.reconstruction((first, second), moved.movedim(0, -1) + self.basis.reference)
 
 
 class LeastForce:

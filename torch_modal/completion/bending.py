@@ -50,8 +50,7 @@ class ModalBending:
     def shape(self, base: Tensor, pose: ModalPose) -> Tensor:
         """The deformed shape. *Shape:* ``(V, 3)``."""
         bending = torch.einsum("k,kcf->cf", pose.amplitudes, self.columns)
-        rest = base.T[:, None].contiguous()
-        return self.reconstruction(self._sides(base, bending), rest)[:, 0].T @ pose.rotation.mT + pose.move
+        return self.reconstruction(self._sides(base, bending), base[None])[0] @ pose.rotation.mT + pose.move
 
     def linearise(self, base: Tensor, pose: ModalPose, rigid: bool = False) -> tuple[Tensor, Tensor]:
         """The deformed shape, and its derivatives in amplitudes, a move and a turn about its centroid.

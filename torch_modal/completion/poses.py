@@ -15,7 +15,6 @@ from torch_modal.completion.frames import CompletionProblem
 from torch_modal.completion.pairs import Pairs
 from torch_modal.completion.search import PoseSearch
 from torch_modal.geometry.rigid import best_fit
-from torch_modal.geometry.triangle_frames import frames_of, mirror_sides
 from torch_modal.modes.coarsening import coarsen
 from torch_modal.modes.extract import extract_bases
 from torch_modal.motion.decoder import scale_modes
@@ -128,17 +127,9 @@ class FramePoses:
                     other = path(shapes, float(np.clip(t + shift * gap, times[0], times[-1])))
                     bases.append(best_fit(other, bases[0]).apply(other))
             else:
-                bases.append(self._beyond(shapes[nearest[1]], shapes[nearest[0]]))
+                last, before = shapes[nearest[:2], None]
+                bases.append(self.bending.reconstruction.extrapolate(last, before)[0])
         return [(x, self.bending.still()) for x in bases]
-
-    def _beyond(self, before: Tensor, last: Tensor) -> Tensor:
-        """The shape as far after the last one as that is after the one before."""
-        motion = best_fit(before, last)
-        sides = mirror_sides(frames_of(last[None], self.faces), frames_of(motion.apply(before)[None], self.faces))
-        x = self.bending.reconstruction(sides, last.T[:, None].contiguous())[:, 0].T
-        x = best_fit(x, last).apply(x)
-        middle = last.mean(0)
-        return (x - middle) @ motion.rotation.mT + 2 * middle - before.mean(0)
 
     def _search(self, i: int, starts: Sequence[tuple[Tensor, ModalPose]]) -> ModalFit:
         """A frame by modes."""

@@ -107,5 +107,5 @@ def deform(x: Tensor, displacement: Tensor, keyframe: Tensor, reconstruction: Re
     pose = best_fit(keyframe.expand_as(x), x, weights).rotation
     turn = (pose @ turn.movedim(0, 1)).movedim(0, 1)
     wanted = bend_sides(turn, strain, frames_of(x, faces))
-    bent = reconstruction(wanted, x.movedim(-1, 0).contiguous()).movedim(0, -1)
+    bent = reconstruction(wanted, x)
     return best_fit(bent, x, weights).apply(bent)

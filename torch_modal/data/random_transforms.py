@@ -11,10 +11,8 @@ from torch.nn.functional import normalize
 from torch_modal.data.augmentation import Parameters, ShapeAugmentation, check_range, draw_normal, draw_uniform
 from torch_modal.data.shape_batch import ShapeBatch
 from torch_modal.data.space import ShapeSpace
-from torch_modal.geometry.poisson import Reconstruction
 from torch_modal.geometry.rigid import RigidMotion, best_fit
 from torch_modal.geometry.rotations import exp
-from torch_modal.geometry.triangle_frames import frames, mirror_sides, sides
 from torch_modal.statistics.variation import check_density
 
 
@@ -120,20 +118,7 @@ class RandomExtrapolation(RandomInBetween):
         after = t > 0.5
         before_end = super().shapes(batch, partners, torch.where(after, 2 - t, -t), space)
         ends = torch.where(after[:, None, None], partners.shapes, batch.shapes)
-        return extrapolate(ends, before_end, space.reconstruction(ends.device))
-
-
-def extrapolate(centre: Tensor, other: Tensor, reconstruction: Reconstruction) -> Tensor:
-    """Extrapolate from ``other`` through ``centre`` by the same step, its rigid motion included.
-
-    *Shape:* ``(B, V, 3), (B, V, 3) -> (B, V, 3)``.
-    """
-    weights, faces = reconstruction.areas.to(centre), reconstruction.faces
-    motion = best_fit(centre, other, weights)
-    last, aligned = (y.movedim(-1, 0).contiguous() for y in (centre, motion.inverse().apply(other)))
-    wanted = mirror_sides(frames(sides(last, faces)), frames(sides(aligned, faces)))
-    beyond = reconstruction(wanted, last).movedim(0, -1)
-    return RigidMotion(motion.rotation.mT, motion.source, 2 * motion.source - motion.target).apply(beyond)
+        return space.reconstruction(ends.device).extrapolate(ends, before_end)
 
 
 class RandomBlend(ShapeAugmentation):

@@ -11,9 +11,9 @@ from torch import Tensor, nn
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.autograd import Recent, is_eager
 from torch_modal.geometry.connectivity import Connectivity, half_cotangents, label_pieces, vertex_areas
-from torch_modal.geometry.rigid import best_fit
+from torch_modal.geometry.rigid import RigidMotion, best_fit
 from torch_modal.geometry.sparse import SparseSolver, graph_laplacian, solve_by
-from torch_modal.geometry.triangle_frames import Sides, edge_means
+from torch_modal.geometry.triangle_frames import Sides, edge_means, frames_of, mirror_sides
 
 # Bounds of cotangent weights, for slivers. Positive weights make the matrix positive definite.
 _WEIGHT_RANGE = (0.02, 20.0)
@@ -177,16 +177,27 @@ class Reconstruction(nn.Module):
         edges = edge_means(wanted, self.weights.to(near), self.sides, self.signs.to(near), len(self.edges))
         return self.poisson(self.poisson.right_hand_side(edges), near)
 
+    def follow(self, before: Tensor, after: Tensor) -> list[RigidMotion]:
+        """Motion of the vertices that each loose piece follows, between shapes. *Shape:* ``(B, V, 3), (B, V, 3)``."""
+        return [best_fit(before[:, anchors], after[:, anchors]) for _, anchors in self.loose]
+
     def forward(self, wanted: Sides, rest: Tensor) -> Tensor:
         """The shape of target sides with the centroid of ``rest``. Unreferenced vertices do not move.
 
-        The initial shape, ``rest``, determines the positions of loose pieces. *Shape:* ``(3, B, V) -> (3, B, V)``.
+        The initial shape, ``rest``, determines the positions of loose pieces. *Shape:* ``(B, V, 3) -> (B, V, 3)``.
         """
-        out = placed = self.fit(wanted, rest.movedim(0, -1)).movedim(-1, 0)
-        for piece, anchors in self.loose:
-            before, after = (x[..., anchors].movedim(0, -1) for x in (rest, placed))
-            motion = best_fit(before, after)
-            centre = (rest[..., piece] * self.poisson.shares.to(rest)[piece]).sum(-1).T[:, None]
-            moved = placed[..., piece] + (motion.apply(centre) - centre).movedim(-1, 0)
-            out = out.index_copy(-1, piece.to(out.device), moved)
+        out = placed = self.fit(wanted, rest)
+        for (piece, _), motion in zip(self.loose, self.follow(rest, placed), strict=True):
+            centre = self.poisson.shares.to(rest)[None, piece] @ rest[:, piece]
+            out = out.index_copy(1, piece.to(out.device), placed[:, piece] + motion.apply(centre) - centre)
         return out
+
+    def extrapolate(self, centre: Tensor, other: Tensor) -> Tensor:
+        """The shapes as far beyond ``centre`` as ``other`` is before it, rigid motions included.
+
+        *Shape:* ``(B, V, 3), (B, V, 3) -> (B, V, 3)``.
+        """
+        motion = best_fit(other, centre, self.areas.to(centre))
+        aligned = motion.apply(other)
+        beyond = self(mirror_sides(frames_of(centre, self.faces), frames_of(aligned, self.faces)), centre)
+        return motion._replace(source=motion.target, target=2 * motion.target - motion.source).apply(beyond)

@@ -7,7 +7,7 @@ from torch_modal.geometry.canonical import size
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.local_rotations import LocalRotations
 from torch_modal.geometry.poisson import Reconstruction
-from torch_modal.geometry.rigid import RigidMotion, best_fit
+from torch_modal.geometry.rigid import best_fit
 from torch_modal.geometry.triangle_frames import Sides, bend_sides, bending_between, frames_of
 
 # Only triangles without area have logarithmic strains beyond this, a factor of 3,000.
@@ -67,19 +67,11 @@ class BendingCoordinates:
             columns.append(torch.cat([torch.where(flat, 0, turn), strain]))
         on_faces = torch.stack(columns) if columns else placed.new_zeros(0, 6, len(self.faces))
         offsets = placed.new_zeros(len(placed), 6, len(self.centres))
-        for i, (row, (centre, motion)) in enumerate(zip(self.centres, self._follow_anchors(placed), strict=True)):
-            offset = (torch.einsum("v,bvi->bi", row, placed)[:, None] - centre) @ motion.rotation
+        rest = self.mean.expand_as(placed)
+        for i, motion in enumerate(self.reconstruction.follow(rest, placed)):
+            offset = self.centres[i, None] @ (placed - motion.apply(rest)) @ motion.rotation
             offsets[:, :3, i] = offset[:, 0] / self.size
         return torch.cat([on_faces, offsets], 2)
-
-    def _follow_anchors(self, shapes: Tensor) -> list[tuple[Tensor, RigidMotion]]:
-        """Centre and motion of each loose piece, by the vertices that it follows. *Shape:* ``(B, V, 3)``."""
-        motions = []
-        for row, (_, anchors) in zip(self.centres, self.reconstruction.loose, strict=True):
-            before = self.mean[anchors].expand(len(shapes), -1, -1)
-            motion = best_fit(before, shapes[:, anchors])
-            motions.append((motion.apply((row @ self.mean).expand(len(shapes), 1, -1)), motion))
-        return motions
 
     def spread(self, fields: Tensor) -> Tensor:
         """Means of fields on the vertices, for each column. *Shape:* ``(..., V) -> (..., E)``."""
@@ -96,11 +88,10 @@ class BendingCoordinates:
 
     def shapes(self, coordinates: Tensor) -> Tensor:
         """The shapes of coordinates, in the pose of the mean. *Shape:* ``(B, 6, E) -> (B, V, 3)``."""
-        rest = self.mean.mT[:, None].expand(-1, len(coordinates), -1).contiguous()
-        shapes = self.reconstruction(self.sides(coordinates), rest).movedim(0, -1)
+        rest = self.mean.expand(len(coordinates), -1, -1)
+        shapes = self.reconstruction(self.sides(coordinates), rest)
         moves = (self.size * coordinates[:, :3, len(self.faces) :]).unbind(2)
-        for (piece, _), (_, motion), move in zip(
-            self.reconstruction.loose, self._follow_anchors(shapes), moves, strict=True
-        ):
+        motions = self.reconstruction.follow(rest, shapes)
+        for (piece, _), motion, move in zip(self.reconstruction.loose, motions, moves, strict=True):
             shapes = shapes.index_add(1, piece, (motion.rotation @ move[..., None]).mT.expand(-1, len(piece), -1))
         return self.align(shapes)

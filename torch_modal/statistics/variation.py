@@ -20,7 +20,7 @@ from torch_modal.geometry.canonical import CANONICAL_SIZE
 from torch_modal.geometry.connectivity import farthest_apart
 from torch_modal.geometry.poisson import Reconstruction
 from torch_modal.geometry.rigid import best_rotation
-from torch_modal.geometry.triangle_frames import frames, sides
+from torch_modal.geometry.triangle_frames import frames_of
 from torch_modal.geometry.vectors import pick
 from torch_modal.statistics.coordinates import BendingCoordinates
 
@@ -158,7 +158,7 @@ class Variation:
 
     def folds(self, x: Tensor) -> int:
         """Number of pairs of neighbouring triangles that lie on each other. *Shape:* ``(V, 3)``."""
-        normals = frames(sides(x.detach().mT[:, None].contiguous(), self.faces)).normal[:, 0]
+        normals = frames_of(x.detach()[None], self.faces).normal[:, 0]
         one, other = torch.tensor(self.coordinates.mesh.face_neighbours).unbind(1)
         return int(((pick(normals, one) * pick(normals, other)).sum(0) < FOLDED).sum())
 
