@@ -17,6 +17,8 @@ EQUAL_MOMENTS = 1e-6
 """Relative difference of principal moments below which axes are undetermined; likewise skewness and signs."""
 GENERIC = np.array([1.0, 0.6180339887, 0.3247179572])
 """A generic direction, which is unlikely to match a symmetry of a shape."""
+PREFERENCE = np.array([3.0, 2.0, 1.0])
+"""Order of the caller's axes, x first, among axes of equal moments."""
 
 
 def size(points: FloatArray, faces: IntArray) -> float:
@@ -102,25 +104,7 @@ def _moments(points: FloatArray, faces: IntArray) -> tuple[FloatArray, FloatArra
 
 
 def _principal_axes(second: FloatArray) -> FloatArray:
-    """Principal axes in rows, by descending moments. *Shape:* ``(3, 3) -> (3, 3)``."""
+    """Principal axes in rows, by descending moments; of equal moments, close to the caller's. *Shape:* ``(3, 3)``."""
     moments, vectors = np.linalg.eigh(second)
-    moments, axes = moments[::-1], vectors.T[::-1].copy()
-    start = 0
-    for end in range(1, 4):
-        if end < 3 and moments[end - 1] - moments[end] < EQUAL_MOMENTS * moments[0]:
-            continue
-        if end - start > 1 or moments[0] <= 0:
-            axes[start:end] = _nearest_axes(axes[start:end])
-        start = end
-    return axes
-
-
-def _nearest_axes(span: FloatArray) -> FloatArray:
-    """Orthonormal basis of the same span, close to the caller's axes. *Shape:* ``(n, 3) -> (n, 3)``."""
-    projector, basis = span.T @ span, []
-    for _ in range(len(span)):
-        # Uneven weights break ties.
-        best = int((np.linalg.norm(projector, axis=0) * [1.0, 0.99, 0.98]).argmax())
-        basis.append(projector[:, best] / np.linalg.norm(projector[:, best]))
-        projector = projector - np.outer(basis[-1], basis[-1] @ projector)
-    return np.array(basis)
+    spans = np.split(vectors.T, np.flatnonzero(np.diff(moments) >= EQUAL_MOMENTS * moments[2]) + 1)
+    return np.concatenate([np.linalg.eigh(span * PREFERENCE @ span.T)[1].T @ span for span in spans])[::-1].copy()

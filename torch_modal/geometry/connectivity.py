@@ -122,13 +122,9 @@ def spanning_forest(n: int, pairs: IntArray, costs: FloatArray) -> tuple[IntArra
     Returns:
         The parent of each node, itself for a root; its connected component. *Shape:* ``(n,)`` each.
     """
-    graph = sparse.coo_matrix((costs, pairs.T), shape=(n, n)).tocsr()
-    if graph.nnz < len(pairs):  # duplicate edges, whose costs were summed: the cheapest counts
-        key = pairs[:, 0] * n + pairs[:, 1]
-        order = np.lexsort((costs, key))
-        order = order[np.flatnonzero(np.diff(key[order], prepend=-1))]
-        graph = sparse.coo_matrix((costs[order], pairs[order].T), shape=(n, n)).tocsr()
-    tree = minimum_spanning_tree(graph).tocoo()
+    order = np.argsort(costs, kind="stable")
+    order = order[np.unique(pairs[order] @ [n, 1], return_index=True)[1]]  # of duplicate edges, the cheapest
+    tree = minimum_spanning_tree(sparse.coo_matrix((costs[order], pairs[order].T), shape=(n, n)).tocsr()).tocoo()
     piece = connected_components(tree, directed=False)[1].astype(np.int64)
     # An extra node above all roots: one traversal visits all trees.
     roots = np.unique(piece, return_index=True)[1]

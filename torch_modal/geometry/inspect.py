@@ -22,13 +22,8 @@ def degenerate_faces(faces: IntArray) -> BoolArray:
 
 def find_repeated_faces(faces: IntArray) -> BoolArray:
     """Faces with the same vertices as an earlier face, in any order. *Shape:* ``(F,)``."""
-    a, b, c = faces.T
-    low, high = np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
-    middle = a + b + c - low - high
-    repeated = np.zeros(len(faces), dtype=bool)
-    corners = np.stack([high, middle, low])
-    order = np.lexsort(corners)  # stable: among equal faces the earliest comes first
-    repeated[order[1:]] = (corners[:, order[1:]] == corners[:, order[:-1]]).all(axis=0)
+    repeated = np.ones(len(faces), dtype=bool)
+    repeated[np.unique(np.sort(faces, axis=1), axis=0, return_index=True)[1]] = False
     return repeated
 
 

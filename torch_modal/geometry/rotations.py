@@ -73,13 +73,7 @@ def quaternion(rotation: Tensor) -> Tensor:
 
 def matrix(q: Tensor) -> Tensor:
     """Rotation matrix of a quaternion of norm one. *Shape:* ``(4, ...) -> (3, 3, ...)``."""
-    w, x, y, z = q
-    rows = (
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    )
-    return torch.stack([torch.stack(row) for row in rows])
+    return rotate(q[:, None], torch.eye(3).to(q).view(3, 3, *[1] * (q.dim() - 1)))
 
 
 def product(p: Tensor, q: Tensor) -> Tensor:

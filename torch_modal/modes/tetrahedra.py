@@ -12,6 +12,8 @@ from torch_modal.modes.surface import CanonicalSurface
 
 EDGES = np.array([(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)])
 """Corners at the ends of the edges of a tetrahedron. *Shape:* ``(6, 2)``."""
+FACES = np.array([(1, 2, 3), (0, 2, 3), (0, 1, 3), (0, 1, 2)])
+"""Corners of the faces of a tetrahedron. *Shape:* ``(4, 3)``."""
 SMALL_AMOUNT = 0.01
 """Largest volume (or area, of a surface) of a small piece, as a fraction of the whole."""
 SMALL_SIZE = 0.1
@@ -130,14 +132,11 @@ def loose_pieces(tetrahedra: Tetrahedra) -> IntArray:
 
 def face_connected_pieces(tets: IntArray) -> IntArray:
     """Face-connected component of each tetrahedron. *Shape:* ``(T, 4) -> (T,)``."""
-    a, b, c, d = np.sort(tets, axis=1).T
-    n = tets.max(initial=0) + 1
+    t, n = len(tets), tets.max(initial=0) + 1
     # Packs three vertices into one integer; safe up to two million vertices.
-    sides = np.concatenate([(p * n + q) * n + r for p, q, r in ((b, c, d), (a, c, d), (a, b, d), (a, b, c))])
-    order = np.argsort(sides)
-    shared = np.diff(sides[order]) == 0
-    owner = order % max(len(tets), 1)
-    return label_pieces(np.stack([owner[:-1][shared], owner[1:][shared]], axis=1), len(tets))
+    sides = np.sort(tets, axis=1)[:, FACES] @ [n * n, n, 1]
+    side = np.unique(sides, return_inverse=True)[1].reshape(-1)
+    return label_pieces(np.stack([np.repeat(np.arange(t), 4), t + side], axis=1), t + sides.size)[:t]
 
 
 def submesh(tetrahedra: Tetrahedra, kept: BoolArray) -> Tetrahedra:
