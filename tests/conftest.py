@@ -15,12 +15,13 @@ import scipy.sparse as sp
 import torch
 import trimesh
 from kornia.geometry.conversions import quaternion_to_rotation_matrix
-from solids import as_it_is, box, eigenmodes, element_hessian, lumped_mass, surface
+from solids import box, eigenmodes, element_hessian, lumped_mass, surface
 from timing import limit_threads
 
 from torch_modal.elastic.backend import WarpBackend
 from torch_modal.elastic.energy import RestShapes
 from torch_modal.elastic.implicit import ConvergenceWarning
+from torch_modal.geometry.surface import Surface
 from torch_modal.inbetween.settings import Objective, Solver
 from torch_modal.inbetween.solver import InBetweenSolver
 from torch_modal.keyframes.check import Keyframes
@@ -66,7 +67,7 @@ def capsule() -> tuple[np.ndarray, np.ndarray]:
 @pytest.fixture(scope="session")
 def capsule_tetrahedra(capsule: tuple[np.ndarray, np.ndarray]) -> Tetrahedra:
     """The capsule filled by the real mesher, once per run: few enough vertices for dense linear algebra."""
-    return COARSE.fill(as_it_is(*capsule), threading.Event())
+    return COARSE.fill(Surface(*capsule), threading.Event())
 
 
 class Shapes(NamedTuple):

@@ -8,7 +8,6 @@ import scipy.sparse as sp
 from torch_modal.modes.eigen import ElasticBody, ElasticModes, lowest_modes
 from torch_modal.modes.embedding import find_neighbours, fit_weights
 from torch_modal.modes.stiffness import hat_gradients, mass_matrix
-from torch_modal.modes.surface import CanonicalSurface
 from torch_modal.modes.tetrahedra import Tetrahedra, solid_volumes
 
 
@@ -66,11 +65,6 @@ def as_mesh(solid: Tetrahedra) -> tuple[np.ndarray, np.ndarray]:
 def eigenmodes(k: sp.csc_matrix, mass: sp.spmatrix, positions: np.ndarray, n_modes: int) -> ElasticModes:
     """Lowest modes of these matrices."""
     return lowest_modes(ElasticBody(positions, k, mass, lambda motions: motions), n_modes)
-
-
-def as_it_is(points: np.ndarray, faces: np.ndarray) -> CanonicalSurface:
-    """The surface in its own coordinates."""
-    return CanonicalSurface(points, faces, np.arange(len(points)), 1.0, np.eye(3))
 
 
 def lumped_mass(solid: Tetrahedra) -> np.ndarray:

@@ -21,7 +21,7 @@ from results import Table, wanted
 
 import torch_modal as tm
 from torch_modal.data.samples import load_sample
-from torch_modal.modes.surface import CanonicalSurface
+from torch_modal.geometry.surface import Surface
 from torch_modal.modes.tetrahedra import Mesher, Tetrahedra
 
 COLUMNS = ["model", "#V", "#N", "#K", "#D", "IT, s", "UT, s", "UT by default, s"]
@@ -80,7 +80,7 @@ class Counted:
         """That of the mesher."""
         return self.mesher.key()
 
-    def fill(self, surface: CanonicalSurface, stop: threading.Event) -> Tetrahedra:
+    def fill(self, surface: Surface, stop: threading.Event) -> Tetrahedra:
         """Tetrahedra of the mesher."""
         found = self.mesher.fill(surface, stop)
         self.counts.append(len(found.vertices))

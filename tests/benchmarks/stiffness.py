@@ -16,6 +16,7 @@ from solids import eigenmodes
 from timing import limit_threads
 
 import torch_modal as tm
+from torch_modal.geometry.surface import Surface
 from torch_modal.modes.extract import MESHERS
 from torch_modal.modes.solid import without_small_pieces
 from torch_modal.modes.stiffness import arap_hessian, mass_matrix
@@ -32,12 +33,12 @@ def bodies() -> Iterator[tuple[str, CanonicalSurface]]:
     from _bipeds import biped
 
     if (fist := keyframes_of("mh-hand-path", "08")) is not None:
-        yield "closed fist alone", CanonicalSurface.of(fist[0][0].numpy(), fist[1].numpy())
+        yield "closed fist alone", CanonicalSurface(fist[0][0].numpy(), fist[1].numpy())
     bird = biped("wader", None)
-    yield "bird on slender legs", CanonicalSurface.of(bird.pose(0.0), bird.faces)
+    yield "bird on slender legs", CanonicalSurface(bird.pose(0.0), bird.faces)
 
 
-def filled(mesher: Mesher, surface: CanonicalSurface) -> Tetrahedra:
+def filled(mesher: Mesher, surface: Surface) -> Tetrahedra:
     """Tetrahedra without small loose pieces, which fTetWild may leave."""
     return without_small_pieces(mesher.fill(surface, threading.Event()))
 

@@ -577,11 +577,11 @@ def test_flat_surface_is_refused_only_where_a_solid_is_needed():
     stray = np.concatenate([grid @ turn.T + 5, [[0, 0, 9]]])  # a vertex of no face gives no thickness
     for flat in (grid, stray, grid * 1e9):
         with pytest.raises(MeshError, match=r"the surface is flat: its extents are .* give it a thickness"):
-            CanonicalSurface.of(flat, faces).require_solid()
+            CanonicalSurface(flat, faces).require_solid()
     with pytest.raises(MeshError, match="on a line: the extents are 1, 0 and 0"):
-        CanonicalSurface.of(grid * [1, 0, 0] + [0, 0, 1], faces)
-    CanonicalSurface.of(CUBE, CUBE_FACES).require_solid()
-    CanonicalSurface.of(grid * 1e-9 + np.array([[0, 0, 1e-12]] + [[0, 0, 0]] * 3), faces).require_solid()
+        CanonicalSurface(grid * [1, 0, 0] + [0, 0, 1], faces)
+    CanonicalSurface(CUBE, CUBE_FACES).require_solid()
+    CanonicalSurface(grid * 1e-9 + np.array([[0, 0, 1e-12]] + [[0, 0, 0]] * 3), faces).require_solid()
 
 
 # ---------------------------------------------------------------- real data and size

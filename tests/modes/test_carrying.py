@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 import torch
 from bodies import bend
-from solids import as_it_is, as_mesh, box, eigenmodes
+from solids import as_mesh, box, eigenmodes
 
+from torch_modal.geometry.surface import Surface
 from torch_modal.modes import carrying
 from torch_modal.modes.carrying import Carrier, nearest_rotations
 from torch_modal.modes.eigen import ModalAnalysisError, lowest_modes
@@ -30,13 +31,13 @@ def bent(points: np.ndarray, angle: float) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def carrier() -> Carrier:
-    bar = as_it_is(POINTS, COMPACT)
-    return Carrier(Solid(bar, BAR, *find_neighbours(POINTS, BAR, bar.normals)))
+    bar = Surface(POINTS, COMPACT)
+    return Carrier(Solid(bar, BAR, *find_neighbours(POINTS, BAR, bar.vertex_normals)))
 
 
 def carried(carrier: Carrier, points: np.ndarray) -> np.ndarray | None:
     """Vertices of the carried tetrahedra."""
-    solid = carrier.carry(as_it_is(points, COMPACT))
+    solid = carrier.carry(Surface(points, COMPACT))
     return None if solid is None else solid.tetrahedra.vertices
 
 
@@ -56,7 +57,7 @@ def test_a_bent_bar_is_filled_as_it_bends(carrier: Carrier) -> None:
 
 def test_modes_of_the_carried_bar_are_those_of_the_bent_one(carrier: Carrier) -> None:
     points = bent(POINTS, np.pi)
-    solid = carrier.carry(as_it_is(points, COMPACT))
+    solid = carrier.carry(Surface(points, COMPACT))
     assert solid is not None
     truth = Tetrahedra(bent(BAR.vertices, np.pi), BAR.tets)
     found = lowest_modes(solid.body("edge"), 8)
@@ -84,7 +85,7 @@ def test_clearances_of_a_plate_and_of_a_gap() -> None:
     """A plate of 8 by 4 by 0.4, and another 0.3 above it: a diagonal of 9."""
     one, faces = as_mesh(box((40, 20, 2), (8.0, 4.0, 0.4)))
     above = one + np.array([0, 0, 0.7])
-    whole = CanonicalSurface.of(np.concatenate([one, above]), np.concatenate([faces, faces + len(one)]))
+    whole = CanonicalSurface(np.concatenate([one, above]), np.concatenate([faces, faces + len(one)]))
     thickness, gap = clearances(whole)
     middle = whole.points[whole.faces].mean(axis=1)
     flat = (np.ptp(whole.points[whole.faces][..., 2], axis=1) == 0) & (np.abs(middle[:, :2]) < [30.0, 12.0]).all(axis=1)
@@ -93,14 +94,14 @@ def test_clearances_of_a_plate_and_of_a_gap() -> None:
     np.testing.assert_allclose(gap[facing], 0.3 * whole.scale, rtol=0.02)
     assert np.isinf(gap[flat & ~facing]).all()
     # Corners of a box are no thin parts.
-    assert np.isinf(clearances(CanonicalSurface.of(*as_mesh(box((20, 20, 20), (1.0, 1.0, 1.0)))))[0]).all()
+    assert np.isinf(clearances(CanonicalSurface(*as_mesh(box((20, 20, 20), (1.0, 1.0, 1.0)))))[0]).all()
 
 
 def test_self_proximity_grows_as_the_ends_meet() -> None:
     """Of a horseshoe."""
     points, faces = as_mesh(box((48, 6, 6), (16.0, 1.0, 1.0)))
     nearly_closed, half, straight = (
-        self_proximity(CanonicalSurface.of(bent(points, angle), faces)) for angle in (1.98 * np.pi, 1.0, 0.0)
+        self_proximity(CanonicalSurface(bent(points, angle), faces)) for angle in (1.98 * np.pi, 1.0, 0.0)
     )
     assert nearly_closed > half
     assert straight == 0
@@ -114,8 +115,8 @@ def meshed(monkeypatch: pytest.MonkeyPatch) -> list[np.ndarray]:
     """A mesher that knows the bar; it keeps the surfaces that it was asked to fill."""
     asked: list[np.ndarray] = []
 
-    def fill(mesher: TetWild, surface: CanonicalSurface, stop: object) -> Tetrahedra:
-        asked.append(surface.points)
+    def fill(mesher: TetWild, surface: Surface, stop: object) -> Tetrahedra:
+        asked.append(surface.vertices)
         low, high = BAR.vertices.min(axis=0), BAR.vertices.max(axis=0)
         return Tetrahedra((BAR.vertices - (low + high) / 2) * (100 / np.linalg.norm(high - low)), BAR.tets)
 

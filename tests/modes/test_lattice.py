@@ -16,6 +16,7 @@ from bodies import body
 from scipy.spatial import cKDTree
 from solids import as_mesh, box, eigenmodes, lumped_mass, surface
 
+from torch_modal.geometry.surface import Surface
 from torch_modal.modes import lattice as lattice_module
 from torch_modal.modes.extract import extract_modes
 from torch_modal.modes.lattice import Lattice, lattice
@@ -33,7 +34,7 @@ Mesh = tuple[np.ndarray, np.ndarray]
 
 @pytest.mark.parametrize("cell", [0.08, 0.04])
 def test_volume_and_place(capsule: Mesh, cell: float) -> None:
-    whole = CanonicalSurface.of(*capsule)
+    whole = CanonicalSurface(*capsule)
     filled = lattice(whole, cell)
     assert (tet_volumes(filled) > 0).all()
     exact = trimesh.Trimesh(whole.points, whole.faces)
@@ -47,7 +48,7 @@ def test_volume_and_place(capsule: Mesh, cell: float) -> None:
 
 
 def test_outer_vertices_lie_on_the_surface(capsule: Mesh) -> None:
-    whole = CanonicalSurface.of(*capsule)
+    whole = CanonicalSurface(*capsule)
     filled = lattice(whole, 0.05)
     outer = filled.vertices[np.unique(surface(filled))]
     corners = whole.points[whole.faces]
@@ -88,7 +89,7 @@ def test_the_same_in_every_process_with_any_threads() -> None:
 def test_thin_plates_are_filled(thickness: float) -> None:
     """By tetrahedra in one piece, all over; their flat sides lie along sides of the lattice's cubes."""
     vertices, faces = as_mesh(box((20, 15, 1), (4.0, 3.0, thickness)))
-    whole = CanonicalSurface.of(vertices, faces)
+    whole = CanonicalSurface(vertices, faces)
     filled = Lattice().fill(whole, threading.Event())
     assert face_connected_pieces(filled.tets).max() == 0
     assert cKDTree(filled.vertices).query(whole.points)[0].max() < 4.0
@@ -100,7 +101,7 @@ def test_thin_plates_are_filled(thickness: float) -> None:
 def test_too_fine_cubes_become_larger(capsule: Mesh) -> None:
     """What fTetWild could still fill, the lattice fills with as many cubes as it may have."""
     ball = trimesh.creation.icosphere(subdivisions=2)
-    whole = CanonicalSurface.of(ball.vertices, ball.faces)
+    whole = CanonicalSurface(ball.vertices, ball.faces)
     filled = lattice(whole, 0.009)
     assert len(filled.tets) < 40 * lattice_module.MOST_CUBES
     assert solid_volumes(filled).sum() == pytest.approx(trimesh.Trimesh(whole.points, whole.faces).volume, rel=0.02)
@@ -108,7 +109,7 @@ def test_too_fine_cubes_become_larger(capsule: Mesh) -> None:
 
 def of_body(name: str) -> CanonicalSurface:
     shape = body(name)
-    return CanonicalSurface.of(shape.pose(0.0), shape.faces)
+    return CanonicalSurface(shape.pose(0.0), shape.faces)
 
 
 @pytest.mark.parametrize("name", ["limb bent 120", "wire bent 120", "rod bent 180"])
@@ -136,7 +137,7 @@ def test_modes_of_a_bar_against_its_own_tetrahedra() -> None:
     """The bar fills its cells by a third only; a lattice that counted cells as full would be far too stiff."""
     solid = box((30, 6, 6), (10.0, 1.0, 1.3))
     vertices, faces = as_mesh(solid)
-    bar = CanonicalSurface.of(vertices @ np.linalg.qr(np.arange(9.0).reshape(3, 3) + np.eye(3))[0], faces)
+    bar = CanonicalSurface(vertices @ np.linalg.qr(np.arange(9.0).reshape(3, 3) + np.eye(3))[0], faces)
     filled = lattice(bar, 0.025)
     found = eigenmodes(arap_hessian(filled), mass_matrix(filled), filled.vertices, 5).eigenvalues
     wanted = eigenmodes(arap_hessian(solid), mass_matrix(solid), solid.vertices, 5).eigenvalues / bar.scale**2
@@ -148,7 +149,7 @@ def test_open_and_half_flipped_surfaces(capsule: Mesh) -> None:
     vertices, faces = capsule
     centers = vertices[faces].mean(axis=1)
     far = centers[:, 2] > np.quantile(centers[:, 2], 0.875)
-    whole, opened = CanonicalSurface.of(vertices, faces), CanonicalSurface.of(vertices, faces[~far])
+    whole, opened = CanonicalSurface(vertices, faces), CanonicalSurface(vertices, faces[~far])
     share = solid_volumes(lattice(opened, 0.05)).sum() / opened.scale**3
     assert share == pytest.approx(solid_volumes(lattice(whole, 0.05)).sum() / whole.scale**3, rel=0.25)
 
@@ -163,8 +164,8 @@ class Cubes:
     def key(self) -> dict[str, Any]:
         return {"mesher": "cubes", "edge": self.edge}
 
-    def fill(self, surface: CanonicalSurface, stop: threading.Event) -> Tetrahedra:
-        self.filled.append(len(surface.points))
+    def fill(self, surface: Surface, stop: threading.Event) -> Tetrahedra:
+        self.filled.append(len(surface.vertices))
         return lattice(surface, self.edge)
 
 

@@ -89,20 +89,20 @@ def test_modes_have_unit_mass() -> None:
 
 def test_rigid_motions_and_strains_are_carried_exactly() -> None:
     sample = load_sample("creature")
-    surface = CanonicalSurface.of(sample.keyframes[0].numpy(), sample.faces.numpy())
+    surface = CanonicalSurface(sample.keyframes[0].numpy(), sample.faces.numpy())
     sheet = sheet_body(surface, 30)
-    assert len(sheet.points) < 0.6 * len(surface.points)
+    assert len(sheet.points) < 0.6 * len(surface.vertices)
     rng = np.random.default_rng(0)
     turn, shift = rng.normal(size=(3, 3)), rng.normal(size=3)
     turn = turn - turn.T
     coarse = (sheet.points @ turn.T + shift)[..., None]
-    np.testing.assert_allclose(sheet.to_surface(coarse)[..., 0], surface.points @ turn.T + shift, atol=1e-9)
-    surface = CanonicalSurface.of(*strip(spacing=0.035))
+    np.testing.assert_allclose(sheet.to_surface(coarse)[..., 0], surface.vertices @ turn.T + shift, atol=1e-9)
+    surface = CanonicalSurface(*strip(spacing=0.035))
     flat = sheet_body(surface, 30)
     plane = np.diag([0.3, -0.1, 0.0])  # the normal turns with the faces, and has no strain of its own
-    assert len(flat.points) < 0.6 * len(surface.points)
+    assert len(flat.points) < 0.6 * len(surface.vertices)
     np.testing.assert_allclose(
-        flat.to_surface((flat.points @ plane)[..., None])[..., 0], surface.points @ plane, atol=1e-9
+        flat.to_surface((flat.points @ plane)[..., None])[..., 0], surface.vertices @ plane, atol=1e-9
     )
 
 
@@ -184,14 +184,14 @@ def test_the_choice(capsule: Mesh, data_dir: Path, caplog: pytest.LogCaptureFixt
     """Solids where there is one to fill; a log line says why not."""
     slit = capsule[0], capsule[1][:-2]
     for mesh in (capsule, slit, lens(0.1)):
-        assert why_shell([CanonicalSurface.of(*mesh)]) == ""
+        assert why_shell([CanonicalSurface(*mesh)]) == ""
     face = tm.load_keyframes([data_dir / "ict-face" / "00-neutral.obj"])
     for mesh, reason in (
         (strip(), "open"),
         ((face.keyframes[0].numpy(), face.faces.numpy()), "open"),
         (lens(0.01), "thin"),
     ):
-        assert f"the shape is {reason}: " in why_shell([CanonicalSurface.of(*mesh)])
+        assert f"the shape is {reason}: " in why_shell([CanonicalSurface(*mesh)])
     with caplog.at_level(logging.INFO, "torch_modal"):
         both = extract_bases(np.stack([lens(0.1)[0], lens(0.005)[0]]), lens(0.1)[1], 4, cache=False, progress=False)
     assert "modes of the surface itself, not of a solid: key-frame 1 is thin" in caplog.text

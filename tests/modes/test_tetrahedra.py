@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 import trimesh
 from conftest import COARSE
-from solids import as_it_is, box, together
+from solids import box, together
 
 from torch_modal.data.samples import load_sample
+from torch_modal.geometry.surface import Surface
 from torch_modal.modes import tetwild
 from torch_modal.modes.lattice import Lattice
 from torch_modal.modes.surface import CanonicalSurface
@@ -38,7 +39,7 @@ def test_fills_the_capsule(capsule: Mesh, capsule_tetrahedra: Tetrahedra) -> Non
 def test_inside_out_unreferenced_tiny_and_from_a_thread(capsule: Mesh) -> None:
     vertices, faces = capsule
     scattered = np.concatenate([[[1e3, 0, 0]], vertices]) * 1e-6  # vertex 0 is in no face
-    surface = CanonicalSurface.of(scattered, faces[:, ::-1] + 1)
+    surface = CanonicalSurface(scattered, faces[:, ::-1] + 1)
     found: list[Tetrahedra] = []
     handler = signal.getsignal(signal.SIGINT)
     thread = threading.Thread(target=lambda: found.append(COARSE.fill(surface, threading.Event())))
@@ -109,7 +110,7 @@ def worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
 def test_failure_says_which_mesh_and_why(worker, capsule: Mesh, code: str, says: str) -> None:
     worker(code)
     with pytest.raises(TetrahedralizationError, match=says) as caught:
-        TetWild().fill(as_it_is(*capsule), threading.Event())
+        TetWild().fill(Surface(*capsule), threading.Event())
     assert f"a mesh of {len(capsule[0])} vertices and {len(capsule[1])} faces" in str(caught.value)
 
 
@@ -131,7 +132,7 @@ def test_timeout_kills_the_worker_and_its_children(worker, capsule: Mesh, tmp_pa
     """)
     start = time.monotonic()
     with pytest.raises(TetrahedralizationError, match="no result after the timeout of 1 s"):
-        TetWild(timeout=1.0).fill(as_it_is(*capsule), threading.Event())
+        TetWild(timeout=1.0).fill(Surface(*capsule), threading.Event())
     assert time.monotonic() - start < 10
     time.sleep(0.1)
     assert not any(_is_running(int(pid)) for pid in (tmp_path / "pids").read_text().split())
@@ -175,16 +176,16 @@ def test_settings_out_of_range() -> None:
 
 
 def test_auto_takes_the_lattice_unless_parts_touch(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[CanonicalSurface] = []
+    asked: list[Surface] = []
 
-    def fails(self: TetWild, surface: CanonicalSurface, stop: threading.Event) -> Tetrahedra:
+    def fails(self: TetWild, surface: Surface, stop: threading.Event) -> Tetrahedra:
         asked.append(surface)
         raise TetrahedralizationError("it failed")
 
     monkeypatch.setattr(TetWild, "fill", fails)
     keyframes, faces, *_ = load_sample("hand")
     for x, touching in zip(keyframes.numpy(), (False, True), strict=True):
-        surface = CanonicalSurface.of(x, faces.numpy())
+        surface = CanonicalSurface(x, faces.numpy())
         filled, lattice = (mesher.fill(surface, threading.Event()) for mesher in (Auto(), Lattice()))
         assert [one is surface for one in asked] == [True] * touching
         np.testing.assert_array_equal(filled.vertices, lattice.vertices)
@@ -197,7 +198,7 @@ def test_auto_bounds_the_time_of_the_mesher(monkeypatch: pytest.MonkeyPatch, cap
     monkeypatch.setattr(tetwild, "PATIENCE", 1.0)
     monkeypatch.setattr(tetwild, "EDGE_RANGE", (2e-3, 2e-3))
     keyframes, faces, *_ = load_sample("hand")
-    surface = CanonicalSurface.of(keyframes[1].numpy(), faces.numpy())
+    surface = CanonicalSurface(keyframes[1].numpy(), faces.numpy())
     before = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
     with caplog.at_level("INFO"):
         filled = Auto().fill(surface, threading.Event())
@@ -209,7 +210,7 @@ def test_auto_bounds_the_time_of_the_mesher(monkeypatch: pytest.MonkeyPatch, cap
 def test_edges_follow_the_thinnest_part(monkeypatch: pytest.MonkeyPatch) -> None:
     given: list[float] = []
 
-    def stopped(surface: CanonicalSurface, settings: TetWild, stop: threading.Event) -> Tetrahedra:
+    def stopped(surface: Surface, settings: TetWild, stop: threading.Event) -> Tetrahedra:
         given.append(settings.edge_length_fac)  # type: ignore[arg-type]
         raise ValueError("stopped")
 
@@ -218,5 +219,5 @@ def test_edges_follow_the_thinnest_part(monkeypatch: pytest.MonkeyPatch) -> None
     wire = trimesh.creation.cylinder(0.05, 4.0, sections=16).apply_translation([2.0, 0, 0])  # a tenth of the area
     for mesh in (ball, trimesh.util.concatenate([ball, wire])):
         with pytest.raises(TetrahedralizationError, match="stopped"):
-            TetWild().fill(CanonicalSurface.of(mesh.vertices, mesh.faces), threading.Event())
+            TetWild().fill(CanonicalSurface(mesh.vertices, mesh.faces), threading.Event())
     assert given == [EDGE_RANGE[1], EDGE_RANGE[0]]

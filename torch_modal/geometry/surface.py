@@ -6,6 +6,7 @@ import numpy as np
 
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.geometry.connectivity import Connectivity, vertex_areas
+from torch_modal.geometry.inspect import volume_of
 from torch_modal.geometry.vectors import vertex_normals
 
 
@@ -56,6 +57,11 @@ class Surface:
     def area(self) -> float:
         """Total area."""
         return float(self.face_areas.sum())
+
+    @property
+    def thickness(self) -> float:
+        """Mean thickness of the body: twice the volume over the area."""
+        return 2 * abs(volume_of(self.vertices, self.faces)) / self.area
 
     @property
     def diagonal(self) -> float:

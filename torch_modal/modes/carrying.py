@@ -8,11 +8,10 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from torch_modal.arrays import FloatArray, IntArray
-from torch_modal.geometry.connectivity import vertex_areas
 from torch_modal.geometry.sparse import factorize
+from torch_modal.geometry.surface import Surface
 from torch_modal.modes.solid import Solid
 from torch_modal.modes.stiffness import dirichlet_matrix, hat_gradients
-from torch_modal.modes.surface import CanonicalSurface
 from torch_modal.modes.tetrahedra import solid_volumes, tet_volumes
 
 FIT_WEIGHT = 1e4
@@ -41,18 +40,17 @@ class Carrier:
     """
 
     def __init__(self, solid: Solid) -> None:
-        tetrahedra, points = solid.tetrahedra, solid.surface.points
+        tetrahedra, points = solid.tetrahedra, solid.surface.vertices
         self.solid, self.weights = solid, solid.weights()
         self.gradients, self.volumes = hat_gradients(tetrahedra), solid_volumes(tetrahedra)
         extent = float(np.linalg.norm(np.ptp(points, axis=0)))
-        areas = vertex_areas(points, solid.surface.faces)
-        self.area = areas.sum()
+        areas, self.area = solid.surface.vertex_areas, solid.surface.area
         # |W x - p|² is a mean over the surface, per diagonal squared; the other term a mean over the volume.
         self.pull = sp.diags(FIT_WEIGHT * self.volumes.sum() / extent**2 * areas / self.area) @ self.weights
         laplacian = dirichlet_matrix(tetrahedra, self.gradients).tocsc()
         self.factors = factorize(laplacian + self.weights.T @ self.pull)
 
-    def carry(self, surface: CanonicalSurface) -> Solid | None:
+    def carry(self, surface: Surface) -> Solid | None:
         """The solid in the pose of another key-frame.
 
         Returns:
@@ -62,11 +60,11 @@ class Carrier:
             LinAlgError: The result is not finite.
         """
         rest, faces = self.solid.tetrahedra, self.solid.surface.faces
-        areas = vertex_areas(surface.points, faces)
+        areas = surface.vertex_areas
         # The diagonal, the unit of length here, depends on the pose; the area hardly does.
-        scale = np.sqrt(areas.sum() / self.area)
-        target = surface.points / scale
-        turns = vertex_rotations(self.solid.surface.points, target, faces)
+        scale = np.sqrt(surface.area / self.area)
+        target = surface.vertices / scale
+        turns = vertex_rotations(self.solid.surface.vertices, target, faces)
         # Harmonic extension of the surface rotations to the volume.
         field = self.factors.solve(self.pull.T @ turns.reshape(-1, 9)).reshape(-1, 3, 3)
         gradients = field[rest.tets].mean(axis=1)

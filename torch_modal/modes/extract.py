@@ -142,7 +142,7 @@ def bases_of_checked(
         extraction = _Extraction(len(shapes), int(n_modes), mesher, cache or Cache.at(None), bar)
         for index, shape in enumerate(shapes):
             with extraction.stage(index, "checks"):
-                extraction.surfaces.append(CanonicalSurface.of(shape, triangles))
+                extraction.surfaces.append(CanonicalSurface(shape, triangles))
         results = extraction.by(method)
     if n_pieces := [int(result["n_pieces"][0]) for result in results if result["n_zero"][0] > N_RIGID]:
         warnings.warn(
@@ -181,7 +181,7 @@ def _bases_of_bodies(several: Sequence[Any], keyframes: torch.Tensor, n_modes: i
 def why_shell(surfaces: list[CanonicalSurface]) -> str:
     """Reason for which a set of key-frames has modes of the surface itself; empty if of the solid."""
     for index, surface in enumerate(surfaces):
-        holes = open_part(surface.points, surface.mesh)
+        holes = open_part(surface.vertices, surface.connectivity)
         thickness = surface.thickness / surface.area**0.5
         what = f"key-frame {index} is" if len(surfaces) > 1 else "the shape is"
         if holes > OPEN:
@@ -254,7 +254,7 @@ class _Extraction:
             mesh = self._mesh(index)
             return self._modes_of(index, mesh.body)
 
-        inputs = {"points": solid.surface.points, **solid.tetrahedra.arrays()}
+        inputs = {"points": solid.surface.vertices, **solid.tetrahedra.arrays()}
         inputs = {f"rest_{name}": array for name, array in inputs.items()}
         return self._all(compute, inputs, {"form": "edge", **self.mesher.key()}, len(solid.tetrahedra.vertices))
 
@@ -266,7 +266,7 @@ class _Extraction:
         @one_blas_thread()
         def modes(index: int) -> Arrays:
             surface = self.surfaces[index]
-            arrays = {"points": surface.points, "faces": surface.faces, **inputs}
+            arrays = {"points": surface.vertices, "faces": surface.faces, **inputs}
             result = self.cache.get("modes", arrays, {"n_modes": self.n_modes, **parameters}, lambda: compute(index))
             self.bar.update()
             return result

@@ -5,7 +5,7 @@ Deterministic; accepts every surface.
 
 import itertools
 import threading
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,8 +15,9 @@ from scipy.spatial import cKDTree
 
 from torch_modal.arrays import BoolArray, FloatArray, IntArray
 from torch_modal.geometry.canonical import CANONICAL_SIZE
+from torch_modal.geometry.surface import Surface
 from torch_modal.modes.bisection import bisect
-from torch_modal.modes.surface import CanonicalSurface, SurfaceSamples, clearances
+from torch_modal.modes.surface import SurfaceSamples, clearances
 from torch_modal.modes.tetrahedra import (
     Tetrahedra,
     face_connected_pieces,
@@ -97,12 +98,12 @@ class Lattice:
         """The edge length and the version."""
         return {"mesher": "lattice", "cube": self.cube, "version": VERSION}
 
-    def fill(self, surface: CanonicalSurface, stop: threading.Event) -> Tetrahedra:
+    def fill(self, surface: Surface, stop: threading.Event) -> Tetrahedra:
         """Fill a surface with tetrahedra."""
         tetrahedra = lattice(surface, self.cube)
-        if (n_pieces := face_connected_pieces(tetrahedra.tets).max()) <= surface.mesh.vertex_pieces.max():
+        if (n_pieces := face_connected_pieces(tetrahedra.tets).max()) <= surface.connectivity.vertex_pieces.max():
             return tetrahedra
-        rotated = lattice(replace(surface, points=surface.points @ GENERIC_ROTATION.T), self.cube)
+        rotated = lattice(Surface(surface.vertices @ GENERIC_ROTATION.T, surface.connectivity), self.cube)
         better = face_connected_pieces(rotated.tets).max() < n_pieces
         return rotated._replace(vertices=rotated.vertices @ GENERIC_ROTATION) if better else tetrahedra
 
@@ -171,7 +172,7 @@ class Indicator:
         return np.clip(values, 0.0, 1.0)
 
 
-def lattice(surface: CanonicalSurface, cube: float) -> Tetrahedra:
+def lattice(surface: Surface, cube: float) -> Tetrahedra:
     """Fill a surface with a graded lattice of tetrahedra, with the outer vertices moved onto the surface.
 
     Tetrahedra are bisected where the body or a gap is thin. Each has the fraction of its volume that is inside. The
@@ -181,8 +182,8 @@ def lattice(surface: CanonicalSurface, cube: float) -> Tetrahedra:
     largest = cube * CANONICAL_SIZE
     while True:
         root = ROOT * largest
-        low = surface.points.min(axis=0) - 1.5 * root
-        counts = np.ceil((surface.points.max(axis=0) + 1.5 * root - low) / root).astype(np.int64)
+        low = surface.vertices.min(axis=0) - 1.5 * root
+        counts = np.ceil((surface.vertices.max(axis=0) + 1.5 * root - low) / root).astype(np.int64)
         if counts.prod() <= MOST_CUBES:
             break
         largest *= COARSER
@@ -192,7 +193,7 @@ def lattice(surface: CanonicalSurface, cube: float) -> Tetrahedra:
     points, wanted = samples.points, sizes[samples.faces]
     spacing = max(GRID_SPACING * wanted.min(), (np.prod(counts * root) / MOST_POINTS) ** (1 / 3))
     grid = [next_fast_len(int(np.ceil(length)) + 1, real=True) for length in counts * root / spacing]
-    has_sides = np.asarray(~np.isin(surface.faces[samples.faces], surface.mesh.boundary_edges).any(axis=1))
+    has_sides = np.asarray(~np.isin(surface.faces[samples.faces], surface.connectivity.boundary_edges).any(axis=1))
     indicator = Indicator(samples, has_sides, low, spacing, np.array(grid))
 
     def is_inside(places: FloatArray) -> BoolArray:

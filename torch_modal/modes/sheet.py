@@ -13,10 +13,10 @@ from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.elastic.rest_hessian import rest_hessian
 from torch_modal.elastic.shell import BETA
 from torch_modal.geometry.canonical import CANONICAL_SIZE
-from torch_modal.geometry.connectivity import Connectivity, double_areas, vertex_areas
+from torch_modal.geometry.connectivity import Connectivity, vertex_areas
+from torch_modal.geometry.surface import Surface
 from torch_modal.modes.coarsening import collapse, join_clusters
 from torch_modal.modes.eigen import ElasticBody
-from torch_modal.modes.surface import CanonicalSurface
 from torch_modal.modes.tetrahedra import small_pieces
 
 THICKNESS = 0.01
@@ -42,22 +42,22 @@ def n_coarse_faces(n_modes: int) -> int:
     return max(SHEET_FACES, FACES_PER_MODE * n_modes)
 
 
-def sheet_body(surface: CanonicalSurface, n_modes: int) -> ElasticBody:
+def sheet_body(surface: Surface, n_modes: int) -> ElasticBody:
     """A surface as a thin elastic sheet.
 
     Vertices are clustered by edge collapses, and modes are computed on the mesh of the clusters, with stretching as
     stiff as the fine mesh: in Eq. 5 it grows as edges become shorter. Small loose pieces follow the rest.
     """
-    fine = surface.mesh
+    fine = surface.connectivity
     piece = fine.vertex_pieces[surface.faces[:, 0]]
-    amounts = np.bincount(piece, double_areas(surface.points, surface.faces))
-    large = surface.faces[~small_pieces(amounts, surface.points[surface.faces], piece)[piece]]
+    amounts = np.bincount(piece, surface.face_areas)
+    large = surface.faces[~small_pieces(amounts, surface.vertices[surface.faces], piece)[piece]]
     # Modes do not mind needles, for which `coarsen` would collapse several times.
-    coarsening = collapse(surface.points, large, n_coarse_faces(n_modes))
-    coarsening = join_clusters(surface.points, large, coarsening, SHORTEST_EDGE)
-    points, mesh = coarsening.restrict(surface.points), Connectivity(coarsening.faces, coarsening.n_vertices)
+    coarsening = collapse(surface.vertices, large, n_coarse_faces(n_modes))
+    coarsening = join_clusters(surface.vertices, large, coarsening, SHORTEST_EDGE)
+    points, mesh = coarsening.restrict(surface.vertices), Connectivity(coarsening.faces, coarsening.n_vertices)
 
-    coarser = _mean_length(points, mesh) / _mean_length(surface.points, fine)
+    coarser = _mean_length(points, mesh) / _mean_length(surface.vertices, fine)
     first, second = mesh.adjacent_sides.T
     # Also at edges of three faces and more, which would be free to turn.
     hinges = [mesh.start[first], mesh.end[first], mesh.opposite[first], mesh.opposite[second]]
@@ -68,11 +68,11 @@ def sheet_body(surface: CanonicalSurface, n_modes: int) -> ElasticBody:
     def to_surface(motions: FloatArray) -> FloatArray:
         # Each cluster moves the vertices around it by its displacement and its gradient, blended by a smooth partition
         # of unity; rigid motions and uniform strains are exact.
-        if np.array_equal(coarsening.clusters, np.arange(len(surface.points))):
+        if np.array_equal(coarsening.clusters, np.arange(len(surface.vertices))):
             return motions
         weights = _cluster_weights(coarsening.clusters, surface, fine, points, mesh)
         entries = weights.row, weights.col
-        arms = (surface.points[weights.row] - points[weights.col]).T
+        arms = (surface.vertices[weights.row] - points[weights.col]).T
         slopes = [sp.coo_matrix((weights.data * along, entries), weights.shape) for along in arms]
         local = np.concatenate([motions[None], _vertex_gradients(motions, points, mesh.faces)])
         blend = sp.hstack([weights, *slopes], format="csr")
@@ -82,10 +82,10 @@ def sheet_body(surface: CanonicalSurface, n_modes: int) -> ElasticBody:
 
 
 def _cluster_weights(
-    clusters: IntArray, surface: CanonicalSurface, fine: Connectivity, points: FloatArray, mesh: Connectivity
+    clusters: IntArray, surface: Surface, fine: Connectivity, points: FloatArray, mesh: Connectivity
 ) -> sp.coo_matrix:
     """Weights of the clusters that move each vertex, membership averaged over neighbours. *Shape:* ``(U, N)``."""
-    n_fine, n = len(surface.points), len(points)
+    n_fine, n = len(surface.vertices), len(points)
     clustered = np.flatnonzero(clusters >= 0)
     weights = sp.csr_matrix((np.ones(len(clustered)), (clustered, clusters[clustered])), shape=(n_fine, n))
     averages = _averages(fine)
@@ -95,7 +95,7 @@ def _cluster_weights(
     weights = sp.diags(1 / np.where(total > 0, total, 1)) @ weights
     rows = np.flatnonzero(total == 0)
     if len(rows):  # pieces that no cluster reaches follow the clusters around the nearest one
-        nearest = cKDTree(points).query(surface.points[rows])[1]
+        nearest = cKDTree(points).query(surface.vertices[rows])[1]
         follows = sp.csr_matrix((np.ones(len(rows)), (rows, nearest)), shape=(n_fine, n))
         weights = weights + follows @ _averages(mesh)
     return sp.coo_matrix(weights)

@@ -9,11 +9,11 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from torch_modal.arrays import FloatArray, IntArray
+from torch_modal.geometry.surface import Surface
 from torch_modal.io.cache import Cache
 from torch_modal.modes.eigen import ElasticBody
 from torch_modal.modes.embedding import find_neighbours, fit_weights
 from torch_modal.modes.stiffness import arap_hessian, mass_matrix
-from torch_modal.modes.surface import CanonicalSurface
 from torch_modal.modes.tetrahedra import Mesher, Tetrahedra, loose_pieces, small_pieces, solid_volumes, submesh
 
 
@@ -33,18 +33,18 @@ class Solid:
         meshed: The key-frame that the tetrahedra were carried from; None if they are its own.
     """
 
-    surface: CanonicalSurface
+    surface: Surface
     tetrahedra: Tetrahedra
     neighbours: IntArray
     kernel: FloatArray
     meshed: "Solid | None" = None
 
     @classmethod
-    def from_surface(cls, surface: CanonicalSurface, mesher: Mesher, cache: Cache, stop: threading.Event) -> "Solid":
+    def from_surface(cls, surface: Surface, mesher: Mesher, cache: Cache, stop: threading.Event) -> "Solid":
         """Mesh a surface, unless the cache has its tetrahedra; raises as :meth:`Mesher.fill`."""
 
         def embed(tetrahedra: Tetrahedra) -> tuple[Tetrahedra, IntArray, FloatArray]:
-            return tetrahedra, *find_neighbours(surface.points, tetrahedra, surface.normals)
+            return tetrahedra, *find_neighbours(surface.vertices, tetrahedra, surface.vertex_normals)
 
         def compute() -> dict[str, NDArray[Any]]:
             tetrahedra, neighbours, kernel = embed(without_small_pieces(mesher.fill(surface, stop)))
@@ -54,14 +54,14 @@ class Solid:
                 tetrahedra, neighbours, kernel = embed(submesh(tetrahedra, bears[piece[tetrahedra.tets[:, 0]]]))
             return {**tetrahedra.arrays(), "neighbours": neighbours, "kernel": kernel}
 
-        inputs = {"points": surface.points, "faces": surface.faces}
+        inputs = {"points": surface.vertices, "faces": surface.faces}
         arrays = cache.get("solid", inputs, mesher.key(), compute)
         tetrahedra = Tetrahedra(arrays["vertices"], arrays["tets"], arrays.get("inside"))
         return cls(surface, tetrahedra, arrays["neighbours"], arrays["kernel"])
 
     def weights(self) -> sp.csr_matrix:
         """Displacements of the surface from displacements of the tetrahedra. *Shape:* ``(U, N)``."""
-        return fit_weights(self.surface.points, self.tetrahedra.vertices, self.neighbours, self.kernel)
+        return fit_weights(self.surface.vertices, self.tetrahedra.vertices, self.neighbours, self.kernel)
 
     def body(self) -> ElasticBody:
         """Stiffness, and mass at a density of 1."""

@@ -1,17 +1,13 @@
 """Key-frames in canonical coordinates, samples of their surfaces, thickness and gaps."""
 
-from dataclasses import dataclass
-from functools import cached_property
-
 import numpy as np
 from scipy.spatial import cKDTree
 
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.errors import MeshError
 from torch_modal.geometry.canonical import CANONICAL_SIZE, in_order, to_canonical
-from torch_modal.geometry.connectivity import Connectivity, vertex_areas
 from torch_modal.geometry.inspect import FLATNESS, principal_extents, volume_of
-from torch_modal.geometry.vectors import vertex_normals
+from torch_modal.geometry.surface import Surface
 from torch_modal.threads import n_threads
 
 _DIAGONAL_RANGE = (1e-90, 1e90)
@@ -33,35 +29,28 @@ SEEN_SAMPLES = 10_000
 MOST_SHRINKINGS = 10
 
 
-@dataclass(frozen=True)
-class CanonicalSurface:
+class CanonicalSurface(Surface):
     """Referenced vertices of a shape in its principal axes, centred, with a size of 100.
 
-    Results do not depend on the caller's axes or on the order of the faces.
+    Results do not depend on the caller's axes or on the order of the faces, which are wound counterclockwise seen from
+    outside, and sorted.
+
+    Args:
+        shape: A checked shape in any units. *Shape:* ``(V, 3)``.
+        faces: *Shape:* ``(F, 3)``.
 
     Attributes:
-        points: *Shape:* ``(U, 3)``.
-        faces: Indices into ``points``, wound counterclockwise seen from outside, sorted. *Shape:* ``(F, 3)``.
-        used: Vertex indices of the points in the shape. *Shape:* ``(U,)``.
+        used: Vertex indices of the vertices in the shape. *Shape:* ``(U,)``.
         scale: Canonical units per unit of the caller.
-        axes: ``points @ axes`` has the caller's axes. *Shape:* ``(3, 3)``.
+        axes: ``vertices @ axes`` has the caller's axes. *Shape:* ``(3, 3)``.
+
+    Raises:
+        MeshError: The surface has no area, or is so large or small that eigenvalues leave the range of float64.
     """
 
-    points: FloatArray
-    faces: IntArray
-    used: IntArray
-    scale: float
-    axes: FloatArray
-
-    @classmethod
-    def of(cls, shape: FloatArray, faces: IntArray) -> "CanonicalSurface":
-        """Canonical surface of a checked shape in any units. *Shape:* ``(V, 3), (F, 3)``.
-
-        Raises:
-            MeshError: The surface has no area, or is so large or small that eigenvalues leave the range of float64.
-        """
-        used, compact = np.unique(faces, return_inverse=True)
-        points = shape[used]
+    def __init__(self, shape: FloatArray, faces: IntArray) -> None:
+        self.used, compact = np.unique(faces, return_inverse=True)
+        points, compact = shape[self.used], compact.reshape(-1, 3)
         diagonal = float(np.linalg.norm(np.ptp(points, axis=0)))
         if not _DIAGONAL_RANGE[0] < diagonal < _DIAGONAL_RANGE[1]:
             raise MeshError(
@@ -74,17 +63,17 @@ class CanonicalSurface:
                 f"all vertices lie on a line: the extents are {extents[0]:.3g}, {extents[1]:.3g} and {extents[2]:.3g}; "
                 "a surface has an area"
             )
-        points, axes, _, scale = to_canonical(points, compact.reshape(-1, 3))
-        order, sorted_faces = in_order(points, compact.reshape(-1, 3))
+        points, self.axes, _, self.scale = to_canonical(points, compact)
+        order, sorted_faces = in_order(points, compact)
         ordered = order[sorted_faces]
         # fTetWild keeps the volume with positive winding number, which is empty for an inverted mesh.
         if volume_of(points - points.mean(axis=0), ordered) < 0:
-            ordered = np.ascontiguousarray(ordered[:, ::-1])
-        return cls(points, ordered, used, scale, axes)
+            ordered = ordered[:, ::-1]
+        super().__init__(points, ordered)
 
     def require_solid(self) -> None:
         """Raise a MeshError for a planar surface, which has no interior."""
-        extents = principal_extents(self.points)
+        extents = principal_extents(self.vertices)
         if extents[2] <= FLATNESS * extents[0]:
             lengths = "{:.3g}, {:.3g} and {:.3g}".format(*extents / self.scale)
             raise MeshError(
@@ -92,37 +81,16 @@ class CanonicalSurface:
                 'tetrahedra; take the modes of the surface (method="shell"), or give it a thickness'
             )
 
-    @cached_property
-    def mesh(self) -> Connectivity:
-        """Edges and pieces."""
-        return Connectivity(self.faces, len(self.points))
-
-    @cached_property
-    def area(self) -> float:
-        """Surface area."""
-        return float(vertex_areas(self.points, self.faces).sum())
-
-    @property
-    def thickness(self) -> float:
-        """Mean thickness of the body: twice the volume over the area."""
-        return 2 * abs(volume_of(self.points, self.faces)) / self.area
-
-    @cached_property
-    def normals(self) -> FloatArray:
-        """Outward unit normals of the points, zero where the faces have no area. *Shape:* ``(U, 3)``."""
-        return vertex_normals(self.points, self.faces)
-
 
 class SurfaceSamples:
     """P samples of a surface, each face at a spacing of its own and with one or more. *Shape:* ``(F,)``."""
 
-    def __init__(self, surface: CanonicalSurface, spacing: FloatArray) -> None:
-        corners = surface.points[surface.faces]
+    def __init__(self, surface: Surface, spacing: FloatArray) -> None:
+        corners = surface.vertices[surface.faces]
         sides = corners - np.roll(corners, 1, axis=1)
         longest = np.linalg.norm(sides, axis=2).max(axis=1) / spacing
         longest *= min(1.0, (MOST_SAMPLES / (longest**2).sum()) ** 0.5)
         n_cuts = np.maximum(np.ceil(longest), 1).astype(np.int64)
-        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
         points, shares, faces = [], [], []
         for n in np.unique(n_cuts):
             chosen = n_cuts == n
@@ -132,7 +100,7 @@ class SurfaceSamples:
             uv = np.concatenate([up, down]) / (3 * n)
             weights = np.concatenate([1 - uv.sum(axis=1, keepdims=True), uv], axis=1)
             points.append(np.einsum("qa,fai->fqi", weights, corners[chosen]).reshape(-1, 3))
-            shares.append(np.repeat(normals[chosen] / n**2, n**2, axis=0))
+            shares.append(np.repeat(surface.area_vectors[chosen] / n**2, n**2, axis=0))
             faces.append(np.repeat(np.flatnonzero(chosen), n**2))
         normal = np.concatenate(shares)
         #: *Shape:* ``(P, 3)``, and the face of each, ``(P,)``.
@@ -143,23 +111,23 @@ class SurfaceSamples:
         self.tree = cKDTree(self.points, leafsize=LEAF)
 
 
-def self_proximity(surface: CanonicalSurface) -> float:
+def self_proximity(surface: Surface) -> float:
     """Fraction of the area with an opposing part of the surface close in front of it.
 
     Tetrahedra fuse parts in contact, so such a pose is a poor rest pose.
     """
-    step = max(len(surface.points) // SEEN_POINTS, 1)
-    points, normals = surface.points[::step], surface.normals[::step]
+    step = max(len(surface.vertices) // SEEN_POINTS, 1)
+    points, normals = surface.vertices[::step], surface.vertex_normals[::step]
     tree = cKDTree(points)
     opposed = np.zeros(len(points), dtype=bool)
     for gap in (1 / 16, 1 / 8, 1 / 4, 1 / 2):  # beyond half the gap, the opposing side is nearer than the point itself
         nearest = tree.query(points + gap * LARGEST_GAP * CANONICAL_SIZE * normals, workers=n_threads())[1]
         opposed |= np.einsum("vi,vi->v", normals, normals[nearest]) < OPPOSED
-    areas = vertex_areas(surface.points, surface.faces)[::step]
+    areas = surface.vertex_areas[::step]
     return float(areas[opposed].sum() / areas.sum())
 
 
-def clearances(surface: CanonicalSurface) -> tuple[FloatArray, FloatArray]:
+def clearances(surface: Surface) -> tuple[FloatArray, FloatArray]:
     """Thickness of the body behind each face, and gap in front of it; infinite above `LARGEST_THICKNESS`.
 
     *Shape:* ``(F,), (F,)``.

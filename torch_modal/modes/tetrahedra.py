@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from torch_modal.arrays import BoolArray, FloatArray, IntArray
 from torch_modal.geometry.connectivity import label_pieces
-from torch_modal.modes.surface import CanonicalSurface
+from torch_modal.geometry.surface import Surface
 
 EDGES = np.array([(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)])
 """Corners at the ends of the edges of a tetrahedron. *Shape:* ``(6, 2)``."""
@@ -51,7 +51,7 @@ class Mesher(Protocol):
         """Cache key besides the surface: name, settings and versions, as numbers, strings or None."""
         ...
 
-    def fill(self, surface: CanonicalSurface, stop: threading.Event) -> Tetrahedra:
+    def fill(self, surface: Surface, stop: threading.Event) -> Tetrahedra:
         """Fill a surface with tetrahedra, in its units.
 
         Args:

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from torch_modal.geometry.connectivity import double_areas
 from torch_modal.geometry.decimation import decimate
+from torch_modal.geometry.surface import Surface
 from torch_modal.modes.lattice import Lattice
 from torch_modal.modes.processes import ChildError, run_child
-from torch_modal.modes.surface import CanonicalSurface, clearances, self_proximity
+from torch_modal.modes.surface import clearances, self_proximity
 from torch_modal.modes.tetrahedra import Tetrahedra, TetrahedralizationError, orient, without_debris
 from torch_modal.progress import logger
 
@@ -79,7 +79,7 @@ class TetWild:
         versions = {name: version(name) for name in ("pytetwild", "fast-simplification")}
         return {"mesher": "tetwild", **settings, **versions}
 
-    def fill(self, surface: CanonicalSurface, stop: threading.Event) -> Tetrahedra:
+    def fill(self, surface: Surface, stop: threading.Event) -> Tetrahedra:
         """Fill a closed surface with tetrahedra of positive volume.
 
         Raises:
@@ -87,7 +87,7 @@ class TetWild:
                 ones that do not fill the surface.
             StoppedError: ``stop`` was set, and the child process killed.
         """
-        points, faces = surface.points, surface.faces
+        points, faces = surface.vertices, surface.faces
         diagonal = float(np.linalg.norm(np.ptp(points, axis=0)))
         edge_length_fac = self.edge_length_fac
         if edge_length_fac is None:
@@ -95,7 +95,7 @@ class TetWild:
             if self_proximity(surface) <= TOUCHING:  # otherwise, the overlap of two parts is measured
                 thin = clearances(surface)[0]
                 order = np.argsort(thin)
-                areas = double_areas(points, faces)[order].cumsum()
+                areas = surface.face_areas[order].cumsum()
                 thickness = min(thickness, thin[order][np.searchsorted(areas, THIN_PART * areas[-1])])
             edge_length_fac = float(np.clip(EDGES_PER_THICKNESS * thickness / diagonal, *EDGE_RANGE))
         try:
@@ -128,7 +128,7 @@ class Auto:
         """The keys of both meshers."""
         return {**Lattice().key(), **{f"touching_{name}": value for name, value in TetWild().key().items()}}
 
-    def fill(self, surface: CanonicalSurface, stop: threading.Event) -> Tetrahedra:
+    def fill(self, surface: Surface, stop: threading.Event) -> Tetrahedra:
         """Fill a surface with tetrahedra."""
         if self_proximity(surface) > TOUCHING:
             try:
@@ -138,9 +138,9 @@ class Auto:
         return Lattice().fill(surface, stop)
 
 
-def _run_worker(surface: CanonicalSurface, settings: TetWild, stop: threading.Event) -> Tetrahedra:
+def _run_worker(surface: Surface, settings: TetWild, stop: threading.Event) -> Tetrahedra:
     """Run the worker process on a surface, decimated, and read its result."""
-    points, faces = surface.points, surface.faces
+    points, faces = surface.vertices, surface.faces
     if len(faces) > settings.max_surface_faces:
         points, faces, _ = decimate(points, faces, settings.max_surface_faces)
     with tempfile.TemporaryDirectory(prefix="torch_modal-", ignore_cleanup_errors=True) as folder:
