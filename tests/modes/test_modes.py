@@ -129,15 +129,12 @@ def test_pieces_add_zero_modes() -> None:
     np.testing.assert_allclose(result.eigenvalues, each[:4], rtol=1e-9)
 
 
-def test_untrustworthy_problems_are_refused() -> None:
+def test_stiffness_that_resists_rigid_motions_is_refused() -> None:
     solid = box((4, 2, 2), (2.0, 1.0, 1.0))
     k, mass = arap_hessian(solid), lumped_mass(solid)
     anchored = k + sp.diags(np.r_[np.ones(3), np.zeros(k.shape[0] - 3)])
     with pytest.raises(ModalAnalysisError, match="the rigid motions"):
         eigenmodes(sp.csc_matrix(anchored), sp.diags(mass), solid.vertices, 4)
-    indefinite = k - 0.1 * sp.diags(np.repeat(mass, 3))
-    with pytest.raises(ModalAnalysisError):
-        eigenmodes(sp.csc_matrix(indefinite), sp.diags(mass), solid.vertices, 4)
 
 
 # -------------------------------------------------------------------------------- from key-frames to bases
@@ -303,8 +300,7 @@ def test_threads_change_nothing(boxed: Mesh, monkeypatch: pytest.MonkeyPatch) ->
 @pytest.mark.parametrize(
     ("name", "value", "says"),
     [
-        *(("n_modes", value, "n_modes is .*; give a whole number") for value in (0, -1, 2.5, True)),
-        ("n_modes", 10_000, "at most 216 ways to deform; give 1 to 216"),
+        *(("n_modes", n, "n_modes is .*ways to deform; give .* 1 to 216") for n in (0, -1, 2.5, True, 10_000)),
         *((name, "spokes", f"the {what} is 'spokes'; give") for name, what in (("mesher",) * 2, ("method",) * 2)),
     ],
 )

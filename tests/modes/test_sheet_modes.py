@@ -226,21 +226,6 @@ def test_where_no_solid_can_be_had(capsule: Mesh, caplog: pytest.LogCaptureFixtu
             extract_modes(*capsule, 4, method=method, mesher=Failing(failure), cache=False)  # type: ignore[arg-type]
 
 
-def test_where_no_shell_can_be_had(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The solid, where the shell was only chosen."""
-
-    def fail(*_: object) -> None:
-        raise ModalAnalysisError("degenerate")
-
-    vertices, faces = strip()
-    solid = extract_modes(
-        vertices * (1, 1, 0) + [0, 0, 0.01] * np.cos(vertices[:, :1]), faces, 4, method="solid", cache=False
-    )
-    monkeypatch.setattr(extract._Extraction, "shells", fail)
-    found = extract_modes(vertices * (1, 1, 0) + [0, 0, 0.01] * np.cos(vertices[:, :1]), faces, 4, cache=False)
-    torch.testing.assert_close(found.modes, solid.modes, rtol=0, atol=0)
-
-
 def test_the_cache_knows_the_method(capsule: Mesh, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = str(tmp_path)
     shell = extract_modes(*capsule, 4, method="shell", cache_dir=folder)

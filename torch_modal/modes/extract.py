@@ -5,12 +5,12 @@ import functools
 import threading
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
 import torch
 
+from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.errors import MeshError, MeshWarning
 from torch_modal.geometry.bodies import bodies
 from torch_modal.geometry.connectivity import Connectivity
@@ -124,27 +124,22 @@ def bases_of_checked(
         if mesher not in MESHERS:
             raise ValueError(f"the mesher is {mesher!r}; give a Mesher or one of {tuple(MESHERS)}")
         mesher = MESHERS[mesher]()
-    if isinstance(n_modes, bool) or not isinstance(n_modes, (int, np.integer)) or n_modes < 1:
-        raise ValueError(f"n_modes is {n_modes!r}; give a whole number of at least 1")
     shapes, triangles = keyframes.detach().cpu().double().numpy(), faces.cpu().numpy()
     mesh = Connectivity(triangles, shapes.shape[1])
     possible = 3 * len(mesh.used) - N_RIGID
-    if n_modes > possible:
+    if type(n_modes) is bool or not isinstance(n_modes, (int, np.integer)) or not 1 <= n_modes <= possible:
         raise ValueError(
-            f"{n_modes} modes requested, but a surface of {len(mesh.used)} vertices has at most {possible} ways to "
-            f"deform; give 1 to {possible}"
+            f"n_modes is {n_modes!r}, but a surface of {len(mesh.used)} vertices has at most {possible} ways to "
+            f"deform; give a whole number of 1 to {possible}"
         )
     several = bodies(shapes, mesh)
     if len(several) > 1:
         with contextlib.suppress(MeshError, ModalAnalysisError):  # the whole may have modes, nevertheless
             return _bases_of_bodies(several, torch.from_numpy(shapes), n_modes, method, mesher, cache, progress)
     with one_blas_thread(), ProgressReport(len(shapes), "vibration modes", progress) as bar:
-        extraction = _Extraction(len(shapes), int(n_modes), mesher, cache or Cache.at(None), bar)
-        for index, shape in enumerate(shapes):
-            with extraction.stage(index, "checks"):
-                extraction.surfaces.append(CanonicalSurface(shape, triangles))
+        extraction = _Extraction(shapes, triangles, int(n_modes), mesher, cache or Cache.at(None), bar)
         results = extraction.by(method)
-    if n_pieces := [int(result["n_pieces"][0]) for result in results if result["n_zero"][0] > N_RIGID]:
+    if n_pieces := [np.max(result["n_pieces"]) for result in results if np.max(result["n_zero"]) > N_RIGID]:
         warnings.warn(
             f"the shape has {max(n_pieces)} loose pieces, or parts hung on an edge or a vertex: modes deform each, and "
             "how they move against each other is left to the interpolation of the key-frames; join them if they "
@@ -191,36 +186,34 @@ def why_shell(surfaces: list[CanonicalSurface]) -> str:
     return ""
 
 
-@dataclass
 class _Extraction:
     """Modes of all key-frames of a set, as arrays in canonical units; ``stop`` cancels the work."""
 
-    n_keyframes: int
-    n_modes: int
-    mesher: Mesher
-    cache: Cache
-    bar: ProgressReport
-    surfaces: list[CanonicalSurface] = field(default_factory=list)
-    stop: threading.Event = field(default_factory=threading.Event)
+    def __init__(
+        self, shapes: FloatArray, faces: IntArray, n_modes: int, mesher: Mesher, cache: Cache, bar: ProgressReport
+    ) -> None:
+        self.n_modes, self.mesher, self.cache, self.bar, self.stop = n_modes, mesher, cache, bar, threading.Event()
+        self.n_keyframes, self.surfaces = len(shapes), list[CanonicalSurface]()
+        for index, shape in enumerate(shapes):
+            with self.stage(index, "checks"):
+                self.surfaces.append(CanonicalSurface(shape, faces))
 
     def by(self, method: Method) -> list[Arrays]:
-        """Modes by a method; where that was chosen here and fails because of the surface, by the other."""
-        if method != "auto":
-            return self.solids() if method == "solid" else self.shells()
-        reason = why_shell(self.surfaces)
-        first, second = (self.shells, self.solids) if reason else (self.solids, self.shells)
-        if reason:
+        """Modes by a method; ``"auto"`` takes the shell for shapes that are open or thin or whose solids fail."""
+        if method == "auto" and (reason := why_shell(self.surfaces)):
             logger.info("modes of the surface itself, not of a solid: %s", reason)
+            return self.shells()
+        if method == "shell":
+            return self.shells()
         try:
-            return first()
+            return self.solids()
         except ModalAnalysisError as error:
-            self.stop.clear()
-            logger.info("modes of %s: %s", "a solid" if reason else "the surface itself, not of a solid", error)
-            self.bar.expect(len(self.surfaces))
-            try:
-                return second()
-            except (MeshError, TetrahedralizationError, ModalAnalysisError):
-                raise error from None
+            if method == "solid":
+                raise
+            logger.info("modes of the surface itself, not of a solid: %s", error)
+        self.stop.clear()
+        self.bar.expect(self.n_keyframes)
+        return self.shells()
 
     def shells(self) -> list[Arrays]:
         """Modes of all surfaces themselves."""
@@ -292,13 +285,7 @@ class _Extraction:
                     f"the modes cannot be computed: {error}; the mesh is likely degenerate: check the surface, or try "
                     "another method or mesher"
                 ) from error
-        return {
-            "eigenvalues": result.eigenvalues,
-            "modes": np.ascontiguousarray(modes.transpose(2, 0, 1)),
-            "rigid_eigenvalues": result.rigid_eigenvalues,
-            "n_zero": np.array([result.n_zero]),
-            "n_pieces": np.array([result.n_pieces]),
-        }
+        return {**result._asdict(), "modes": np.ascontiguousarray(modes.transpose(2, 0, 1))}
 
     @contextlib.contextmanager
     def stage(self, index: int, what: str) -> Iterator[None]:
