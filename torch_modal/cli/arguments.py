@@ -18,39 +18,27 @@ REGISTRATION = ("landmarks", "same_subject", "cache", "progress")
 
 def add_levels(sub: argparse.ArgumentParser) -> None:
     """Add ``--levels`` of subdivision."""
-    text = "how often the number of intervals doubles (default: %(default)s, 8 frames an interval)"
-    sub.add_argument("--levels", type=int, metavar="L", default=3, help=text)
+    sub.add_argument("--levels", type=int, metavar="L", default=3, help="each interval becomes 2**L (default: 3)")
 
 
 def add_modes(sub: argparse.ArgumentParser) -> None:
     """Add options of `extract_bases`."""
-    add, default = sub.add_argument, "(default: %(default)s)"
-    text = f"elastic modes of each key-frame; 20 to 100 are usual {default}"
-    add("--modes", dest="n_modes", type=int, default=30, metavar="N", help=text)
-    text = f"modes of the solid inside, of the surface itself (sheets, thin and open bodies), or what fits {default}"
-    add("--method", choices=("auto", "solid", "shell"), default="auto", help=text)
-    text = f"what fills solids: a lattice of cubes (deterministic), fTetWild, or what fits {default}"
-    add("--mesher", choices=("auto", "lattice", "tetwild"), default="auto", help=text)
+    add = sub.add_argument
+    add("--modes", dest="n_modes", type=int, default=30, metavar="N", help="modes of each key-frame (default: 30)")
+    add("--method", choices=("auto", "solid", "shell"), default="auto", help="modes of the inside or of the surface")
+    add("--mesher", choices=("auto", "lattice", "tetwild"), default="auto", help="what fills solids with tetrahedra")
 
 
 def add_forms(sub: argparse._ActionsContainer) -> None:
     """Add ``--bones`` and ``--targets``, forms of an animation as GLB."""
-    text = "GLB: a skin of at most N bones, a tenth of the size, for engines (40 are usual)"
-    sub.add_argument("--bones", type=int, metavar="N", help=text)
+    sub.add_argument("--bones", type=int, metavar="N", help="GLB: a skin of at most N bones (40 are usual)")
     sub.add_argument("--targets", type=int, metavar="N", help="GLB: N principal shapes as morph targets")
-
-
-def check_forms(args: argparse.Namespace, file: Path) -> None:
-    """Usage error for two forms, or for a form of another format."""
-    if (args.bones or args.targets) and (file.suffix.lower() != ".glb" or (args.bones and args.targets)):
-        args.fail("--bones and --targets are two forms of a .glb file; take one of them")
 
 
 def add_registration(sub: argparse.ArgumentParser, optional: bool = False) -> None:
     """Add options of the registration of meshes of different connectivity, with ``--register`` if it is optional."""
     if optional:
-        text = "the meshes have different connectivity: lay the first onto the others"
-        sub.add_argument("--register", action="store_true", help=text)
+        sub.add_argument("--register", action="store_true", help="the meshes have different connectivity")
     text = "lines of vertex numbers, counted from 0, or of coordinates: a column for each mesh"
     sub.add_argument("--landmarks", type=Path, metavar="FILE", help=text)
     sub.add_argument("--across", dest="same_subject", action="store_false", help="the meshes are different subjects")
@@ -58,8 +46,7 @@ def add_registration(sub: argparse.ArgumentParser, optional: bool = False) -> No
 
 def add_cache(sub: argparse.ArgumentParser) -> None:
     """Add ``--no-cache``, for tetrahedra, modes and registrations."""
-    text = "neither read the cache (the folder TORCH_MODAL_CACHE, or the user's cache folder) nor write to it"
-    sub.add_argument("--no-cache", dest="cache", action="store_false", help=text)
+    sub.add_argument("--no-cache", dest="cache", action="store_false", help="neither read nor write the cache")
 
 
 def pick_options(args: argparse.Namespace, *names: str) -> dict[str, Any]:

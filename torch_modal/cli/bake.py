@@ -5,24 +5,20 @@ from pathlib import Path
 
 from torch_modal.cli import arguments
 from torch_modal.cli.arguments import pick_options
-from torch_modal.io.formats import ANIMATION_FORMATS
+from torch_modal.io.formats import ANIMATION_FORMATS, check_forms
 from torch_modal.io.write import check_suffix
 
 
 def add_arguments(sub: argparse.ArgumentParser) -> None:
     """Add the arguments of ``bake``."""
     add = sub.add_argument
-    text = "meshes in their order, a folder or a quoted pattern of them, an animated GLB, or an NPZ file"
-    add("meshes", nargs="+", type=Path, metavar="MESH", help=text)
-    text = f"the file: {', '.join(ANIMATION_FORMATS)}"
-    add("--out", type=Path, required=True, metavar="FILE", help=text)
+    add("meshes", nargs="+", type=Path, metavar="MESH", help="meshes in order, a folder, an animated GLB, or an NPZ")
+    add("--out", type=Path, required=True, metavar="FILE", help=f"the file: {', '.join(ANIMATION_FORMATS)}")
     arguments.add_forms(sub)
     add("--fps", type=float, metavar="X", help="frames a second (default: as in the file, or 24)")
     add("--cyclic", action="store_true", help="the last frame leads on to the first")
-    text = "take out trembling: what has a period of X frames is halved, what is slower hardly changes"
-    add("--smooth", type=float, metavar="X", help=text)
-    text = "keep each N-th frame and the last as key-frames, and fill in a smooth path through them"
-    add("--every", type=int, metavar="N", help=text)
+    add("--smooth", type=float, metavar="X", help="halve what trembles with a period of X frames")
+    add("--every", type=int, metavar="N", help="keep each N-th frame and the last, and a smooth path through them")
     arguments.add_registration(sub, optional=True)
     arguments.add_cache(sub)
 
@@ -47,7 +43,7 @@ def run(args: argparse.Namespace) -> None:
     if args.every is not None and args.every < 2:
         args.fail(f"--every must be 2 or more; got {args.every}")
     check_suffix(args.out, ANIMATION_FORMATS)
-    arguments.check_forms(args, args.out)
+    check_forms(args.out, args.bones, args.targets)
 
     import torch
 

@@ -4,9 +4,8 @@ import argparse
 import time
 import warnings
 from pathlib import Path
-from typing import Any
 
-from torch_modal.cli import arguments
+from torch_modal.cli import arguments, subdivide
 from torch_modal.cli.arguments import check_output, pick_options
 from torch_modal.io.formats import MESH_FORMATS, PICTURES
 from torch_modal.io.write import check_suffix
@@ -19,8 +18,7 @@ CROSSES = 3  # exit status of `check` when parts newly pass through each other
 def add_register(sub: argparse.ArgumentParser) -> None:
     """Add the arguments of ``register``."""
     sub.add_argument("meshes", nargs=2, type=Path, metavar="MESH", help="the template, and the target")
-    text = f"the template laid onto the target, {', '.join(MESH_FORMATS)}"
-    sub.add_argument("--out", type=Path, required=True, metavar="FILE", help=text)
+    sub.add_argument("--out", type=Path, required=True, metavar="FILE", help=f"the result: {', '.join(MESH_FORMATS)}")
     sub.add_argument("--keep-doubtful", action="store_true", help="write a doubtful result too, with a warning")
     arguments.add_registration(sub)
     arguments.add_cache(sub)
@@ -66,11 +64,9 @@ def add_check(sub: argparse.ArgumentParser) -> None:
     add = sub.add_argument
     add("meshes", nargs="+", type=Path, metavar="MESH", help="meshes of one connectivity")
     add("--keyframes", nargs="+", type=Path, default=[], metavar="FILE", help="meshes whose own crossings are known")
-    text = "check the motion through the meshes: seven shapes between any two, with its shell energy and seconds"
-    add("--between", action="store_true", help=text)
+    add("--between", action="store_true", help="check seven shapes between any two, and the energy of the motion")
     add("--contact", action="store_true", help="with --between: keep parts from passing through each other")
-    text = "draw the meshes with crossings in colour, as .png or .pdf"
-    add("--picture", type=Path, metavar="FILE", help=text)
+    add("--picture", type=Path, metavar="FILE", help="draw the meshes with crossings in colour, as .png or .pdf")
 
 
 def check(args: argparse.Namespace) -> int:
@@ -146,8 +142,8 @@ def check(args: argparse.Namespace) -> int:
 
 def add_carry(sub: argparse.ArgumentParser) -> None:
     """Add the arguments of ``carry``."""
-    add, text = sub.add_argument, "meshes of one connectivity; the points lie on the first"
-    add("meshes", nargs="+", type=Path, metavar="MESH", help=text)
+    add = sub.add_argument
+    add("meshes", nargs="+", type=Path, metavar="MESH", help="meshes of one connectivity; the points lie on the first")
     add("--points", type=Path, required=True, metavar="FILE.ply", help="points, or splats")
     add("--out", type=Path, required=True, metavar="FOLDER", help="for a PLY file for each mesh")
 
@@ -187,8 +183,7 @@ def carry(args: argparse.Namespace) -> None:
 def add_modes(sub: argparse.ArgumentParser) -> None:
     """Add the arguments of ``modes``."""
     sub.add_argument("meshes", nargs="+", type=Path, metavar="MESH", help="key-frames of one connectivity")
-    text = "FILE.safetensors for one mesh, or a folder for a file of each mesh's name"
-    sub.add_argument("--out", type=Path, required=True, metavar="FILE_OR_FOLDER", help=text)
+    sub.add_argument("--out", type=Path, required=True, metavar="FILE_OR_FOLDER", help="FILE.safetensors, or a folder")
     arguments.add_modes(sub)
     arguments.add_cache(sub)
 
@@ -232,12 +227,10 @@ def add_precompute(sub: argparse.ArgumentParser) -> None:
     add = sub.add_argument
     add("root", type=Path, metavar="DIR", help="the folder tree with the key-frames")
     add("--out", type=Path, required=True, metavar="DIR", help="where the bases go")
-    text = "sets at a time, each in a process with one thread (default: one for each processor)"
-    add("--workers", type=int, metavar="N", help=text)
+    add("--workers", type=int, metavar="N", help="sets at a time (default: one for each processor)")
     add("--scheduler", metavar="ADDRESS", help="run on the Dask cluster with this scheduler instead")
     add("--timeout", type=float, metavar="S", default=600.0, help="for a set (default: 600)")
-    text = "the meshes of a folder are a motion, in the order of their names, perhaps with a file times.txt"
-    add("--sequence", action="store_true", help=text)
+    add("--sequence", action="store_true", help="meshes of a folder are a motion, perhaps with a file times.txt")
     arguments.add_modes(sub)
 
 
@@ -286,29 +279,20 @@ def demo(args: argparse.Namespace) -> None:
     Run the main job on the samples that come with the package: a galloping creature
     (a cycle of six key-frames) and a closing hand (two key-frames).
 
-    For each it writes an animation (GLB) and a picture of the sequence next to linear
-    interpolation.
+    For each it runs `subdivide`, which writes an animation (GLB) and a picture of the sequence
+    next to linear interpolation.
 
     Examples:
       torch-modal demo --sample hand --out hand-demo
     """
     names = [args.sample] if args.sample else DEMO_SAMPLES
-    files = [args.out / f"{name}{suffix}" for name in names for suffix in (".glb", ".png")]
-    check_output(args, files, ())
+    check_output(args, [args.out / f"{name}{suffix}" for name in names for suffix in (".glb", ".png")], ())
 
-    import torch_modal as tm
-    from torch_modal.data.samples import load_sample
+    from torch_modal.data.samples import SAMPLES, sample_files
 
     for name in names:
-        sample = load_sample(name)
-        keyframes, faces, cyclic = sample.keyframes, sample.faces, sample.cyclic
-        args.report(f"{name}: {len(keyframes)} key-frames of {keyframes.shape[1]} vertices")
-        frames = tm.subdivide(keyframes, faces, args.levels, cyclic=cyclic, progress=args.progress)
-        places = tm.keyframe_places(len(keyframes), args.levels, cyclic=cyclic)
-        keys = [place for place in places if place < len(frames)]
-        plays: dict[str, Any] = {"cyclic": cyclic, "ping_pong": not cyclic, "duration": sample.seconds}
-        glb, png = (args.out / f"{name}{suffix}" for suffix in (".glb", ".png"))
-        tm.save_animation(frames, faces, glb, keyframe_indices=keys, overwrite=True, **plays)
-        rows = {"torch_modal": frames, "linear": tm.linear_sequence(keyframes, places)}
-        tm.render_sequence(rows, faces, png, keyframe_indices=keys, view=sample.view, overwrite=True)
-    args.report(f"written to {args.out}: " + ", ".join(file.name for file in files))
+        plays = ["--cyclic" if SAMPLES[name]["cyclic"] else "--ping-pong", "--duration", str(SAMPLES[name]["seconds"])]
+        command = ["subdivide", *map(str, sample_files(name)), "--levels", str(args.levels), *plays, "--overwrite"]
+        command += ["--out", str(args.out / f"{name}.glb"), "--picture", str(args.out / f"{name}.png")]
+        args.report(" ".join(["torch-modal", *command]))
+        subdivide.run(args.parse(command, argparse.Namespace(progress=args.progress, report=args.report)))

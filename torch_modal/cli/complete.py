@@ -13,13 +13,10 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
     """Arguments of ``complete``."""
     add = sub.add_argument
     add("mesh", type=Path, metavar="MESH", help="a whole mesh: the template, or the first key-frame")
-    text = "clouds (PLY), meshes of any connectivity as clouds, markers (CSV with time,vertex,x,y,z)"
-    add("observations", nargs="+", type=Path, metavar="SEEN", help=text)
-    text = "when the clouds were seen, in their order (default: 0 1 2 ...)"
-    add("--times", nargs="+", type=float, metavar="T", help=text)
+    add("observations", nargs="+", type=Path, metavar="SEEN", help="clouds, meshes, markers (CSV: time,vertex,x,y,z)")
+    add("--times", nargs="+", type=float, metavar="T", help="when the clouds were seen (default: 0 1 2 ...)")
     add("--keyframes", nargs="+", type=Path, default=[], metavar="MESH", help="further whole, exact meshes")
-    text = "when the whole meshes are, the first included (default: that is a template of no time)"
-    add("--keyframe-times", nargs="+", type=float, metavar="T", help=text)
+    add("--keyframe-times", nargs="+", type=float, metavar="T", help="when the whole meshes are, the first included")
     add("--noise", type=float, metavar="X", help="standard deviation of the points (default: estimated)")
     add("--estimate-times", action="store_true", help="times between the first and the last are not exact")
     add("--contact", action="store_true", help="keep parts from passing through each other (extra contact)")

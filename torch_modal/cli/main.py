@@ -71,7 +71,7 @@ def build_parser() -> argparse.ArgumentParser:
         group.add_argument("--quiet", action="store_true", help="report warnings and errors only")
         group.add_argument("--debug", action="store_true", help="show the traceback of an error")
         # Arguments that contradict each other end with the usage and status 2, like all that argparse refuses.
-        sub.set_defaults(command=run, fail=sub.error)
+        sub.set_defaults(command=run, fail=sub.error, parse=parser.parse_args)
     return parser
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from torch_modal.cli import arguments
 from torch_modal.cli.arguments import pick_options
-from torch_modal.io.formats import ANIMATION_FORMATS, MESH_FORMATS, PICTURES, Timing
+from torch_modal.io.formats import ANIMATION_FORMATS, MESH_FORMATS, PICTURES, Timing, check_forms
 from torch_modal.io.write import check_suffix
 
 ANIMATION = ("cyclic", "duration", "fps", "ping_pong", "ease")
@@ -19,8 +19,7 @@ def add_output(sub: argparse.ArgumentParser, picture: str) -> None:
     add = sub.add_argument
     text = f"the animation alone: {', '.join(ANIMATION_FORMATS)}; a folder: numbered frames and animation.glb"
     add("--out", type=Path, required=True, metavar="FILE_OR_FOLDER", help=text)
-    text = "format of the numbered frames (default: as the first mesh, with everything else in its file)"
-    add("--format", choices=[suffix[1:] for suffix in MESH_FORMATS], help=text)
+    add("--format", choices=[suffix[1:] for suffix in MESH_FORMATS], help="of the frames (default: the first mesh's)")
     add("--picture", type=Path, metavar="FILE", help=f"also draw {picture}, .png or .pdf")
 
 
@@ -62,20 +61,14 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
     arguments.add_levels(sub)
     add("--frames", dest="n_frames", type=int, metavar="N", help="of the result (default: by the levels)")
     add("--cyclic", action="store_true", help="the last key-frame leads on to the first")
-    text = "times of the key-frames, ascending, in any unit; of a cycle, also the time when it begins again"
-    add("--times", nargs="+", type=float, metavar="T", help=text)
-    text = "interpolate each pair of key-frames alone, without its neighbours in time"
-    add("--no-smooth", dest="smooth", action="store_const", const=False, help=text)
+    add("--times", nargs="+", type=float, metavar="T", help="of the key-frames; of a cycle, also when it begins again")
+    add("--no-smooth", dest="smooth", action="store_const", const=False, help="interpolate each pair alone")
     add("--contact", action="store_true", help="keep parts from passing through each other (extra contact)")
-    text = "a coarser mesh of N vertices moves and carries the detail; 0: none (default: 20000 for large meshes)"
-    add("--proxy", type=int, metavar="N", help=text)
-    text = "accurate; fast, without steps on the fine mesh; paper, its method whole (default: %(default)s)"
-    add("--preset", choices=("accurate", "fast", "paper"), default="accurate", help=text)
+    add("--proxy", type=int, metavar="N", help="vertices of a coarser mesh that moves large ones; 0: none")
+    add("--preset", choices=("accurate", "fast", "paper"), default="accurate", help="(default: accurate)")
     group = sub.add_argument_group("animation")
-    text = "of the sequence once (default: 1 for a cycle, 2 for two key-frames, 1 an interval of more)"
-    group.add_argument("--duration", type=float, metavar="SECONDS", help=text)
-    text = "frames a second; with --duration, pictures or samples a second of videos and point caches (default: 24)"
-    group.add_argument("--fps", type=float, metavar="X", help=text)
+    group.add_argument("--duration", type=float, metavar="SECONDS", help="of the sequence once")
+    group.add_argument("--fps", type=float, metavar="X", help="frames, or samples of videos and caches, a second")
     group.add_argument("--ping-pong", action="store_true", help="there and back again")
     group.add_argument("--ease", action="store_true", help="slow at both ends")
     arguments.add_forms(group)
@@ -105,7 +98,7 @@ def run(args: argparse.Namespace) -> None:
     if len(args.meshes) < 2:
         args.fail("subdivide needs two key-frames or more")
     animation = check_files(args, args.meshes)
-    arguments.check_forms(args, animation)
+    check_forms(animation, args.bones, args.targets)
     Timing(len(args.meshes), **pick_options(args, *ANIMATION))
 
     import torch_modal as tm

@@ -20,20 +20,16 @@ if TYPE_CHECKING:
 def add_arguments(sub: argparse.ArgumentParser) -> None:
     """Add the arguments of ``view``."""
     add = sub.add_argument
-    text = "shapes in their order, a folder, or one animated GLB or NPZ"
-    add("meshes", nargs="+", type=Path, metavar="MESH", help=text)
+    add("meshes", nargs="+", type=Path, metavar="MESH", help="shapes in order, a folder, an animated GLB, or an NPZ")
     text = "another sequence of as many shapes, of the same faces; may be given several times"
     add("--compare", nargs="+", type=Path, action="append", default=[], metavar="FILE", help=text)
     add("--linear", action="store_true", help="also show linear interpolation of the key-frames of the first sequence")
-    text = "which frames are key-frames, from 0 (default: the GLB's, or the first and the last)"
-    add("--keyframes", nargs="+", type=int, metavar="N", help=text)
+    add("--keyframes", nargs="+", type=int, metavar="N", help="numbers of the key-frames (default: the GLB's, or ends)")
     add("--cyclic", action="store_true", help="the last frame leads on to the first")
     add("--fps", type=float, metavar="X", help="frames a second (default: the GLB's, or 24)")
     add("--up", choices=("y", "z"), help="what is up (default: Y, unless the first shape is flat in Y)")
-    text = "write the page there, as .html (default: a temporary file, opened)"
-    add("--page", type=Path, metavar="FILE", help=text)
-    text = "a page to pick landmarks of two meshes or more; it starts with the landmarks of FILE, if given"
-    add("--landmarks", nargs="?", const=True, metavar="FILE", help=text)
+    add("--page", type=Path, metavar="FILE", help="write the page there, as .html (default: a temporary file, opened)")
+    add("--landmarks", nargs="?", const=True, metavar="FILE", help="pick landmarks of meshes, or continue with FILE")
 
 
 def run(args: argparse.Namespace) -> None:
@@ -66,16 +62,16 @@ def run(args: argparse.Namespace) -> None:
         inputs = [] if args.landmarks in (None, True) else [Path(args.landmarks)]
         check_output(args, [args.page], [*chain(*sequences), *inputs])
 
-    page, what = _landmarks(args) if args.landmarks else _sequences(sequences, args)
+    page = _landmarks(args) if args.landmarks else _sequences(sequences, args)
     # Without --page it goes to a temporary folder, and stays: the browser reads it after this process.
     path = page.save(args.page or Path(tempfile.mkdtemp(prefix="torch_modal-"), "page.html"), args.overwrite)
-    args.report(f"{what}: {path}")
+    args.report(f"page: {path}")
     if not args.page and not webbrowser.open(path.absolute().as_uri()):
         print(f"no browser was found to open it; open it yourself, or write it elsewhere with --page: {path}")
 
 
-def _landmarks(args: argparse.Namespace) -> tuple[Page, str]:
-    """A page to pick landmarks on meshes of any connectivity, and what it shows."""
+def _landmarks(args: argparse.Namespace) -> Page:
+    """A page to pick landmarks on meshes of any connectivity."""
     import torch_modal as tm
     from torch_modal.io.read import open_asset
     from torch_modal.registration.landmarks import landmark_vertices
@@ -83,12 +79,11 @@ def _landmarks(args: argparse.Namespace) -> tuple[Page, str]:
     meshes = [(asset.positions, asset.faces) for asset in map(open_asset, args.meshes)]
     rows = None if args.landmarks is True else landmark_vertices(args.landmarks, [points for points, _ in meshes])
     names = _number_names([path.name for path in args.meshes])
-    page = tm.show_landmarks(dict(zip(names, meshes, strict=True)), rows, title="Landmarks")
-    return page, f"{len(meshes)} meshes to pick landmarks on"
+    return tm.show_landmarks(dict(zip(names, meshes, strict=True)), rows, title="Landmarks")
 
 
-def _sequences(sequences: list[list[Path]], args: argparse.Namespace) -> tuple[Page, str]:
-    """A page that plays sequences of the same faces, and what it shows."""
+def _sequences(sequences: list[list[Path]], args: argparse.Namespace) -> Page:
+    """A page that plays sequences of the same faces."""
     import torch
 
     import torch_modal as tm
@@ -98,26 +93,20 @@ def _sequences(sequences: list[list[Path]], args: argparse.Namespace) -> tuple[P
 
     first, faces, options = read_shapes(sequences[0])
     names = [(paths[0] if len(paths) == 1 else paths[0].parent).absolute().stem for paths in sequences]
-    shapes, n = [first], len(first)
+    shapes = [first]
     for paths in sequences[1:]:
         frames, other_faces, _ = read_shapes(paths)
         require_same_mesh(sequences[0][0], (first[0], faces), paths[0], (frames[0], other_faces))
-        if len(frames) != n:
-            raise ValueError(
-                f"{paths[0]} has {len(frames)} shapes, {sequences[0][0]} has {n}; compared sequences need equally many"
-            )
         shapes.append(frames)
     asked = {"keyframe_indices": args.keyframes, "fps": args.fps, "cyclic": args.cyclic or None, "up": args.up}
     options |= {name: value for name, value in asked.items() if value is not None}
     if args.linear:
-        cyclic = bool(options.get("cyclic"))
+        n, cyclic = len(first), bool(options.get("cyclic"))
         ends = [0] if cyclic else [0, n - 1]
         keys = check_indices([*ends, *(options.get("keyframe_indices") or [n - 1])], n, "key-frames")
         names.append("linear")
         shapes.append(tm.linear_sequence(torch.from_numpy(first[keys]), [*keys, n] if cyclic else keys).numpy())
-    page = tm.show(dict(zip(_number_names(names), shapes, strict=True)), faces, **options, title=names[0])
-    times = f"{len(shapes)} x " if len(shapes) > 1 else ""
-    return page, f"{times}{n} shapes of {first.shape[1]} vertices"
+    return tm.show(dict(zip(_number_names(names), shapes, strict=True)), faces, **options, title=names[0])
 
 
 def _number_names(names: list[str]) -> list[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -74,6 +75,12 @@ ANIMATION_FORMATS: dict[str, OutputFormat] = {
 """Videos and point caches have shapes alone, of which nobody needs a warning."""
 PICTURES = (".png", ".pdf")
 PAGES = (".html", ".htm")
+
+
+def check_forms(path: Path, bones: object, targets: object) -> None:
+    """Raise a ValueError for two forms of a GLB, or for a form of another format."""
+    if (bones, targets) != (None, None) and (path.suffix.lower() != ".glb" or None not in (bones, targets)):
+        raise ValueError(f"{path.name!r}: bones and targets are two forms of a .glb file; other formats hold neither")
 
 
 class Timing:

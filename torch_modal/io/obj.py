@@ -162,6 +162,9 @@ class ObjAsset(Asset):
 
 
 def _numbers(rows: list[list[str]], width: int) -> FloatArray:
+    for row in rows:
+        if len(row) < width:
+            raise ValueError(f"a line has fewer than {width} numbers: {' '.join(row)[:60]!r}")
     return np.array(rows, dtype=np.float64).reshape(-1, width)
 
 

@@ -11,7 +11,7 @@ from torch_modal.arrays import Array
 from torch_modal.geometry.skin import Skin
 from torch_modal.io.asset import Asset
 from torch_modal.io.files import atomic_write
-from torch_modal.io.formats import ANIMATION_FORMATS, Animation, Timing, resample
+from torch_modal.io.formats import ANIMATION_FORMATS, Animation, Timing, check_forms, resample
 from torch_modal.io.write import check_frames, check_indices, check_suffix, refuse_existing
 from torch_modal.motion.skin import bake
 from torch_modal.progress import Progress, ProgressReport
@@ -87,10 +87,7 @@ def save_animation(
     """
     shapes, triangles = check_frames(frames, faces)
     path = Path(out)
-    if (bones, targets) != (None, None) and (path.suffix.lower() != ".glb" or None not in (bones, targets)):
-        raise ValueError(
-            f"out={path.name!r}: bones or targets are two forms of a .glb file; other formats hold neither"
-        )
+    check_forms(path, bones, targets)
     suffix = check_suffix(path, ANIMATION_FORMATS)
     if targets is not None and not (isinstance(targets, int) and 1 <= targets < len(shapes)):
         raise ValueError(
