@@ -1,8 +1,6 @@
 """Lazy imports of optional packages."""
 
 import importlib
-import importlib.util
-from collections.abc import Collection
 from typing import Any
 
 from torch_modal.errors import MissingPackageError
@@ -22,22 +20,5 @@ def require(module: str, extra: str, what: str) -> Any:
     try:
         return importlib.import_module(module)
     except ImportError as error:
-        raise _missing([module], extra, what) from error
-
-
-def require_installed(modules: Collection[str], extra: str, what: str) -> None:
-    """Raise before the work begins if optional packages are missing, without importing them.
-
-    Raises:
-        MissingPackageError: Packages are not installed.
-    """
-    missing = [name for name in modules if importlib.util.find_spec(name) is None]
-    if missing:
-        raise _missing(missing, extra, what)
-
-
-def _missing(modules: list[str], extra: str, what: str) -> MissingPackageError:
-    are = "is" if len(modules) == 1 else "are"
-    return MissingPackageError(
-        f"{what} needs {' and '.join(modules)}, which {are} not installed: pip install 'torch_modal[{extra}]'"
-    )
+        message = f"{what} needs {module}, which is not installed: pip install 'torch_modal[{extra}]'"
+        raise MissingPackageError(message) from error

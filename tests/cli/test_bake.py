@@ -52,13 +52,6 @@ def test_a_folder_becomes_a_skin(folder: Path, tmp_path: Path, capsys: pytest.Ca
     assert tm.load_sequence(tmp_path / "b.npz").frames[::2].sub(frames).abs().max() < 1e-5 * DIAGONAL
 
 
-def test_principal_shapes_of_arrays(tmp_path: Path) -> None:
-    np.savez(tmp_path / "a.npz", frames=FRAMES, faces=FACES)
-    assert main(["bake", str(tmp_path / "a.npz"), "--targets", "2", "--out", str(tmp_path / "a.glb")]) == 0
-    frames = tm.load_sequence(tmp_path / "a.glb").frames
-    assert 1e-5 < rms(frames, FRAMES) < 0.05
-
-
 def test_key_frames_alone_and_the_path_between_them(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -114,20 +107,6 @@ def test_meshes_of_different_connectivity_are_registered(
     assert seen["register"] and not seen["same_subject"] and not seen["cache"]
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["--bones", "3", "--targets", "3"], "two forms of a .glb file"),
-        (["--bones", "3", "--out", "a.usda"], "two forms of a .glb file"),
-    ],
-)
-def test_wrong_usage(
-    folder: Path, tmp_path: Path, options: list[str], message: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["bake", str(folder), "--out", str(tmp_path / "a.glb"), *options]) == 1
-    assert message in capsys.readouterr().err
-
-
 def test_nothing_is_overwritten_and_one_shape_is_no_motion(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -142,6 +121,8 @@ def test_nothing_is_overwritten_and_one_shape_is_no_motion(
     assert "is one shape; a motion has two frames or more" in capsys.readouterr().err
     assert main(["bake", str(folder), "--out", str(tmp_path / "b.obj")]) == 1
     assert "must end in" in capsys.readouterr().err
+    assert main(["bake", str(folder), "--bones", "3", "--out", str(tmp_path / "b.usda")]) == 1
+    assert "bones are for .glb files" in capsys.readouterr().err
     assert main(["bake", str(folder), "--smooth", "0", "--out", str(tmp_path / "b.glb")]) == 1
     assert "smooth must be a positive number of frames, got 0.0" in capsys.readouterr().err
     assert main(["bake", str(folder), "--across", "--out", str(tmp_path / "b.glb")]) == 1

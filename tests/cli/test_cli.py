@@ -195,7 +195,8 @@ def test_errors_are_one_line_and_debug_shows_the_traceback(
     out = ["--out", str(tmp_path / "a.glb")]
     assert fails(capsys, "subdivide", meshes[0], "missing.obj", *out) == "missing.obj: no such file"
     (tmp_path / "bad.obj").write_text("v 0 0\n")
-    assert "a line has fewer than 3 numbers: '0 0'" in fails(capsys, "subdivide", meshes[0], str(tmp_path / "bad.obj"), *out)
+    message = fails(capsys, "subdivide", meshes[0], str(tmp_path / "bad.obj"), *out)
+    assert "a line has fewer than 3 numbers: '0 0'" in message
     assert "whole number from 0 to 12" in fails(capsys, "subdivide", *meshes, *out, "--levels", "13")
     assert "ways to deform" in fails(capsys, "modes", meshes[0], "--out", str(tmp_path), "--modes", "100000")
     with pytest.raises(FileNotFoundError):

@@ -52,7 +52,7 @@ def test_own_formats_write(tmp_path: Path) -> None:
 
 
 def test_messages_and_help_list_all_formats(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(ValueError, match=r"\.npz, \.csv or \.needs, got 'a\.avi'"):
+    with pytest.raises(ValueError, match=r"\.npz or \.csv or \.needs, got 'a\.avi'"):
         tm.save_animation(FRAMES, FACES, tmp_path / "a.avi")
     with pytest.raises(ValueError, match="fmt must be one of ply, obj, off, glb, xyz, got 'stl'"):
         tm.save_frames(FRAMES, FACES, tmp_path, "stl")

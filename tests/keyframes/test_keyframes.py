@@ -163,8 +163,12 @@ TWICE[7] = TWICE[6]  # nothing strange in it, but one is missing
     [
         ([*CUBE.tolist(), [2, 2, 2]], CUBE_FACES, r"b\.obj has 9 vertices, .*a\.obj has 8"),
         (CUBE, CUBE_FACES[:-1], r"b\.obj has 11 faces, .*a\.obj has 12"),
-        (CUBE, OTHER_DIAGONAL, r"face of .*b\.obj with the vertices \[0, 1, 4\].*\(2 of 12 faces.*diagonal"),
-        (CUBE, TWICE, r"face of .*a\.obj with the vertices \[2, 6, 7\] is not in .*b\.obj"),
+        (
+            CUBE,
+            OTHER_DIAGONAL,
+            r"vertices \[0, 1, 4\] is in one of .* \(so are 4 faces\).*diagonal",
+        ),
+        (CUBE, TWICE, r"the face with the vertices \[2, 6, 7\] is in one"),
     ],
 )
 def test_files_of_different_meshes_are_refused(tmp_path, vertices, faces, match):
@@ -230,8 +234,8 @@ HUGE = {
         ("junk.obj", bytes(range(256)) * 9, "no faces"),
         ("word.obj", obj(CUBE, CUBE_FACES) + "f 1 2 x\n", "cannot be read as OBJ"),
         ("number.obj", "v 0 0 zero\n", "cannot be read as OBJ"),
-        ("short.obj", "v 0 0\n", "fewer than three numbers: 'v 0 0'"),
-        ("zero.obj", obj(CUBE, CUBE_FACES) + "f 0 1 2\n", "index 0"),
+        ("short.obj", "v 0 0\n", "fewer than 3 numbers: '0 0'"),
+        ("zero.obj", obj(CUBE, CUBE_FACES) + "f 0 1 2\n", r"face 12 uses the vertices \[-1, 0, 1\]"),
         ("line.obj", obj(CUBE, CUBE_FACES) + "f 1 2\n", "fewer than three corners"),
         ("range.obj", obj(CUBE, [*CUBE_FACES.tolist(), [0, 1, 8]]), r"face 12 uses the vertices \[0, 1, 8\]"),
         ("under.obj", obj(CUBE, CUBE_FACES) + "f 1 2 -9\n", "face 12 uses"),

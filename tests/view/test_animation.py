@@ -1,7 +1,7 @@
 """Animations of all formats, read back by other libraries or by the letter of the format."""
 
-import importlib.util
 import struct
+import sys
 
 import numpy as np
 import pygltflib
@@ -157,7 +157,8 @@ def small_pictures(monkeypatch):
 
 @pytest.mark.parametrize(("suffix", "extra"), [("mp4", "video"), ("usdc", "usd")])
 def test_missing_packages_are_named_before_the_work(tmp_path, monkeypatch, suffix, extra):
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    for name in ("imageio", "pxr"):
+        monkeypatch.setitem(sys.modules, name, None)
     with pytest.raises(MissingPackageError, match=rf"pip install 'torch_modal\[{extra}\]'"):
         ANIMATION_FORMATS[f".{suffix}"].check_installed("a")
     with pytest.raises(MissingPackageError):

@@ -578,7 +578,6 @@ def test_landmarks_that_cannot_be_shown(
         main(["view", str(two[0]), "--landmarks", *pages])
     with pytest.raises(ValueError, match="two meshes or more"):
         tm.show_landmarks({"a": ball})
-    with pytest.raises(ValueError, match="a column for each of the 2"):
-        tm.show_landmarks({"a": ball, "b": ball}, np.zeros((3, 3), dtype=int))
-    with pytest.raises(ValueError, match="vertices of the meshes from 0"):
-        tm.show_landmarks({"a": ball, "b": ball}, np.array([[0, -1]]))
+    for wrong in (np.zeros((3, 3), dtype=int), np.array([[0, -1]]), np.array([[0.0, 1.0]])):
+        with pytest.raises(ValueError, match="a column for each of the meshes"):
+            tm.show_landmarks({"a": ball, "b": ball}, wrong)

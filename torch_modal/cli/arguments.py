@@ -29,10 +29,9 @@ def add_modes(sub: argparse.ArgumentParser) -> None:
     add("--mesher", choices=("auto", "lattice", "tetwild"), default="auto", help="what fills solids with tetrahedra")
 
 
-def add_forms(sub: argparse._ActionsContainer) -> None:
-    """Add ``--bones`` and ``--targets``, forms of an animation as GLB."""
+def add_bones(sub: argparse._ActionsContainer) -> None:
+    """Add ``--bones`` of an animation as GLB."""
     sub.add_argument("--bones", type=int, metavar="N", help="GLB: a skin of at most N bones (40 are usual)")
-    sub.add_argument("--targets", type=int, metavar="N", help="GLB: N principal shapes as morph targets")
 
 
 def add_registration(sub: argparse.ArgumentParser, optional: bool = False) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 
 from torch_modal.cli import arguments
 from torch_modal.cli.arguments import pick_options
-from torch_modal.io.formats import ANIMATION_FORMATS, MESH_FORMATS, PICTURES, Timing, check_forms
+from torch_modal.io.formats import ANIMATION_FORMATS, MESH_FORMATS, PICTURES, Timing, check_bones
 from torch_modal.io.write import check_suffix
 
 ANIMATION = ("cyclic", "duration", "fps", "ping_pong", "ease")
@@ -71,7 +71,7 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
     group.add_argument("--fps", type=float, metavar="X", help="frames, or samples of videos and caches, a second")
     group.add_argument("--ping-pong", action="store_true", help="there and back again")
     group.add_argument("--ease", action="store_true", help="slow at both ends")
-    arguments.add_forms(group)
+    arguments.add_bones(group)
     arguments.add_registration(sub, optional=True)
     arguments.add_modes(sub)
     arguments.add_cache(sub)
@@ -98,7 +98,7 @@ def run(args: argparse.Namespace) -> None:
     if len(args.meshes) < 2:
         args.fail("subdivide needs two key-frames or more")
     animation = check_files(args, args.meshes)
-    check_forms(animation, args.bones, args.targets)
+    check_bones(animation, args.bones)
     Timing(len(args.meshes), **pick_options(args, *ANIMATION))
 
     import torch_modal as tm
@@ -121,7 +121,7 @@ def run(args: argparse.Namespace) -> None:
     frames[keys] = keyframes
     seams = f", {welded.n_merged} of them copies along seams" if welded.n_merged else ""
     args.report(f"{n} key-frames of {keyframes.shape[1]} vertices{seams} -> {len(frames)} frames")
-    options = pick_options(args, "cyclic", "duration", "ping_pong", "ease", "bones", "targets")
+    options = pick_options(args, "cyclic", "duration", "ping_pong", "ease", "bones")
     write_sequence(args, animation, frames, faces, asset, keyframe_indices=keys, times=when, **options)
     if args.picture:
         rows = {"torch_modal": frames, "linear": tm.linear_sequence(keyframes, places)}

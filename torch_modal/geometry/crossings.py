@@ -34,7 +34,7 @@ def require_contact() -> None:
     Raises:
         MissingPackageError: It names what is missing.
     """
-    extras.require_installed(("igl",), "contact", "contact")
+    extras.require("igl", "contact", "contact")
 
 
 class Crossings:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from torch_modal.arrays import FloatArray, IntArray
-from torch_modal.extras import require_installed
+from torch_modal.extras import require
 from torch_modal.io.asset import FEATURES, Asset
 from torch_modal.progress import Progress
 from torch_modal.times import check_times
@@ -45,7 +45,8 @@ class OutputFormat:
 
     def check_installed(self, name: str) -> None:
         """Raise a MissingPackageError that names the file, before any work, if a module is not installed."""
-        require_installed(self.modules, self.extra, name)
+        for module in self.modules:
+            require(module, self.extra, name)
 
     def write(self, *arguments: Any) -> Any:
         """Call the function."""
@@ -77,10 +78,10 @@ PICTURES = (".png", ".pdf")
 PAGES = (".html", ".htm")
 
 
-def check_forms(path: Path, bones: object, targets: object) -> None:
-    """Raise a ValueError for two forms of a GLB, or for a form of another format."""
-    if (bones, targets) != (None, None) and (path.suffix.lower() != ".glb" or None not in (bones, targets)):
-        raise ValueError(f"{path.name!r}: bones and targets are two forms of a .glb file; other formats hold neither")
+def check_bones(path: Path, bones: object) -> None:
+    """Raise a ValueError for bones in another format than GLB."""
+    if bones is not None and path.suffix.lower() != ".glb":
+        raise ValueError(f"bones are for .glb files, got {path.name!r}")
 
 
 class Timing:
@@ -176,5 +177,3 @@ class Animation(NamedTuple):
     progress: Progress
     skin: Skin | None = None
     """The motion as bones, instead of morph targets."""
-    targets: int | None = None
-    """Number of principal shapes, instead of a morph target for each frame."""

@@ -17,6 +17,7 @@ from urllib.parse import unquote
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import BPoly
 from scipy.spatial.transform import Rotation, Slerp
 
 from torch_modal.arrays import FloatArray
@@ -163,12 +164,7 @@ class Document:
         Positions and times need bounds. Normalized integers stand for fractions.
         """
         rows = np.ascontiguousarray(array).reshape(len(array), -1)
-        size = rows.dtype.itemsize * rows.shape[1]
-        gap = -size % 4 if target == ARRAY_BUFFER else 0  # each vertex starts at a multiple of four bytes
-        stored = np.pad(rows.view("u1"), ((0, 0), (0, gap))) if gap else rows
-        view = self.add_bytes(stored.tobytes(), target)
-        if gap:
-            self.root["bufferViews"][view]["byteStride"] = size + gap
+        view = self.add_bytes(rows.tobytes(), target)
         code = next(code for code, name in COMPONENTS.items() if np.dtype(name) == rows.dtype)
         accessor: Json = {"bufferView": view, "componentType": code, "count": len(rows), "type": kind}
         if normalized:
@@ -225,18 +221,15 @@ def sample(document: Document, sampler: Json, times: FloatArray, quaternions: bo
     values = document.floats(sampler["output"]).reshape(len(keys), 3 if mode == "CUBICSPLINE" else 1, -1)
     before, middle, after = values[:, 0], values[:, values.shape[1] // 2], values[:, -1]
     times = np.clip(times, keys[0], keys[-1])
-    i = np.searchsorted(keys, times, "right") - 1
     if mode == "STEP" or len(keys) == 1:
-        return middle[i]
+        return middle[np.searchsorted(keys, times, "right") - 1]
     if quaternions and mode == "LINEAR":
         return np.asarray(Slerp(keys, Rotation.from_quat(middle))(times).as_quat())
-    i = np.minimum(i, len(keys) - 2)
-    seconds = (keys[i + 1] - keys[i])[:, None]
-    u = (times - keys[i])[:, None] / np.maximum(seconds, 1e-30)
+    controls = [middle[:-1], middle[1:]]
     if mode == "CUBICSPLINE":  # glTF 2.0, appendix C.5
-        tangents = after[i] * u * (1 - u) ** 2 + before[i + 1] * u**2 * (u - 1)
-        return (1 + 2 * u) * (1 - u) ** 2 * middle[i] + u**2 * (3 - 2 * u) * middle[i + 1] + seconds * tangents
-    return (1 - u) * middle[i] + u * middle[i + 1]
+        thirds = np.diff(keys)[:, None] / 3
+        controls[1:1] = [middle[:-1] + thirds * after[:-1], middle[1:] - thirds * before[1:]]
+    return np.asarray(BPoly(np.stack(controls), keys)(times))
 
 
 def world_transforms(document: Document, moved: Tracks | None = None) -> dict[int, FloatArray]:

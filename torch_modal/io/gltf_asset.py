@@ -55,13 +55,6 @@ class GltfAsset(Asset):
         self.document = Document.read(path)
         if compressed := sorted({*self.document.get("extensionsRequired")} & {*_COMPRESSED}):
             raise MeshError(f"{path}: its meshes are compressed ({compressed[0]}); export it without compression")
-        for texture in self.document.get("textures"):
-            if "source" in texture:
-                self.document.get("images", texture["source"])
-        for material in self.document.get("materials"):
-            for key, used in {**material, **material.get("pbrMetallicRoughness", {})}.items():
-                if key.endswith("Texture"):
-                    self.document.get("textures", used["index"])
         self._world = world_transforms(self.document)
         self._primitives: list[_Primitive] = []
         positions, faces, n = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], 0
@@ -90,8 +83,6 @@ class GltfAsset(Asset):
                 count, attributes = len(local), primitive["attributes"]
                 if any(len(self.document.accessor(number)) != count for number in attributes.values()):
                     raise ValueError("a primitive whose attributes have different lengths")
-                if "material" in primitive:
-                    self.document.get("materials", primitive["material"])
                 indices = np.arange(count)
                 if "indices" in primitive:
                     indices = self.document.accessor(primitive["indices"])[:, 0].astype(np.int64)
@@ -171,9 +162,11 @@ class GltfAsset(Asset):
         @cache
         def take(accessor: int, target: int) -> int:
             """Copy an accessor as it is; returns its number in the copy."""
-            source = old.get("accessors", accessor)
+            source, numbers = old.get("accessors", accessor), old.accessor(accessor)
             normalized = source.get("normalized", False)
-            return document.add(old.accessor(accessor), source["type"], target, "min" in source, normalized)
+            if target == ARRAY_BUFFER and numbers.itemsize * numbers.shape[1] % 4:  # vertices start at multiples of 4
+                numbers, normalized = old.floats(accessor).astype(np.float32), False
+            return document.add(numbers, source["type"], target, "min" in source, normalized)
 
         # Each node gets a mesh of its own: the same mesh may be shown, and deformed, at several places.
         for node, group in groupby(self._primitives, lambda primitive: primitive.node):

@@ -32,18 +32,19 @@ class CarriedNormals:
         x = positions[self.first]
         normals, sides = vertex_normals(x, self.triangles), x[self.neighbour] - x
         along = sides - np.einsum("ij,ij->i", sides, normals)[:, None] * normals
-        length = np.linalg.norm(along, axis=1, keepdims=True)
-        usable = length > 1e-9 * np.maximum(np.linalg.norm(sides, axis=1, keepdims=True), np.finfo(np.float64).tiny)
-        other = np.cross(normals, np.eye(3)[np.abs(normals).argmin(axis=1)])
-        other /= np.maximum(np.linalg.norm(other, axis=1, keepdims=True), 1e-12)
-        second = np.where(usable, along / np.where(usable, length, 1.0), other)
+        with np.errstate(invalid="ignore"):
+            second = along / np.linalg.norm(along, axis=1, keepdims=True)
         return np.stack([normals, second, np.cross(normals, second)], axis=2)[self.group]
 
     def at(self, positions: FloatArray) -> FloatArray:
-        """Normals of the surface with other positions; where it has not moved, the file's, bit for bit."""
+        """Normals of the surface with other positions.
+
+        The file's, bit for bit, where the surface has not moved, and at edges of no length.
+        """
         after = self._frames(positions)
         rotated = np.einsum("nij,nkj,nk->ni", after, self.before, self.normals)
-        return np.where((self.before == after).all(axis=(1, 2))[:, None], self.normals, rotated)
+        stays = (self.before == after).all(axis=(1, 2)) | ~np.isfinite(rotated).all(axis=1)
+        return np.where(stays[:, None], self.normals, rotated)
 
 
 def carry_together(

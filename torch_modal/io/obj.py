@@ -73,8 +73,8 @@ class ObjAsset(Asset):
         """Indices from 0 of corners such as ``1/2/3`` or ``-1//-1``; -1 where there is none. *Shape:* ``(C, 3)``."""
         unique: dict[str, int] = {}
         which = [unique.setdefault(word, len(unique)) for row in faces for word in row]
-        table = np.array([[int(index or 0) for index in f"{word}//".split("/")[:3]] for word in unique] or [[0] * 3])
-        corners = table[which]
+        table = [[int(index or 0) for index in f"{word}//".split("/")[:3]] for word in unique]
+        corners = np.array(table, dtype=np.int64).reshape(-1, 3)[np.array(which, dtype=np.int64)]
         # Negative indices count back from the line.
         before = [np.searchsorted(self._line_of[kind], self._line_of["f"]) for kind in ("v", "vt", "vn")]
         corners = np.where(corners < 0, corners + np.repeat(before, self._sizes, axis=1).T, corners - 1)

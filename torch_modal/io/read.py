@@ -89,10 +89,9 @@ def require_same_mesh(
     if np.array_equal(mesh[1], other_mesh[1]):
         return
     here, there = ({*map(frozenset, faces.tolist())} for _, faces in (mesh, other_mesh))
-    for file, strange, whole in ((other, there - here, first), (first, here - there, other)):
-        if strange:
-            raise MeshError(
-                f"the face of {file} with the vertices {min(map(sorted, strange))} is not in {whole} ({len(strange)} "
-                f"of {len(mesh[1])} faces differ); {hint}; polygons that start at another corner are cut along another "
-                "diagonal, so export triangles"
-            )
+    if strange := here ^ there:
+        raise MeshError(
+            f"the face with the vertices {min(map(sorted, strange))} is in one of {first} and {other} only (so are "
+            f"{len(strange)} faces); {hint}; polygons that start at another corner are cut along another diagonal, so "
+            "export triangles"
+        )

@@ -67,9 +67,7 @@ def check_suffix(path: Path, suffixes: Collection[str]) -> str:
     """The suffix of a file in small letters, with its dot; raises a ValueError if it is not among ``suffixes``."""
     suffix = path.suffix.lower()
     if suffix not in suffixes:
-        *others, last = suffixes
-        wanted = f"{', '.join(others)} or {last}" if others else last
-        raise ValueError(f"out must end in {wanted}, got {path.name!r}")
+        raise ValueError(f"out must end in {' or '.join(suffixes)}, got {path.name!r}")
     return suffix
 
 

@@ -154,14 +154,10 @@ def show_landmarks(
         for name, (vertices, faces) in meshes.items()
     }
     rows = np.zeros((0, len(checked)), dtype=np.int64) if landmarks is None else to_numpy(landmarks)
-    if rows.ndim != 2 or rows.shape[1] != len(checked) or rows.dtype.kind not in "iu":
-        raise ValueError(
-            f"landmarks must be vertex indices, a column for each of the {len(checked)} meshes, got shape {rows.shape} "
-            f"and dtype {rows.dtype}"
-        )
-    counts = np.array([shape.shape[1] for shape, _ in checked.values()])
-    if ((rows < 0) | (rows >= counts)).any():
-        raise ValueError(f"landmarks must index the {counts.tolist()} vertices of the meshes from 0")
+    counts = [shape.shape[1] for shape, _ in checked.values()]
+    fits = rows.ndim == 2 and rows.shape[1] == len(checked) and rows.dtype.kind in "iu"
+    if not fits or ((rows < 0) | (rows >= counts)).any():
+        raise ValueError(f"landmarks must be indices, a column for each of the meshes, of their {counts} vertices")
     groups = [pack_group({name: shape}, faces) for name, (shape, faces) in checked.items()]
     return _page(groups, title, height, landmarks=rows.tolist())
 
