@@ -52,7 +52,7 @@ class FramePoses:
         modes = scale_modes(basis.modes, 100.0)
         self.bending = ModalBending(problem.template, self.faces, modes)
         whole = problem.whole.numpy()
-        self.coarse = coarsen(whole, self.faces.numpy(), COARSE_FACES, range(len(whole)), {})
+        self.coarse = coarsen(whole, self.faces.numpy(), COARSE_FACES)
         reference, fields = self._coarsen(problem.template), self._coarsen(modes)
         self.poses = PoseSearch(ModalBending(reference, torch.from_numpy(self.coarse.faces), fields), basis.eigenvalues)
         #: Times and whole shapes.

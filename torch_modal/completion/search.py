@@ -48,7 +48,7 @@ class PoseSearch:
         self.mesh = Connectivity(bending.faces.numpy(), len(bending.reference))
         relative = eigenvalues / eigenvalues[:1]
         self.stiffness = torch.cat([relative, relative.new_full((6,), OF_MOTIONS)])
-        graph = edge_graph(bending.reference.numpy(), self.mesh)
+        graph = edge_graph(bending.reference.numpy(), self.mesh.edges)
         #: Ends of limbs, and the distances along the surface from each. *Shape:* ``(n,), (n, V)``.
         self.tips, self.from_tips = farthest_apart(graph, self.mesh.used, N_TIPS)
 

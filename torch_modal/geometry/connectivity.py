@@ -158,11 +158,10 @@ def vertex_areas(vertices: FloatArray, faces: IntArray) -> FloatArray:
     return summed.astype(np.float64)  # integers if there are no faces
 
 
-def edge_graph(vertices: FloatArray, mesh: Connectivity) -> sparse.csr_matrix:
-    """Lengths of the edges, none zero, between their ends. *Shape:* ``(V, 3) -> (V, V)``."""
-    i, j = mesh.edges.T
-    lengths = np.linalg.norm(vertices[i] - vertices[j], axis=1)
-    half = sparse.coo_matrix((np.maximum(lengths, 1e-12 * lengths.max(initial=0)), (i, j)), (mesh.n_vertices,) * 2)
+def edge_graph(vertices: FloatArray, edges: IntArray) -> sparse.csr_matrix:
+    """Lengths of edges, none zero, between their ends. *Shape:* ``(V, 3), (E, 2) -> (V, V)``."""
+    lengths = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)
+    half = sparse.coo_matrix((np.maximum(lengths, 1e-12 * lengths.max(initial=0)), edges.T), (len(vertices),) * 2)
     return (half + half.T).tocsr()
 
 

@@ -57,22 +57,14 @@ class Crossings:
     ) -> None:
         self.mesh, self.known, self._search = mesh, known, search
         self.like = known[0] if like is None else like
-        used = self.like[np.unique(mesh.faces)]
-        self.diagonal = float(np.linalg.norm(np.ptp(used, axis=0)))
+        self.diagonal = float(np.linalg.norm(np.ptp(self.like[mesh.used], axis=0)))
+        #: Edge lengths as a graph, and True between vertices that an edge joins. *Shape:* ``(V, V)``.
+        self.lengths = edge_graph(self.like, mesh.edges)
+        self.adjacency: sparse.csr_matrix = self.lengths.astype(bool)
         #: Of the vertices searched so far, those within :data:`FAR_APART`.
         self._near: dict[int, IntArray] = {}
 
     # ------------------------------------------------------------------------------------------------- once for a mesh
-    @cached_property
-    def adjacency(self) -> sparse.csr_matrix:
-        """True between vertices that an edge joins. *Shape:* ``(V, V)``."""
-        return self.lengths.astype(bool)
-
-    @cached_property
-    def lengths(self) -> sparse.csr_matrix:
-        """Edge lengths as a graph. *Shape:* ``(V, V)``."""
-        return edge_graph(self.like, self.mesh)
-
     @cached_property
     def pairs_of_known(self) -> list[IntArray]:
         """Pairs that cross in each of the known shapes. *Shape of each:* ``(P, 2)``."""

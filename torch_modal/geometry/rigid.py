@@ -123,17 +123,14 @@ def looks_mirrored(first: Tensor, second: Tensor, faces: Tensor) -> Tensor:
     For bodies with signed volumes of different sign: the volume of a thin plate also changes its sign if its sheets
     intersect slightly. *Shape:* ``(B, V, 3), (B, V, 3), (F, 3) -> (B,)``, bool.
     """
-    centres, normals = [], []
-    for x in (first, second):
-        a, b, c = (x[:, corner] for corner in faces.unbind(1))
-        centres.append((a + b + c) / 3)
-        normals.append(torch.linalg.cross(b - a, c - a))
-    areas = [torch.linalg.vector_norm(x, dim=-1) for x in normals]
-    weights = (areas[0] * areas[1]).sqrt()
-    total = weights.sum(1)
-    centred = [c - (weights[..., None] * c).sum(1, keepdim=True) / total[:, None, None] for c in centres]
-    unit = [x / torch.where(area > 0, area, 1)[..., None] for x, area in zip(normals, areas, strict=True)]
-    covariance, alike = ((weights[..., None] * a).mT @ b for a, b in (centred, unit))
+    a, b, c = torch.stack([first, second])[:, :, faces].unbind(-2)  # (2, B, F, 3)
+    centres, normals = (a + b + c) / 3, torch.linalg.cross(b - a, c - a)
+    areas = normals.norm(dim=-1)
+    weights = areas.prod(0).sqrt()[..., None]
+    total = weights.sum((1, 2))
+    centres = centres - (weights * centres).sum(2, keepdim=True) / total[:, None, None]
+    unit = normals / torch.where(areas > 0, areas, 1)[..., None]
+    covariance, alike = ((weights * x).mT @ y for x, y in (centres, unit))
     # A reflection M flips normals, and -M is the best rotation of the negative covariance.
     gain = ((best_rotation(-covariance) - best_rotation(covariance)) * alike).sum((1, 2))
     return gain > MIRRORED_GAIN * total

@@ -24,8 +24,7 @@ class Surface:
     @cached_property
     def face_centres(self) -> FloatArray:
         """Means of the corners of the faces. *Shape:* ``(F, 3)``."""
-        a, b, c = self.vertices[self.faces.T]
-        return (a + b + c) / 3
+        return self.vertices[self.faces].mean(axis=1)
 
     @cached_property
     def area_vectors(self) -> FloatArray:

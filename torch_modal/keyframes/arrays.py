@@ -56,12 +56,8 @@ def _as_tensor(name: str, value: Any) -> Tensor:
         return value
     try:
         array = np.asarray(value)
-        if array.dtype.kind not in "biufc":
-            raise TypeError(f"elements of type {array.dtype}")
-        if not array.dtype.isnative:
-            array = array.astype(array.dtype.newbyteorder("="))
-        # PyTorch knows no negative strides and no read-only memory.
-        return torch.from_numpy(array if array.flags.writeable and array.flags.c_contiguous else array.copy(order="C"))
+        # PyTorch knows no negative strides, no read-only memory, and no other order of bytes.
+        return torch.from_numpy(np.require(array, array.dtype.newbyteorder("="), ["C", "W"]))
     except (TypeError, ValueError, RuntimeError) as error:
         raise MeshError(
             f"{name} is a {type(value).__name__} that is no array of numbers ({str(error)[:150]}); "

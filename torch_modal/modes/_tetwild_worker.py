@@ -21,16 +21,12 @@ def main(job_path: str, result_path: str) -> None:
     """Fill a surface with tetrahedra, write ``vertices (N, 3)`` and ``tets (T, 4)``.
 
     The job holds ``vertices (V, 3)``, ``faces (F, 3)`` and the scalars ``edge_length_fac``, ``epsilon``,
-    ``stop_energy``, ``timeout``, ``processor_time``.
+    ``stop_energy``, ``processor_time``.
     """
     with np.load(job_path) as job:
         surface = np.ascontiguousarray(job["vertices"]), np.ascontiguousarray(job["faces"].astype(np.int32))
         settings: dict[str, Any] = {name: float(job[name]) for name in ("edge_length_fac", "epsilon", "stop_energy")}
-        timeout, processor_time = float(job["timeout"]), float(job["processor_time"])
-    if hasattr(signal, "alarm"):
-        # The parent enforces the timeout. If the parent is killed, the default action of SIGALRM ends this process
-        # even while pytetwild holds the GIL.
-        signal.alarm(int(min(timeout + 10, 2**31 - 1)))
+        processor_time = float(job["processor_time"])
     if processor_time < sys.maxsize and sys.platform != "win32":
         import resource
 

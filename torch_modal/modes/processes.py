@@ -85,7 +85,6 @@ def run_child(
     if code:
         lines = (folder / "log.txt").read_text(errors="replace").split("\n")
         last = next((line.strip() for line in reversed(lines) if line.strip()), "")  # of a traceback, the error
-        names = {-number: f"signal {number.name}" for number in signal.Signals}
-        status = names.get(code, f"exit code {code}")
+        status = f"signal {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
         hint = HINTS.get(status, last)
         raise ChildError(f"its process ended with {status}" + (f" ({hint})" if hint else ""))

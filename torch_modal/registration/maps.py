@@ -81,7 +81,7 @@ class SpectralShape:
         )
         #: Lumped mass of the Laplacian. *Shape:* ``(n,)``.
         self.mass = mass.diagonal()
-        self._graph = edge_graph(self.coarse.vertices, self.coarse.connectivity)
+        self._graph = edge_graph(self.coarse.vertices, self.coarse.edges)
         self._heat = extras.require("potpourri3d", "register", "registration").MeshHeatMethodDistanceSolver(*mesh)
 
     def __len__(self) -> int:

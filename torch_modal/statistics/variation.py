@@ -4,7 +4,6 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from scipy import sparse
 from torch import Tensor
 from torch.nn.functional import one_hot
 
@@ -17,7 +16,7 @@ from torch_modal.elastic.stretch import Stretch
 from torch_modal.elastic.term import Mesh
 from torch_modal.elastic.volume import Volume, encloses
 from torch_modal.geometry.canonical import CANONICAL_SIZE
-from torch_modal.geometry.connectivity import farthest_apart
+from torch_modal.geometry.connectivity import edge_graph, farthest_apart
 from torch_modal.geometry.poisson import Reconstruction
 from torch_modal.geometry.rigid import best_rotation
 from torch_modal.geometry.triangle_frames import frames_of
@@ -167,7 +166,10 @@ class Patches:
     """Patches around vertices of a shape that are far apart along the surface, so that fingers do not mix."""
 
     def __init__(self, mean: Tensor, reconstruction: Reconstruction) -> None:
-        graph, used = _graph(mean, reconstruction), np.unique(reconstruction.faces.numpy())
+        # Gaps between loose pieces and the largest count as edges.
+        gaps = [torch.stack([piece[0], anchors[0]])[None] for piece, anchors in reconstruction.loose]
+        graph = edge_graph(mean.numpy(), torch.cat([reconstruction.edges, *gaps]).numpy())
+        used = np.unique(reconstruction.faces.numpy())
         # A patch of one vertex would have no moments.
         centres, from_centres = farthest_apart(graph, used, min(N_PATCHES, len(used) // 2))
         nearest, distances = from_centres.min(axis=0), torch.from_numpy(from_centres)
@@ -234,17 +236,6 @@ def bound_weights(weights: Tensor) -> Tensor:
     below = -weights.clamp_max(0).sum(0)
     ratio = (LARGEST_EXTRAPOLATION / below.clamp_min(LARGEST_EXTRAPOLATION)).clamp_max(1)
     return 1 / len(weights) + ratio * (weights - 1 / len(weights))
-
-
-def _graph(mean: Tensor, reconstruction: Reconstruction) -> sparse.csr_matrix:
-    """Lengths of edges, and of gaps between loose pieces and the largest."""
-    gaps = [torch.stack([piece[0], anchors[0]]) for piece, anchors in reconstruction.loose]
-    starts, ends = torch.cat([reconstruction.edges, *(gap[None] for gap in gaps)]).T
-    lengths = (mean[starts] - mean[ends]).norm(dim=-1).numpy()
-    # Zeros would be no edges.
-    lengths = np.maximum(lengths, 1e-9 * lengths.mean())
-    upper = sparse.coo_matrix((lengths, (starts, ends)), shape=(len(mean), len(mean)))
-    return (upper + upper.T).tocsr()
 
 
 def check_density(concentration: float, locality: float) -> None:
