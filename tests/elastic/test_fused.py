@@ -241,9 +241,9 @@ class TestModal:
         monkeypatch.setattr(modal, "MOST_NUMBERS", largest)
         sizes: list[int] = []
 
-        def watched(kernel: Any, dim: tuple[int, ...], given: list[Any]) -> None:
+        def watched(kernel: Any, dim: tuple[int, ...], given: list[Any], adjoints: Any = ()) -> None:
             sizes.extend(x.numel() for x in given if isinstance(x, Tensor))
-            launch.launch(kernel, dim, given)
+            launch.launch(kernel, dim, given, adjoints)
 
         monkeypatch.setattr(modal, "launch", watched)
         monkeypatch.setattr(kernel_energy, "launch", watched)

@@ -27,7 +27,7 @@ class KernelPoint(NamedTuple):
     value: Tensor
     """But for the constant. *Shape:* ``(B,)``."""
     gradient: Any
-    """But for the volume. *Shape:* ``(B, V, 3)``."""
+    """*Shape:* ``(B, V, 3)``."""
     diagonal: Any
     """Blocks of the convex Hessian's diagonal, packed, if wanted. *Shape:* ``(B, V, 6)``."""
     factors: list[Any]
@@ -43,7 +43,7 @@ class KernelPoint(NamedTuple):
 
     def slope(self, direction: Tensor) -> Tensor:
         """Derivative of the energy along a direction. *Shape:* ``(B, V, 3) -> (B,)``."""
-        return (self.gradient * direction).sum((1, 2)) + self.moment * (self.normal * direction).sum((1, 2))
+        return (self.gradient * direction).sum((1, 2))
 
 
 class KernelTerm(nn.Module):
@@ -70,10 +70,12 @@ class KernelTerm(nn.Module):
         """The functions that kernels are made from; they are no data, and are not stored."""
         return self.term.kernel_functions(self.n)
 
-    def launch(self, name: str, dim: int, *arguments: Any, back: bool = False) -> None:
-        """Run a kernel over the elements of so many samples."""
+    def launch(
+        self, name: str, dim: int, *arguments: Any, back: bool = False, adjoints: Sequence[Tensor | None] = ()
+    ) -> None:
+        """Run a kernel over the elements of so many samples, or its adjoint."""
         kernel = getattr(of_elements("backward" if back else "forward", self.functions), name)
-        launch(kernel, (dim, self.n_elements), [self.elements, *arguments])
+        launch(kernel, (dim, self.n_elements), [self.elements, *arguments], adjoints and [None, *adjoints])
 
     def shapes_to_merge(self, shapes: Tensor) -> tuple[Tensor, Tensor | None]:
         """The shapes that elements are merged of, and all measures together, where their mean counts.
@@ -296,6 +298,8 @@ class KernelEnergy(nn.Module):
         off = sizes[:, 1, 0] - value
         moment = stiffness * off
         energy = torch.addcmul(energy, moment, off, value=0.5)
+        if gradient is not None:
+            gradient.addcmul_(moment[:, None, None], normal)
         return KernelPoint(energy, gradient, diagonal, factors, normal, moment, stiffness)
 
     def product(
@@ -319,6 +323,7 @@ class KernelEnergy(nn.Module):
         to_records: Sequence[Tensor],
         products: tuple[Tensor, Tensor, Tensor] | None = None,
         to_normal: Tensor | None = None,
+        to_stiffness: Tensor | None = None,
         to_energy: Tensor | None = None,
     ) -> None:
         """Adjoint of :meth:`at`: add the gradients of shapes and references.
@@ -327,11 +332,12 @@ class KernelEnergy(nn.Module):
             x: The shapes. *Shape:* ``(B, V, 3)``.
             at: The energy there; its diagonal and factors are not read.
             to: The references.
-            to_gradient: In the whole gradient, with the volume's part. *Shape:* ``(B, V, 3)``.
+            to_gradient: In the gradient. *Shape:* ``(B, V, 3)``.
             to_x: Is added to. *Shape:* ``(B, V, 3)``.
             to_records: Are added to.
             products: What the diagonal receives, the fields of conjugate gradients, and what their products receive.
             to_normal: In the volume's gradient beyond that. *Shape:* ``(B, V, 3)``.
+            to_stiffness: In the volume's stiffness. *Shape:* ``(B,)``.
             to_energy: In the energy. *Shape:* ``(B,)``.
         """
         b, n = x.shape[:2]
@@ -346,6 +352,8 @@ class KernelEnergy(nn.Module):
         to_moment = (to_gradient * at.normal).sum((1, 2))
         off = at.moment * inverse(at.stiffness, at.stiffness <= 0)
         to_volume, to_weight = at.stiffness * to_moment, 2 * off * to_moment
+        if to_stiffness is not None:  # twice the weight
+            to_weight = to_weight + 2 * to_stiffness
         if to_energy is not None:
             to_volume, to_weight = to_volume + at.moment * to_energy, to_weight + off**2 * to_energy
         to_whole_normal = at.moment[:, None, None] * to_gradient
@@ -369,16 +377,14 @@ class _MergeRests(Operation):
         n = len(self.parts)
         return shapes, weights, more[:n], more[n] if len(more) > n else None
 
-    def _launch(
-        self, i: int, seen: tuple[Tensor, Tensor | None], tensors: Sequence[Tensor], results: Sequence[Tensor | None],
-        back: bool = False,
-    ) -> None:  # fmt: skip
-        (x, total), (shapes, weights, stiffness, start), term = seen, self._split(tensors), self.parts[i]
-        soft = None if term.functions.fullness is None else start
+    def _arguments(self, i: int, seen: tuple[Tensor, Tensor | None], tensors: Sequence[Tensor]) -> list[Any]:
+        """Arguments of the kernel before its results, or their gradients."""
+        (x, total), (shapes, weights, stiffness, start) = seen, self._split(tensors)
+        soft = None if self.parts[i].functions.fullness is None else start
         relative = self.relative and soft is not None
-        sizes = (NEEDLE_OF_STEPS if relative else NEEDLE) ** 2, int(relative), shapes.shape[1], stiffness[i].shape[1]
-        first = x.shape[1], x, weights, total, stiffness[i], soft
-        term.launch("merge", len(shapes), *first, *sizes, *results, back=back)
+        needle = NEEDLE_OF_STEPS if relative else NEEDLE
+        sizes = needle**2, int(relative), shapes.shape[1], stiffness[i].shape[1]
+        return [x.shape[1], x, weights, total, stiffness[i], soft, *sizes]
 
     def run(self, kept: list[Any] | None, *tensors: Tensor) -> tuple[Tensor, ...]:
         shapes, records = tensors[0], []
@@ -386,7 +392,7 @@ class _MergeRests(Operation):
         for i, term in enumerate(self.parts):
             seen = term.shapes_to_merge(shapes.flatten(0, 1))
             records.append(shapes.new_empty(len(shapes), term.n_elements, term.functions.potential.n_rows))
-            self._launch(i, seen, tensors, [records[i], constant])
+            term.launch("merge", len(shapes), *self._arguments(i, seen, tensors), records[i], constant)
             if kept is not None:
                 kept.append(seen)
         return *records, constant
@@ -395,12 +401,15 @@ class _MergeRests(Operation):
         if not kept:
             self.run(kept, *tensors)
         gradients = tuple(torch.zeros_like(each) for each in tensors)
-        to_shapes, to_weights, to_stiffness, to_start = self._split(gradients)
+        to_shapes = gradients[0].flatten(0, 1)
         for i, term in enumerate(self.parts):
             to_seen = torch.zeros_like(kept[i][0]) if isinstance(term, KernelVolume) else to_shapes
-            self._launch(i, kept[i], tensors, [grads[i], to_seen, to_weights, to_stiffness[i], to_start], True)
+            values = *self._arguments(i, kept[i], tensors), torch.empty_like(grads[i]), torch.empty_like(grads[-1])
+            _, _, to_weights, _, to_stiffness, to_start, *sizes = self._arguments(i, (to_seen, None), gradients)
+            adjoints = None, to_seen, to_weights, None, to_stiffness, to_start, *[None] * len(sizes), grads[i]
+            term.launch("merge", len(tensors[0]), *values, back=True, adjoints=adjoints)
             if isinstance(term, KernelVolume):
-                term.back(tensors[0].flatten(0, 1), to_seen, None, to_shapes.flatten(0, 1))
+                term.back(tensors[0].flatten(0, 1), to_seen, None, to_shapes)
         return gradients
 
     def by_torch(self, *tensors: Tensor) -> tuple[Tensor, ...]:

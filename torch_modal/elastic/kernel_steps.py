@@ -86,36 +86,41 @@ class KernelProblem:
         at.diagonal.add_(others.diagonal)
         return at._replace(value=at.value + others.value, extra=others.product)
 
-    def newton_direction(self, at: KernelPoint, n_products: int, keep: bool = False) -> tuple[Tensor, Tensor, Tensor]:
+    def newton_direction(self, at: KernelPoint, n_products: int, keep: bool = False) -> tuple[Tensor, ...]:
         """Conjugate gradients, fused.
 
         Args:
-            at: The energy where the step starts; its diagonal is inverted in place.
+            at: The energy where the step starts.
             n_products: Iterations.
             keep: True to keep the fields of all iterations.
 
         Returns:
             The solution, *shape* ``(B, V, 3)``; residuals, directions, and the Hessian's products with these but for
             the volume's part, of the last iteration alone where they are not kept, *shape* ``(3, n_products, B, V,
-            3)``; three scalars of each iteration (``kernels/steps.py``), *shape* ``(n_products + 1, B, 3)``.
+            3)``; three scalars of each iteration (``kernels/steps.py``), *shape* ``(n_products + 1, B, 3)``; and the
+            inverse of the diagonal, *shape* ``(B, V, 6)``.
         """
-        x, module = at.gradient, kernels("steps")
-        (b, n), n_kept = x.shape[:2], n_products if keep else 1
-        kept, scalars = x.new_empty(3, n_kept, *x.shape), x.new_zeros(n_products + 1, b, 3)
-        results = [kept, scalars, torch.empty_like(x)]
-        launch(module.begin, (b, n), [at.gradient, at.normal, at.moment, at.diagonal, n_kept, n, *results])
+        (b, n), module = at.gradient.shape[:2], kernels("steps")
+        n_kept, solution, inverse = (
+            n_products if keep else 1,
+            torch.zeros_like(at.gradient),
+            torch.empty_like(at.diagonal),
+        )
+        fields, scalars = at.gradient.new_empty(3, n_kept, b, n, 3), at.gradient.new_zeros(n_products + 1, b, 3)
+        launch(module.begin, (b, n), [at.gradient, at.normal, at.diagonal, b, n_kept, n, inverse, fields, scalars])
         for k in range(n_products):
             first = k % n_kept * b * n
-            place = n_kept * b * n + first, kept, 2 * n_kept * b * n + first
-            self.kernels.product(at.factors, (b, n), kept, *place, scalars, k * b)
+            place = n_kept * b * n + first, fields, 2 * n_kept * b * n + first
+            self.kernels.product(at.factors, (b, n), fields, *place, scalars, k * b)
             if at.extra is not None:
-                pushed = at.extra(kept[1, k % n_kept])
-                kept[2, k % n_kept].add_(pushed)
-                scalars[k, :, 2].add_((pushed * kept[1, k % n_kept]).sum((1, 2)))
-            launch(module.advance, (b, n), [at.normal, at.diagonal, at.stiffness, k, n_kept, n, *results])
+                pushed = at.extra(fields[1, k % n_kept])
+                fields[2, k % n_kept].add_(pushed)
+                scalars[k, :, 2].add_((pushed * fields[1, k % n_kept]).sum((1, 2)))
+            common = k, n_kept, n, fields, scalars
+            launch(module.advance, (b, n), [at.normal, inverse, at.stiffness, *common, solution])
             if k < n_products - 1:
-                launch(module.turn, (b, n), [at.normal, at.diagonal, b, k, n_kept, n, *results[:2]])
-        return results[2], kept, scalars
+                launch(module.turn, (b, n), [at.normal, inverse, b, *common])
+        return solution, fields, scalars, inverse
 
 
 class _Relaxation(Operation):
@@ -146,33 +151,38 @@ class _Relaxation(Operation):
 
         Args:
             step: What :func:`descend` adds to its list: the start, the energy there, the whole step, its length, and
-                the fields and scalars of :meth:`KernelProblem.newton_direction`.
+                the further results of :meth:`KernelProblem.newton_direction`.
             to: The reference.
             to_reached: Gradient at the end. *Shape:* ``(B, V, 3)``.
             to_records: Are added to.
         """
-        x, at, solution, length, kept, scalars = step
+        x, at, solution, length, fields, scalars, inverse = step
         to_x, to_solution, to_energy, to_slope = to_reached.clone(), to_reached, None, None
         if bool((length < 1).any()):
             to_solution, to_energy, to_slope = self._length_back(x, at, solution, to, to_x, to_records)
-        module, (b, n), n_products = kernels("steps"), x.shape[:2], kept.shape[1]
-        force, (residual, direction, to_normal) = torch.empty_like(kept[0]), x.new_zeros(3, *x.shape)
-        to_diagonal, received = torch.zeros_like(at.diagonal), x.new_zeros(n_products, b, 3)
-        received[-1, :, 0] = (to_solution * kept[1, -1]).sum((1, 2))
+        module, (b, n), n_products = kernels("steps_adjoint"), x.shape[:2], fields.shape[1]
+        values = at.normal, inverse, at.stiffness, fields, scalars
+        to_normal, to_inverse, to_stiffness, to_fields, to_scalars = map(torch.zeros_like, values)
         for k in reversed(range(n_products)):
-            common = [at.normal, at.stiffness, k, n_products, n, kept, scalars]
-            args = [*common, to_solution, residual, force, direction, received]
-            launch(module.back_to_direction, (b, n), args)
-            self.kernels.product(at.factors, (b, n), force, k * b * n, direction, 0)
-            launch(module.back_to_normal, (b, n), [*common, force, direction, to_normal, received])
-            args = [*common, at.diagonal, to_solution, direction, residual, to_diagonal, received]
-            launch(module.back_to_residual, (b, n), args)
-        # The right side is the gradient's opposite.
-        to_gradient = -residual if to_slope is None else to_slope[:, None, None] * solution - residual
-        products = to_diagonal, kept, force
-        self.kernels.back(x, at, to, to_gradient, to_x, to_records, products, to_normal, to_energy)
-        for i in self.kernels.volumes:  # of the stiffness, twice the weight
-            to_records[i][:, 0, 0].add_(2 * (scalars[:-1, :, 1] * received[..., 2]).sum(0))
+            common, received = (k, n_products, n, fields, scalars), (None, None, None, to_fields, to_scalars)
+            if k < n_products - 1:
+                turned = at.normal, inverse, b, *common
+                launch(module.turn, (b, n), turned, [to_normal, to_inverse, None, *received])
+            moved = at.normal, inverse, at.stiffness, *common, solution
+            launch(module.advance, (b, n), moved, [to_normal, to_inverse, to_stiffness, *received, to_solution])
+            # The product with the Hessian, which is its own adjoint, and its product with the direction.
+            to_form = to_scalars[k, :, 2, None, None]
+            to_fields[1, k].addcmul_(to_form, fields[2, k])
+            to_fields[2, k].addcmul_(to_form, fields[1, k])
+            first = k * b * n, (n_products + k) * b * n, (2 * n_products + k) * b * n
+            self.kernels.product(at.factors, (b, n), to_fields, first[2], to_fields, first[1])
+        to_gradient = torch.zeros_like(x) if to_slope is None else to_slope[:, None, None] * solution
+        to_diagonal = torch.zeros_like(at.diagonal)
+        begun = at.gradient, at.normal, at.diagonal, b, n_products, n, inverse, fields, scalars
+        to_begun = to_gradient, to_normal, to_diagonal, None, None, None, to_inverse, to_fields, to_scalars
+        launch(module.begin, (b, n), begun, to_begun)
+        products = to_diagonal, fields, to_fields[2]
+        self.kernels.back(x, at, to, to_gradient, to_x, to_records, products, to_normal, to_stiffness, to_energy)
         return to_x
 
     def _length_back(

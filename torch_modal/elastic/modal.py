@@ -314,8 +314,7 @@ class _GradientAndValue(Operation):
     def run(self, kept: list[Any] | None, a: Tensor, base: Tensor, *records: Tensor) -> tuple[Tensor, ...]:
         modal = self.modal
         at = modal.kernels.at(modal.shapes(a, base), Reference.of_records(records), 1)
-        gradient = at.gradient.addcmul_(at.moment[:, None, None], at.normal)
-        return gradient.flatten(1) @ modal.flat.double().mT, at.value
+        return at.gradient.flatten(1) @ modal.flat.double().mT, at.value
 
     def back(
         self, kept: list[Any], grads: Sequence[Tensor], a: Tensor, base: Tensor, *records: Tensor

@@ -398,83 +398,6 @@ def _merge_kernel(f: KernelFunctions, module: "wp.Module") -> dict[str, "wp.Kern
     return {"merge": merge, "total": total}
 
 
-def _merge_back_kernel(f: KernelFunctions, module: "wp.Module") -> "wp.Kernel":
-    """The adjoint of ``merge``."""
-    c, potential = _common(f), f.potential
-    corners, edge_vectors, add, sums = c.corners, c.edge_vectors, c.add, potential.sums
-    merging = _merging(f)
-    fullness, softness, mean_of, merge_rests = merging.fullness, merging.softness, merging.mean_of, merging.merge
-    record, weight_of = potential.record, f.weight
-
-    @wp.func
-    def of_record(m: sums, factor: real, received: record):
-        return wp.dot(potential.merge_rests(m, factor), received)
-
-    @wp.func
-    def of_measure(m: potential.kind, pull: real, received: sums):
-        return wp.dot(potential.moments(m, pull), received)
-
-    @wp.kernel(module=module)
-    def merge(
-        elements: wp.array[corners], n_vertices: int, x: wp.array[vec3], weights: wp.array[real], whole: wp.array[real],
-        stiffness: wp.array[real], start: wp.array[vec3], altitude: real, relative: int, n_shapes: int,
-        n_stiffness: int, to_out: wp.array[record], to_x: wp.array[vec3], to_weights: wp.array[real],
-        to_stiffness: wp.array[real], to_start: wp.array[vec3], threads: int,
-    ):  # fmt: skip
-        """Adds the gradients; the means, and the energy that remains, have none."""
-        i = wp.tid()
-        s = i // threads
-        for k in range(i - s * threads, elements.shape[0], threads):
-            q = elements[place(k, 0)]
-            moments, usual = merge_rests(
-                x,
-                n_vertices,
-                q,
-                weights,
-                whole,
-                elements.shape[0],
-                altitude,
-                relative,
-                s * n_shapes,
-                (s + 1) * n_shapes,
-            )
-            at = place(s * n_stiffness, wp.min(k, n_stiffness - 1))
-            at_start = real(1.0)
-            soft = real(1.0)
-            if start:
-                at_start = fullness(edge_vectors(start, s * n_vertices, q), altitude)
-                soft = softness(at_start, usual, relative)
-            received = to_out[place(s * elements.shape[0], k)]
-            to_sums, to_factor, _0 = wp.grad(of_record)(moments, soft * stiffness[at], received)
-            wp.atomic_add(to_stiffness, at, soft * to_factor)
-            to_usual = real(0.0)
-            if start:
-                to_own, to_usual, _1 = wp.grad(softness)(at_start, usual, relative)
-                to_own *= stiffness[at] * to_factor
-                to_usual *= stiffness[at] * to_factor
-                if to_own != real(0.0):  # few elements are softened
-                    to_start_e, _2 = wp.grad(fullness)(edge_vectors(start, s * n_vertices, q), altitude)
-                    add(to_start, s * n_vertices, q, to_own * to_start_e)
-            for r in range(s * n_shapes, (s + 1) * n_shapes):
-                e = edge_vectors(x, r * n_vertices, q)
-                m, g = f.linearise(e)
-                mean = mean_of(whole, r, elements.shape[0])
-                weight = f.weight(e, m, mean)
-                to_m, to_weight, _3 = wp.grad(of_measure)(m, weights[r] * weight, to_sums)
-                of_e, of_m, _4 = wp.grad(weight_of)(e, m, mean)
-                received_weight = weights[r] * to_weight
-                to_e = received_weight * of_e
-                to_pull = weight * to_weight
-                if to_usual != real(0.0):
-                    of_full, _6 = wp.grad(fullness)(e, altitude)
-                    to_e += (weights[r] * to_usual) * of_full
-                    to_pull += to_usual * fullness(e, altitude)
-                add(to_x, r * n_vertices, q, to_e + potential.rate(m, to_m + received_weight * of_m) * g)
-                wp.atomic_add(to_weights, r, to_pull)
-
-    return merge
-
-
 @cache
 def backward(f: KernelFunctions) -> SimpleNamespace:
     """Adjoints, and second derivatives."""
@@ -584,7 +507,7 @@ def backward(f: KernelFunctions) -> SimpleNamespace:
                 unit[j // 3, j % 3] = slope
                 out[place(3 * n * at, j)] = hessian_product(e, unit) + (beyond * g[j // 3, j % 3]) * g
 
-    merge = _merge_back_kernel(f, module) if f.weight is not None else None
+    merge = None if f.weight is None else wp.kernel(forward(f).merge.func, module=module)
     return SimpleNamespace(linearise=linearise, hessians=hessians, merge=merge)
 
 
