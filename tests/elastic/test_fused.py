@@ -316,22 +316,40 @@ class TestRotations:
         mesh = Mesh.of(small_bars.faces, small_bars.keyframes.shape[1])
         return WarpRotations(mesh.connectivity, small_bars.keyframes[:2])
 
-    @staticmethod
-    def oracle(rotations: WarpRotations) -> Any:
-        """The same by torch."""
-        return turned(rotations, LocalRotations)
-
     def test_between_two(self, rotations: WarpRotations, small_bars: Shapes) -> None:
         x = small_bars.keyframes
         given = [x[:2].clone(), x[1:3].clone(), torch.tensor([0.3, 0.8], dtype=DOUBLE)]
-        assert_kernels(turned(rotations), self.oracle(rotations), given, 1e-12, 1e-9)
+        assert_kernels(turned(rotations), turned(rotations, LocalRotations), given, 1e-12, 1e-9)
         found = vmap(lambda t: turned(rotations)(*given[:2], t.expand(2)))(given[2])
         torch.testing.assert_close(found[1], turned(rotations)(*given[:2], given[2][1].expand(2)), rtol=0, atol=1e-12)
 
-    def test_the_same_shape(self, rotations: WarpRotations, small_bars: Shapes) -> None:
+    @pytest.mark.parametrize("angle", [0.0, 0.03, 1.0, 3.0])
+    def test_a_turn(self, small_bars: Shapes, angle: float) -> None:
+        """Also none, and where the series end."""
         x = small_bars.keyframes[:1]
-        given = [x.clone(), x.clone(), torch.tensor([0.3], dtype=DOUBLE)]
-        assert_alike(gradients(turned(rotations), given)[:2], gradients(self.oracle(rotations), given)[:2], 1e-7)
+        roughened = x + 0.02 * torch.sin(40 * x) * (angle > 0)
+        other = roughened @ exp(angle * torch.tensor([0.6, 0.0, 0.8], dtype=DOUBLE)).mT
+        rotations = WarpRotations(Connectivity(small_bars.faces.numpy()), torch.cat([x, other]))
+        given = [x.clone(), other, torch.tensor([0.3], dtype=DOUBLE)]
+        assert_kernels(turned(rotations), turned(rotations, LocalRotations), given, 1e-12, 1e-7, angle > 0)
+
+    @pytest.mark.parametrize("kind", ["point", "line", "half turn", "whole turn"])
+    def test_gradients_of_what_is_degenerate_are_finite(
+        self, rotations: WarpRotations, small_bars: Shapes, kind: str
+    ) -> None:
+        x, (i, j, k) = small_bars.keyframes[:1], small_bars.faces[0].tolist()
+        other, t = x.clone(), torch.tensor([0.3], dtype=DOUBLE)
+        if kind == "point":
+            other[:, [j, k]] = x[:, [i]]
+        elif kind == "line":
+            other[:, k] = 0.3 * x[:, i] + 0.7 * x[:, j]
+        else:
+            other = other @ exp((1 + (kind == "whole turn")) * torch.pi * torch.tensor([0.6, 0.0, 0.8]).double()).mT
+        for first, second in ((x, other), (other, x), (other, other)):
+            found = gradients(turned(rotations), [first, second, t])
+            assert all(bool(slope.isfinite().all()) and float(slope.abs().max()) < 1e6 for slope in found)
+            lost = first.index_fill(1, torch.tensor([i]), torch.nan)
+            assert gradients(turned(rotations), [lost, second, t])[0].isnan().any()
 
     def test_on_a_course(self, rotations: WarpRotations, small_bars: Shapes) -> None:
         x = small_bars.keyframes

@@ -255,10 +255,3 @@ def test_one_stiffness_per_edge(pair: tuple[Tensor, Tensor, Tensor]) -> None:
     factor = torch.rand(len(parts), dtype=torch.float64, generator=torch.Generator().manual_seed(1))
     each = ShellEnergy(faces, alpha=500 * factor, beta=0.0, gamma=0.0)
     assert float(each(x, rest)) == pytest.approx(float((factor * parts).sum()), rel=1e-12)
-
-
-def test_smoke_faces_of_any_kind(pair: tuple[Tensor, Tensor, Tensor]) -> None:
-    x, rest, faces = pair
-    truth = float(ShellEnergy(faces)(x, rest))
-    for given in (faces.int(), faces.numpy(), faces.tolist()):
-        assert float(ShellEnergy(given)(x, rest)) == truth

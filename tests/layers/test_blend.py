@@ -280,12 +280,6 @@ class TestErrors:
             with pytest.raises(ValueError, match="add up to 1"):
                 call()
 
-    def test_shapes_that_do_not_fit(self, layer: Blend, poses: Tensor) -> None:
-        with pytest.raises(ValueError, match="floating-point of shape"):
-            layer(poses[:, 1:], pulls(0.5, 0.2, 0.3))
-        with pytest.raises(ValueError, match="do not broadcast"):
-            layer(poses.expand(2, -1, -1, -1), pulls(0.5, 0.2, 0.3).expand(3, -1))
-
     def test_settings_of_pairs(self, bars: Shapes) -> None:
         for changes in ({"space": "paired"}, {"contact": True}):
             with pytest.raises(ValueError, match="of two key-frames"):
@@ -301,13 +295,6 @@ class TestParts:
         found = mean(rotations, w)
         left = (w * arc(product(conjugate(found)[:, None], rotations))).sum(-2)
         assert float(left.abs().max()) < 1e-10
-
-    def test_the_mean_of_two_is_on_the_way(self) -> None:
-        half = torch.tensor([[0.0, 0.3], [0.0, -1.0], [0.0, 2.4]], dtype=DOUBLE)[..., None]  # beyond half a turn
-        rotations = about(half)
-        for t in (-0.1, 0.2, 0.5, 0.9):
-            expected = about(t * arc(rotations[:, 1]))
-            torch.testing.assert_close(mean(rotations, pulls(1 - t, t)[:, None]), expected, rtol=0, atol=1e-12)
 
 
 def turned_over(x: Tensor, faces: Tensor) -> float:

@@ -14,7 +14,6 @@ from bodies import bend, twisted_plate
 from conftest import Shapes, modal
 from shapes import diagonal
 from torch import Tensor
-from torch.func import grad
 
 import torch_modal as tm
 from torch_modal.elastic import implicit
@@ -24,7 +23,6 @@ from torch_modal.inbetween.joint import JointSpace
 from torch_modal.inbetween.results import ConvergenceError, ConvergenceWarning
 from torch_modal.inbetween.settings import Solver
 from torch_modal.layers.in_between import InBetween
-from torch_modal.layers.mid_shape import MidShape
 from torch_modal.modes.basis import ModalBasis
 
 DOUBLE = torch.float64
@@ -58,10 +56,6 @@ class TestValues:
             assert x.dtype == dtype
             assert torch.equal(x[0], x_a)
             assert torch.equal(x[2], x_b)
-
-    def test_half_way_is_the_mid_shape(self, layer: InBetween, bars: Shapes) -> None:
-        mid = MidShape(bars.bases[:2], bars.faces, **modal(coarse_faces=200))
-        assert torch.equal(layer(*bars.keyframes[:2], 0.5), mid(*bars.keyframes[:2]))
 
     def test_faces_may_be_a_reversed_view_of_an_array(self, bars: Shapes) -> None:
         x, turned = bars.keyframes, bars.faces.numpy()[:, ::-1]  # torch.from_numpy refuses negative strides
@@ -266,13 +260,6 @@ class TestSingleSamples:
 
 
 class TestTorch:
-    @pytest.mark.parametrize("option", [{"local": True}, {"polish": 1}])
-    def test_steps_of_all_vertices_are_differentiated_twice(self, small_bars: Shapes, option: dict[str, Any]) -> None:
-        x_a, x_b = small_bars.keyframes[:2]
-        layer = InBetween(small_bars.bases[:2], small_bars.faces, **modal(**option))
-        curved = grad(lambda x: (grad(lambda x: layer(x, x_b, 0.5).pow(2).sum())(x) * x_b).sum())(x_a)
-        assert bool(curved.isfinite().all()) and float(curved.abs().max()) > 1e-3
-
     @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
     def test_low_precision_computes_in_float32(self, bars: Shapes, dtype: torch.dtype) -> None:
         layer = InBetween(bars.bases[:2], bars.faces, **modal(coarse_faces=200, local=True))

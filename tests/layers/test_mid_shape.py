@@ -144,16 +144,6 @@ def test_hand_that_closes(ends: tuple[int, int], truth: int, bound: float, hands
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("ends", [(1, 2), (0, 1)], ids=["2-3", "0-2"])
-def test_walking_figure(ends: tuple[int, int], women: Shapes) -> None:
-    pair = women.pick(*ends)
-    solution = MidShape(pair.bases, pair.faces, **modal()).solve(*pair.keyframes).solution
-    assert solution.converged
-    assert solution.gradient_norm <= 3e-7
-    assert solution.n_steps <= 60, "Newton steps had to take over"
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("ends", [(0, 4), (0, 2), (2, 4)])
 def test_way_in_energy_to_the_optimum_over_all_vertices(ends: tuple[int, int], hands: Shapes) -> None:
     from full_space import full_space

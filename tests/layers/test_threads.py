@@ -167,23 +167,6 @@ def test_second_derivatives(layer: tm.InBetween, bars: Shapes) -> None:
         torch.testing.assert_close(x, torch.cat(parts), rtol=1e-6, atol=1e-8)
 
 
-def test_transforms_and_forward_mode_run_as_before(layer: tm.InBetween, bars: Shapes) -> None:
-    torch.set_num_threads(3)
-    a, b, t = (x.detach() for x in leaves(bars))
-
-    def f(t: Tensor) -> Tensor:
-        return layer(a, b, t)
-
-    _, moved = torch.func.jvp(f, (t,), (torch.ones_like(t),))
-    whole = torch.func.vmap(layer)(a, b, t)
-    torch.testing.assert_close(whole, f(t), rtol=0, atol=1e-10)
-    with torch.autograd.forward_ad.dual_level():
-        dual = f(torch.autograd.forward_ad.make_dual(t, torch.ones_like(t)))
-        torch.testing.assert_close(torch.autograd.forward_ad.unpack_dual(dual).tangent, moved, rtol=1e-8, atol=1e-8)
-    slope = torch.func.grad(lambda t: f(t).sum())(t)
-    torch.testing.assert_close(slope, moved.sum((1, 2)), rtol=1e-6, atol=1e-7)
-
-
 class InLoader(torch.utils.data.Dataset):  # type: ignore[type-arg]
     """One batch of in-betweens, computed in a process of a loader."""
 

@@ -108,8 +108,6 @@ class KeyframeAlignment(nn.Module):
         sizes = (rows.amax(-1) - rows.amin(-1)).norm(dim=-1) * self.scale
         usable = sizes.isfinite() & (sizes > SMALLEST_SIZE * CANONICAL_SIZE)  # what is not finite has no extent
         self._warn_of_size(sizes)
-        if is_eager(usable) and usable.all():
-            return keyframes, usable
         return torch.where(usable[..., None, None], keyframes, self.reference.mT / self.scale), usable
 
     def _align(self, keyframes: Tensor, weights: Tensor) -> tuple[Tensor, Pose]:

@@ -6,7 +6,6 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from torch_modal.autograd import is_eager
 from torch_modal.elastic.backend import TorchBackend, choose
 from torch_modal.elastic.energy import Energy, RestShapes
 from torch_modal.elastic.gauss_newton import newton
@@ -106,9 +105,8 @@ class InBetweenSolver(nn.Module):
         compared = rests._replace(weights=weights.clamp_min(0))
         x, solution = blend_towards_starts(x, [base, straight], solution, self.distortion, compared, DISTORTION_SLACK)
         x, solution = self.finish(x, solution, rests)
-        valid, x = solution.status != Status.INVALID, self.alignment.to_caller(x, pose)
-        x = x if is_eager(valid) and valid.all() else torch.where(valid[:, None, None], x, torch.nan)
-        return InBetweenResult(x, solution)
+        valid = (solution.status != Status.INVALID)[:, None, None]
+        return InBetweenResult(torch.where(valid, self.alignment.to_caller(x, pose), torch.nan), solution)
 
     def finish_paired(self, rests: RestShapes, solution: Solution, pose: Pose) -> InBetweenResult:
         """The two shapes of Eq. 4, interpolated locally, and their mean, as in the paper."""
