@@ -6,7 +6,6 @@ import torch
 from torch import Tensor, nn
 
 from torch_modal.arrays import IntArray
-from torch_modal.autograd import linear_map
 from torch_modal.elastic.stretch import MIN_RELATIVE_LENGTH
 from torch_modal.elastic.term import Mesh
 from torch_modal.geometry.connectivity import Connectivity
@@ -41,9 +40,7 @@ class CoarseMesh(nn.Module):
 
     weights: Tensor
     clusters: Tensor
-    members: Tensor
-    first_member: Tensor
-    shares_of_members: Tensor
+    shares: Tensor
 
     def __init__(self, shapes: Tensor, whole: Mesh, n_faces: int, weights: Tensor, modes: Sequence[Tensor]) -> None:
         super().__init__()
@@ -56,31 +53,15 @@ class CoarseMesh(nn.Module):
         self.mesh = Mesh(Connectivity(coarsening.faces, self.n_vertices))
         self.register_buffer("weights", per_cluster.index_add(0, clusters, weights), persistent=False)
         self.register_buffer("clusters", clusters, persistent=False)
+        #: Part of each fine vertex in its cluster. *Shape:* ``(V,)``.
         shares = member / per_cluster.index_add(0, clusters, member)[clusters]
-        #: Fine vertices in the order of their clusters, and the first of each cluster there.
-        self.register_buffer("members", torch.argsort(clusters, stable=True), persistent=False)
-        sizes = torch.bincount(clusters, minlength=self.n_vertices)
-        self.register_buffer("first_member", sizes.cumsum(0) - sizes, persistent=False)
-        self.register_buffer("shares_of_members", shares[self.members], persistent=False)
+        self.register_buffer("shares", shares, persistent=False)
 
     def restrict(self, x: Tensor) -> Tensor:
         """Cluster averages, linear in ``x``. *Shape:* ``(..., V, 3) -> (..., V_coarse, 3)``."""
-        members, first, shares, clusters = self.members, self.first_member, self.shares_of_members, self.clusters
-
-        def means(x: Tensor) -> Tensor:
-            # Sums over clusters, one after the other: ten times as fast as `index_add`. As a matrix, the tensor is
-            # transposed in blocks, several times as fast as by its dimensions.
-            flat, shape = x.reshape(-1, *x.shape[-2:]), (*x.shape[:-2], len(first), 3)
-            rows = flat[0].contiguous() if len(flat) == 1 else flat.flatten(1).T.contiguous().view(len(members), -1)
-            sums = nn.functional.embedding_bag(members, rows, first, mode="sum", per_sample_weights=shares.detach())
-            ordered = sums if len(flat) == 1 else sums.unflatten(1, (3, len(flat))).permute(2, 0, 1).contiguous()
-            return ordered.view(shape)
-
-        def of_members(to_means: Tensor) -> Tensor:
-            received = shares[:, None] * to_means.index_select(-2, clusters[members])
-            return torch.zeros_like(received).index_copy(-2, members, received)
-
-        return linear_map(means, of_members, x)
+        rows = x.mT * self.shares  # five times as fast along rows
+        sums = rows.new_zeros(*rows.shape[:-1], self.n_vertices)
+        return sums.index_add(-1, self.clusters, rows).mT.contiguous()
 
 
 def coarsen_until_resolved(shapes: Tensor, whole: Mesh, n_faces: int, modes: Sequence[Tensor]) -> Coarsening:
