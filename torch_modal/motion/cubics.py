@@ -16,6 +16,7 @@ from typing import NamedTuple, TypeVar
 import torch
 from torch import Tensor
 
+from torch_modal import trees
 from torch_modal.autograd import is_traced, is_vmapped, run_outside_transforms
 
 # Velocities are cut from this many times the slower one of the steps before and after on, and never reach three times:
@@ -70,21 +71,17 @@ def limited_spline(speeds: Tensor, durations: Tensor, cyclic: bool, squared: Squ
         return torch.cat([speeds, speeds])
     # Not SciPy's spline: transforms of torch.func wrap even constants.
     h, inner = durations.double(), torch.arange(0 if cyclic else 1, n, device=durations.device)
-    size, before = n + (not cyclic), (inner - 1) % n
-    matrix, right = h.new_zeros(size, size), h.new_zeros(size, n)
-    for rows, column, value in (
-        (matrix, before, h[inner]),
-        (matrix, inner, 2 * (h[before] + h[inner])),
-        (matrix, (inner + 1) % size, h[before]),
-        (right, before, 3 * h[inner]),
-        (right, inner, 3 * h[before]),
-    ):
-        rows.index_put_((inner, column), value, accumulate=True)
+    before, here = h[inner - 1][:, None], h[inner][:, None]
+    of_speed, of_velocity = torch.eye(n).to(h), torch.eye(n + (not cyclic)).to(h)
+    matrix = here * of_velocity[inner - 1] + 2 * (before + here) * of_velocity[inner]
+    matrix = matrix + before * of_velocity[(inner + 1) % len(of_velocity)]
+    right = 3 * (here * of_speed[inner - 1] + before * of_speed[inner])
     if not cyclic:
-        matrix[0, :2], matrix[-1, -2:] = torch.tensor([[2.0, 1], [1, 2]]).to(h)
-        right[0, 0] = right[-1, -1] = 3
+        ends = of_velocity[:1] * 2 + of_velocity[1:2], of_velocity[-2:-1] + 2 * of_velocity[-1:]
+        matrix = torch.cat([ends[0], matrix, ends[1]])
+        right = torch.cat([3 * of_speed[:1], right, 3 * of_speed[-1:]])
     velocities = torch.tensordot(torch.linalg.solve(matrix, right).to(speeds), speeds, 1)
-    slow, fast, length = squared(speeds[before]), squared(speeds[inner]), squared(velocities[inner])
+    slow, fast, length = squared(speeds[inner - 1]), squared(speeds[inner]), squared(velocities[inner])
     both = slow + fast
     most = LIMIT**2 * slow * fast / torch.where(both > 0, both, 1)
     # Up to the limit nothing changes; beyond it, velocities fall so that no corner is left, there or at rest.
@@ -101,17 +98,15 @@ def offset(first: Tensor, last: Tensor, u: Tensor) -> Tensor:
     return u * (1 - u) * ((1 - u) * first - u * last)
 
 
-def evaluate_by_interval(
-    segment: Tensor, n: int, shapes: Callable[[int, Tensor | slice], Part]
-) -> tuple[list[Part], Tensor]:
-    """Evaluate shapes interval by interval; also the place of each shape in the concatenated results.
+def evaluate_by_interval(segment: Tensor, n: int, shapes: Callable[[int, Tensor | slice], Part]) -> Part:
+    """Evaluate shapes interval by interval, and join the results in the order of the batch.
 
     Where ``vmap`` maps the intervals, or tracing does not know them, all rows are computed in each interval.
 
     Args:
         segment: The interval of each shape. *Shape:* ``(B,)``.
         n: Number of intervals.
-        shapes: Computes some rows of the batch, which are in one interval.
+        shapes: Computes some rows of the batch, which are in one interval: a tensor, or a tree of tensors.
     """
     traced = is_traced(segment)
     used = range(n) if traced else run_outside_transforms(lambda x: x.unique().tolist(), segment)
@@ -119,6 +114,10 @@ def evaluate_by_interval(
     if traced or is_vmapped(segment):
         place, size = sum((segment == i) * place for place, i in enumerate(intervals)), segment.shape[0]
         order = place * size + torch.arange(size, device=segment.device)
-        return [shapes(i, slice(None)) for i in intervals], order
-    rows = [torch.nonzero(segment == i).flatten() for i in intervals]
-    return [shapes(*each) for each in zip(intervals, rows, strict=True)], torch.argsort(torch.cat(rows))
+        parts = [shapes(i, slice(None)) for i in intervals]
+    else:
+        rows = [torch.nonzero(segment == i).flatten() for i in intervals]
+        order = torch.argsort(torch.cat(rows))
+        parts = [shapes(*each) for each in zip(intervals, rows, strict=True)]
+    joined = (torch.cat(tensors)[order] for tensors in zip(*map(trees.leaves, parts), strict=True))
+    return trees.fill(parts[0], joined)  # type: ignore[no-any-return]

@@ -161,8 +161,7 @@ class ModalDecoder(nn.Module):
             chunks = [rows] if isinstance(rows, slice) else rows.split(size)
             return torch.cat([self._shapes(knots, i, a[chunk], u[chunk]) for chunk in chunks])
 
-        parts, order = evaluate_by_interval(segment, len(self.times) - 1, shapes)
-        x = torch.cat(parts)[order]
+        x = evaluate_by_interval(segment, len(self.times) - 1, shapes)
         if motions is not None:
             turns, moves = motions.expand(*lead, 6).reshape(-1, 1, 6).split(3, -1)
             centre = x.mean(1, keepdim=True)

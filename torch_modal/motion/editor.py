@@ -98,7 +98,7 @@ class PathEditor:
             return [(pair, pair.new_zeros(0)) for pair in ends]
         size = (self.keyframes.amax(1) - self.keyframes.amin(1)).norm(dim=-1).amax()
         velocities = []
-        for knots in path.knots(self.keyframes[None].to(path.dtype)) or []:
+        for knots in path.knots(self.keyframes[None].to(path.dtype)):
             for quantity, unit in ((knots.vertices, knots.shapes.abs().amax()), (knots.turns, 1), (knots.moves, size)):
                 velocities += [velocity.flatten(1) / unit for velocity in quantity[1:]]
         return list(zip(ends, torch.cat(velocities, 1), strict=True))

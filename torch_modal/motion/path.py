@@ -1,6 +1,5 @@
 """Motion through many key-frames: smooth in time, at any time, differentiable."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -12,7 +11,6 @@ from torch_modal.contact.active import refuse_transforms
 from torch_modal.contact.in_between import push_apart
 from torch_modal.elastic.backend import choose
 from torch_modal.elastic.energy import RestShapes
-from torch_modal.elastic.minimise import Solution
 from torch_modal.elastic.shell import ALPHA, BETA
 from torch_modal.elastic.term import Mesh
 from torch_modal.geometry.bodies import bodies
@@ -199,10 +197,9 @@ class Path(PreciseModule):
         """The shapes, and how each minimisation went, without a warning. Arguments as for :meth:`forward`."""
         flat, which, segment, u, lead = self._flatten(keyframes, t)
         knots = self.knots(flat)
-        parts, order = evaluate_by_interval(
+        result = evaluate_by_interval(
             segment, len(self.pairs), lambda i, rows: self.evaluate_interval(knots, flat, i, which[rows], u[rows])
         )
-        result = join_batches(parts, order)
         pairs = torch.tensor(self.pairs, device=segment.device)[segment]
         ends = torch.stack([flat[which, k] for k in pairs.unbind(-1)], 1).to(keyframes.dtype)
         exact = with_exact_keyframes(result.shapes, ends, torch.stack([1 - u, u], -1))
@@ -218,23 +215,23 @@ class Path(PreciseModule):
         limited, turns = zip(*map(Spline.explain, splines, knots), strict=True)
         share, turn = self.smooth * torch.cat(limited, -1).to(u).mean(-1), torch.stack(turns).amax(0)
         even = [not self.smooth or any(s.rotations[i].beyond_a_turn for s in splines) for i in range(n)]
-        known, result = knots if self.smooth else None, self.solve(keyframes, t)
-        alone = join_batches(
-            *evaluate_by_interval(segment, n, lambda i, rows: self._spline_shapes(known, flat, i, which[rows], u[rows]))
+        result = self.solve(keyframes, t)
+        alone = evaluate_by_interval(
+            segment, n, lambda i, rows: self._spline_shapes(knots, flat, i, which[rows], u[rows])
         )
         moved = (result.shapes.reshape_as(alone.shapes) - alone.shapes).norm(dim=-1).amax(-1)
         of_intervals = share[segment, :, which], torch.tensor(even, device=u.device)[segment], turn[segment, :, which]
         fields = (x.reshape(lead + x.shape[1:]) for x in (segment, u, *of_intervals, moved))
         return Explanation._make([*fields, result.solution])
 
-    def knots(self, motions: Tensor) -> list[Knots] | None:
-        """The knots of each body; None if the path is not smooth. *Shape:* ``(L, K, V, 3)``."""
+    def knots(self, motions: Tensor) -> list[Knots]:
+        """The knots of each body; none if the path is not smooth. *Shape:* ``(L, K, V, 3)``."""
         parts = zip(self.splines, self.vertices, strict=True)
-        return [spline.knots(motions[:, :, vertices]) for spline, vertices in parts] if self.smooth else None
+        return [spline.knots(motions[:, :, vertices]) for spline, vertices in parts] if self.smooth else []
 
     @full_precision
     def evaluate_interval(
-        self, knots: list[Knots] | None, flat: Tensor, i: int, which: Tensor, u: Tensor, n_searched: int = N_SEARCHED
+        self, knots: list[Knots], flat: Tensor, i: int, which: Tensor, u: Tensor, n_searched: int = N_SEARCHED
     ) -> InBetweenResult:
         """Shapes of one interval.
 
@@ -249,19 +246,19 @@ class Path(PreciseModule):
         result = self._spline_shapes(knots, flat, i, which, u)
         if self.contact:
             result = self._separate_contacts(knots, flat, i, which, u, result, n_searched)
-        if knots is not None and self.objective.terms:
+        if self.smooth and self.objective.terms:
             x = result.shapes[:, None]  # each is compared with itself
             result = self.layers[0].solve_samples(x, torch.ones_like(x[..., 0, 0]), u.shape)
         return result
 
-    def _spline_shapes(
-        self, knots: list[Knots] | None, flat: Tensor, i: int, which: Tensor, u: Tensor
-    ) -> InBetweenResult:
+    def _spline_shapes(self, knots: list[Knots], flat: Tensor, i: int, which: Tensor, u: Tensor) -> InBetweenResult:
         """Shapes without contact and further terms. Arguments as for :meth:`evaluate_interval`."""
         weights = torch.stack([1 - u, u], -1)
-        if knots is None:
-            ends = flat[which][:, list(self.pairs[i])]
-            return self.layers[i].solve_samples(ends, weights, u.shape)  # type: ignore[no-any-return]
+        if not self.smooth:
+            result = self.layers[i].solve_samples(flat[which][:, list(self.pairs[i])], weights, u.shape)
+            # Amplitudes of other intervals are of other modes.
+            solution = result.solution._replace(amplitudes=u.new_zeros(len(u), 0))
+            return result._replace(solution=solution)  # type: ignore[no-any-return]
         results, stiffness = [], [u.new_full((len(u), 1), value) for value in (ALPHA, BETA)]
         for spline, distortion, body in zip(self.splines, self.distortions, knots, strict=True):
             straight = spline.straight(body, i, which, u)
@@ -275,34 +272,32 @@ class Path(PreciseModule):
         return join_bodies(results, self.vertices)
 
     def _separate_contacts(
-        self, knots: list[Knots] | None, flat: Tensor, i: int, which: Tensor, u: Tensor, result: InBetweenResult, n: int
+        self, knots: list[Knots], flat: Tensor, i: int, which: Tensor, u: Tensor, result: InBetweenResult, n: int
     ) -> InBetweenResult:
         """Shapes pushed apart by a displacement found at ``n`` even times of each motion."""
         refuse_transforms(result.shapes)
         layer, pair = self.layers[0 if self.smooth else i], list(self.pairs[i])
         core, even = layer.core, torch.arange(1, n + 1).to(u) / (n + 1)
-        shapes, left = result.shapes.clone(), torch.zeros_like(result.solution.status)
+        shapes, left = result.shapes, torch.zeros_like(result.solution.status)
 
-        def pose_at(rows: Tensor, at: Tensor) -> tuple[Pose, Tensor | None, Tensor]:
-            """Poses, rest shapes of a pair, and key-frames in the frame of the solver."""
-            if knots is not None:
-                return self.splines[0].pose(knots[0], i, rows, at), None, knots[0].shapes[i : i + 2, rows[0]]
-            rests, pose, _ = core.alignment(flat[rows][:, pair], torch.stack([1 - at, at], -1))
-            return pose, rests, rests[0]
+        def pose_at(rows: Tensor, at: Tensor) -> tuple[Pose, Tensor]:
+            """Poses, and key-frames in the frame of the solver."""
+            if self.smooth:
+                return self.splines[0].pose(knots[0], i, rows, at), knots[0].shapes[i : i + 2, rows].movedim(0, 1)
+            ends, pose, _ = core.alignment(flat[rows][:, pair], torch.stack([1 - at, at], -1))
+            return pose, ends
 
         for motion in which.unique().tolist():
             with torch.no_grad():
                 rows = torch.full_like(even, motion, dtype=torch.int64)
-                pose, known, ends = pose_at(rows, even)
+                pose, ends = pose_at(rows, even)
                 x = core.alignment.to_frame(self._spline_shapes(knots, flat, i, rows, even).shapes, pose)
-                if known is None:  # shapes on the spline are compared with themselves
-                    known, weights = x[:, None], torch.ones_like(even)[:, None]
-                else:
-                    weights = torch.stack([1 - even, even], -1)
-                rests = RestShapes(known, weights, layer.stiffness_of(even, even.shape))
+                rests = RestShapes(ends, torch.stack([1 - even, even], -1), layer.stiffness_of(even, even.shape))
+                if self.smooth:  # shapes on the spline are compared with themselves
+                    rests = rests._replace(shapes=x[:, None], weights=torch.ones_like(even)[:, None])
                 last = len(self.pairs) - 1
                 goes_on = self.smooth and (self.cyclic or i > 0), self.smooth and (self.cyclic or i < last)
-                both = torch.stack([ends, flat[motion, pair]])
+                both = torch.stack([ends[0], flat[motion, pair]])
                 displacement = push_apart(core, x, even, rests, pose, both, goes_on)
             chosen = torch.nonzero(which == motion).flatten()
             pose = pose_at(which[chosen], u[chosen])[0]
@@ -324,15 +319,3 @@ class Path(PreciseModule):
         which = torch.arange(len(flat), device=t.device).reshape(leading).expand(lead).reshape(-1)
         segment, u = locate_times(t.expand(lead).reshape(-1), self.times, self.cyclic, rounding)
         return flat, which, segment, u.to(flat), lead
-
-
-def join_batches(parts: Sequence[InBetweenResult], order: Tensor) -> InBetweenResult:
-    """Join flat batches into one; ``order`` is the place of each shape among the parts. *Shape:* ``(B,)``.
-
-    Where numbers of modes differ, zeros follow the amplitudes.
-    """
-    widest = max(result.solution.amplitudes.shape[-1] for result in parts)
-    wide = [nn.functional.pad(p.solution.amplitudes, (0, widest - p.solution.amplitudes.shape[-1])) for p in parts]
-    columns = [wide, *zip(*(result.solution[1:] for result in parts), strict=True)]
-    values = [None if column[0] is None else torch.cat(list(column))[order] for column in columns]
-    return InBetweenResult(torch.cat([result.shapes for result in parts])[order], Solution(*values))  # type: ignore[arg-type]
