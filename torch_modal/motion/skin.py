@@ -25,9 +25,10 @@ from torch_modal.io.write import check_frames
 from torch_modal.times import Times, check_times
 
 MOST_ROUNDS = 20  # at most; fewer where one lowers the error by less than a hundredth
+INFLUENCES = 4  # most bones of a vertex, as files hold them
 SWEEPS = 2  # over the bones in a round
 LEAST_BONE_VERTICES = 4  # vertices of a new bone; fewer leave its rotation undetermined
-EQUAL = 1e-5  # distance of motions that count as one, over the diagonal
+EQUAL = 1e-5  # mean distance of a cluster's vertices, over the diagonal, below which it is one bone
 PRODUCTS_AT_ONCE = 2**22  # products of bones at vertices, in memory at a time
 TINY, RIDGE = 1e-30, 1e-10
 TIED = 8  # further rounds, in which the rotations of a bone are tied to the rotations in the neighbouring frames
@@ -41,7 +42,6 @@ def bake(
     frames: Array,
     faces: Array,
     bones: int = 40,
-    influences: int = 4,
     times: Times = None,
     tolerance: float | None = None,
 ) -> Skin:
@@ -49,14 +49,12 @@ def bake(
 
     Bones start from clusters of vertices that move alike, split where the error is largest; then weights and bones are
     fitted in turns (Le and Deng 2012, Smooth Skinning Decomposition with Rigid Bones). Rotations are tied to the
-    neighbouring frames, as players interpolate between them. Bones that move as one are merged. Copies of a
-    vertex along seams have equal weights.
+    neighbouring frames, as players interpolate between them. Copies of a vertex along seams have equal weights.
 
     Args:
         frames: Vertex positions, two frames or more. Frame 0 is the rest shape. *Shape:* ``(T, V, 3)``.
         faces: Vertex indices. *Shape:* ``(F, 3)``.
         bones: Most bones.
-        influences: Most bones of a vertex, 1 to 4.
         times: When the frames are, ascending, for :func:`torch_modal.save_animation`; of a cycle, with the time when it
             begins again.
         tolerance: Take the fewest bones with an error, the root mean square distance over the bounding-box diagonal, of
@@ -77,8 +75,6 @@ def bake(
         raise ValueError(f"bones need 2 frames and {LEAST_BONE_VERTICES} vertices or more, got {n} of {n_vertices}")
     if not isinstance(bones, int) or not 1 <= bones <= n_vertices:
         raise ValueError(f"bones must be a whole number from 1 to the number of vertices, {n_vertices}; got {bones!r}")
-    if influences not in (1, 2, 3, 4):
-        raise ValueError(f"influences must be 1, 2, 3 or 4 bones of a vertex, got {influences!r}")
     if tolerance is not None and not 0 < tolerance < np.inf:
         raise ValueError(f"tolerance must be a positive part of the diagonal, such as 0.001; got {tolerance}")
     when = None if times is None else check_times(times, n, None, "frame")
@@ -90,7 +86,7 @@ def bake(
     copies = merge_seams(shapes, triangles)
     first = np.unique(copies, return_index=True)[1]
     centres = shapes.mean(1, keepdims=True)
-    fit = _Decomposition(torch.from_numpy((shapes[:, first] - centres) / diagonal).to(like.device), influences)
+    fit = _Decomposition(torch.from_numpy((shapes[:, first] - centres) / diagonal).to(like.device))
 
     @functools.cache
     def skin(most: int) -> Skin:
@@ -125,8 +121,7 @@ def bake(
 class _Decomposition:
     """Fits bones ``(T, J, 3, 4)`` and weights ``(V, J)`` to shapes ``(T, V, 3)``."""
 
-    def __init__(self, x: Tensor, influences: int) -> None:
-        self.influences = influences
+    def __init__(self, x: Tensor) -> None:
         self.rest = torch.nn.functional.pad(x[0], (0, 1), value=1)
         self.shapes, self.rows = x, x.mT.flatten(0, 1)
         self.still = torch.eye(3, 4).to(x).repeat(len(x), 1, 1, 1)
@@ -134,10 +129,10 @@ class _Decomposition:
     def solve(self, most: int) -> tuple[Tensor, Tensor]:
         """Weights in whole parts of :data:`WEIGHT_STEPS`, and bones."""
         bones = self._cluster_bones(most)
-        weights, error = self._fit_weights(bones, self.influences)
+        weights, error = self._fit_weights(bones)
         for _ in range(MOST_ROUNDS):
             last, bones = error.mean(), self._fit_bones(bones, weights)
-            weights, error = self._fit_weights(bones, self.influences)
+            weights, error = self._fit_weights(bones)
             if error.mean() > 0.98 * last:
                 break
         ties, total = torch.full_like(bones[0, :, 0, 0], TIES[0]), error.sum() + EQUAL**2 * len(error)
@@ -146,8 +141,9 @@ class _Decomposition:
             steps = bones[1:, ..., :3] @ bones[:-1, ..., :3].mT
             beyond = (steps * _frame_rotations(self.shapes, weights)[0]).sum((-2, -1)) < 1 + 2 * LARGEST_TURN
             ties = torch.where(beyond.any(0), (4 * ties).clamp_max(TIES[1]), ties)
-            weights, error = self._fit_weights(bones, self.influences)
-        weights, bones, ties = self._merge_bones(weights, bones, ties)
+            weights, error = self._fit_weights(bones)
+        used = weights.sum(0) * WEIGHT_STEPS >= 1
+        weights, bones, ties = weights[:, used], bones[:, used], ties[used]
         whole = (weights * WEIGHT_STEPS).floor()
         rank = (weights * WEIGHT_STEPS - whole).argsort(1, descending=True).argsort(1)
         weights = (whole + (rank < WEIGHT_STEPS - whole.sum(1, keepdim=True))) / WEIGHT_STEPS
@@ -175,13 +171,14 @@ class _Decomposition:
                 bones = self._fit_bones(bones, weights)
         return bones
 
-    def _fit_weights(self, bones: Tensor, influences: int) -> tuple[Tensor, Tensor]:
+    def _fit_weights(self, bones: Tensor, influences: int = INFLUENCES) -> tuple[Tensor, Tensor]:
         """Weights of least squared distance, and its mean over the frames at each vertex.
 
         Bones are added one by one: that towards which a straight step lowers the distance most.
         """
         n_frames, n = bones.shape[:2]
-        columns, grams = bones.transpose(1, 2).reshape(3 * n_frames, 4 * n), _grams(bones).reshape(n * n, 16)
+        columns = bones.transpose(1, 2).reshape(3 * n_frames, 4 * n)
+        grams = (columns.mT @ columns).view(n, 4, n, 4).transpose(1, 2).reshape(n * n, 16)
         weights, errors = self.rest.new_zeros(len(self.rest), n), []
         for rows in torch.arange(len(self.rest), device=bones.device).split(max(1, PRODUCTS_AT_ONCE // n**2)):
             p, x = self.rest[rows], self.rows[:, rows]
@@ -232,23 +229,6 @@ class _Decomposition:
                 columns[:, block] = torch.cat([rotation, shift[..., None]], 2).flatten(0, 1)
         return columns.reshape(n_frames, 3, n, 4).transpose(1, 2)
 
-    def _merge_bones(self, weights: Tensor, bones: Tensor, ties: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Drop bones that move nothing, and merge bones that move alike."""
-        kept = weights.sum(0) * WEIGHT_STEPS >= 1
-        while True:
-            weights, bones, ties = weights[:, kept], bones[:, kept], ties[kept]
-            weighted = weights[:, :, None] * self.rest[:, None]
-            sums = torch.einsum("vja,vjb->jab", weighted, weighted)
-            grams = _grams(bones)
-            norms = grams.diagonal().movedim(-1, 0)
-            apart = norms[:, None] + norms - grams - grams.transpose(0, 1)
-            off = (apart * sums[:, None]).sum((2, 3)) / (len(bones) * sums[:, 3, 3, None])
-            j, k = divmod(int(off.fill_diagonal_(torch.inf).argmin()), len(off))
-            if off[j, k] > EQUAL**2:
-                return weights, bones, ties
-            weights[:, k] += weights[:, j]
-            kept = torch.arange(len(off), device=off.device) != j
-
 
 def _frame_rotations(x: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
     """Rotations of each bone's vertices from frame to frame, and their centres.
@@ -258,9 +238,7 @@ def _frame_rotations(x: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
     parts = weights / weights.sum(0).clamp_min(TINY)
     centres = parts.mT @ x
     sums = x.mT.flatten(0, 1) @ (parts[:, :, None] * x[0, :, None]).flatten(1)
-    moments = (
-        sums.unflatten(1, (-1, 3)).unflatten(0, (-1, 3)).transpose(1, 2) - centres[..., None] * centres[0, :, None]
-    )
+    moments = sums.view(len(x), 3, -1, 3).transpose(1, 2) - centres[..., None] * centres[0, :, None]
     width = moments[0].diagonal(dim1=1, dim2=2).sum(1)[:, None, None]
     turns = best_rotation(moments + IDENTITY_SHARE * width * torch.eye(3).to(x))
     return turns[1:] @ turns[:-1].mT, centres
@@ -284,12 +262,6 @@ def _halfway_errors(skin: Skin, shapes: Tensor) -> Tensor:
     for turn, middle, x in ((half, centres[:-1], local[:-1]), (half.mT, centres[1:], local[1:])):
         off -= 0.5 * blend_bones(weights, torch.cat([turn, middle - turn @ middle], 3), x)
     return off
-
-
-def _grams(bones: Tensor) -> Tensor:
-    """Sums over the frames of ``T_j^T T_k``. *Shape:* ``(T, J, 3, 4) -> (J, J, 4, 4)``."""
-    columns = bones.transpose(1, 2).flatten(0, 1).flatten(1)
-    return (columns.mT @ columns).unflatten(1, (-1, 4)).unflatten(0, (-1, 4)).transpose(1, 2)
 
 
 def _convex_weights(squares: Tensor, products: Tensor, chosen: Tensor) -> tuple[Tensor, Tensor]:
