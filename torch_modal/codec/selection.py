@@ -1,7 +1,6 @@
 """Choice of the frames of a motion that serve as its key-frames."""
 
-from collections.abc import Sequence
-from itertools import pairwise
+import functools
 from typing import Any
 
 import torch
@@ -34,8 +33,8 @@ def select_keyframes(
     """Select the frames of a motion that serve best as its key-frames.
 
     Key-frames are inserted one by one where the errors of the frames between are largest; a given number of them is
-    then moved while the mean error falls. Errors are the errors of :func:`torch_modal.encode`, estimated from a few
-    frames of each interval.
+    then moved, by steps that halve, while the mean error falls. Errors are the errors of :func:`torch_modal.encode`,
+    estimated from a few frames of each interval.
 
     Args:
         frames: A motion of one connectivity, in any units. *Shape:* ``(T, V, 3)``.
@@ -58,7 +57,7 @@ def select_keyframes(
     """
     x, triangles, when = check_motion(frames, faces, times, cyclic)
     modes = extract_modes(x[0], triangles, n_modes, cache_dir=cache_dir, cache=cache).modes
-    return Selection(x, triangles, when, cyclic, modes).run(n_keyframes, error, progress)
+    return insert_keyframes(x, triangles, when, cyclic, modes, n_keyframes, error, progress)
 
 
 def check_motion(frames: Any, faces: Any, times: Any, cyclic: bool) -> tuple[Tensor, Tensor, Tensor]:
@@ -67,84 +66,66 @@ def check_motion(frames: Any, faces: Any, times: Any, cyclic: bool) -> tuple[Ten
     return shapes.detach().cpu().double(), triangles.cpu(), check_times(times, len(shapes), cyclic)
 
 
-class Selection:
-    """Search for the key-frames of a checked motion with modes of its first frame, ``(k, V, 3)``.
+def insert_keyframes(
+    frames: Tensor,
+    faces: Tensor,
+    times: Tensor,
+    cyclic: bool,
+    modes: Tensor,
+    n_keyframes: int | None,
+    error: float,
+    progress: Progress = None,
+) -> list[int]:
+    """Key-frames of a checked motion with modes of its first frame, ``(k, V, 3)``; see :func:`select_keyframes`.
 
-    The error of an interval is computed once.
+    Raises:
+        ValueError: More key-frames than frames, or fewer than two.
     """
+    n = len(frames)
+    if n_keyframes is not None and not 2 <= n_keyframes <= n:
+        raise ValueError(f"n_keyframes must be from 2 to the number of frames, {n}; got {n_keyframes}")
+    decoder = ModalDecoder(frames[:2], faces, torch.arange(2).double(), frames[0], modes)
 
-    def __init__(self, frames: Tensor, faces: Tensor, times: Tensor, cyclic: bool, modes: Tensor) -> None:
-        self.frames, self.times, self.cyclic = frames, times, cyclic
-        self._decoder = ModalDecoder(frames[:2], faces, torch.arange(2).double(), frames[0], modes)
-        self._known: dict[tuple[int, ...], dict[int, float]] = {}  # errors of the intervals that were fitted
+    @functools.cache
+    def fit_interval(a: int, b: int, around: tuple[int, ...]) -> tuple[Tensor, Tensor]:
+        """Some frames between two key-frames, and their errors, from the key-frames that the path depends on."""
+        samples = torch.linspace(a + 1, b - 1, min(FRAMES_TO_FIT, b - a - 1)).round().long()
+        cycles, keys = torch.tensor(around) // n, torch.tensor(around) % n
+        path = decoder.with_keyframes(frames[keys], times[keys] + (times[-1] - times[0]) * cycles)
+        return samples, fit(path, frames[samples], times[samples]).errors
 
-    def run(self, n_keyframes: int | None, error: float, progress: Progress = None) -> list[int]:
-        """The key-frames; see :func:`select_keyframes`.
+    def fit_intervals(keys: list[int]) -> list[tuple[int, int, Tensor, Tensor]]:
+        """Ends, samples and errors of all intervals with frames between."""
+        # Numbers of a cycle go on in the periods before and after.
+        every = [keys[-1] - n, *keys, n, n + keys[1]] if cyclic else keys
+        ends = [(i, every[i], every[i + 1]) for i in range(cyclic, len(every) - 1 - cyclic)]
+        return [(a, b, *fit_interval(a, b, tuple(every[max(i - 1, 0) : i + 3]))) for i, a, b in ends if b > a + 1]
 
-        Raises:
-            ValueError: More key-frames than frames, or fewer than two.
-        """
-        n = len(self.frames)
-        if n_keyframes is not None and not 2 <= n_keyframes <= n:
-            raise ValueError(f"n_keyframes must be from 2 to the number of frames, {n}; got {n_keyframes}")
-        keys = [0, n // 2] if self.cyclic else [0, n - 1]
-        with ProgressReport(n_keyframes or n, "key-frames", progress) as bar:
-            while len(keys) < (n_keyframes or n):
-                intervals = self.intervals(keys)
-                if n_keyframes is None:
-                    scores = [max(errors.values(), default=0.0) for errors, _, _ in intervals]
-                    if max(scores) <= error:
-                        break
-                else:
-                    scores = [sum(errors.values()) * (b - a - 1) for errors, a, b in intervals]
-                errors, a, b = intervals[scores.index(max(scores))]
-                total = sum(errors.values())
-                centre = sum(f * e for f, e in errors.items()) / total if total > 0 else (a + b) / 2
-                keys = sorted([*keys, min(max(round(centre), a + 1), b - 1)])
-                bar.update()
-        return keys if n_keyframes is None else self._move_keyframes(keys)
+    def sum_errors(keys: list[int]) -> float:
+        """Estimated sum of the errors of all frames."""
+        return sum(float(errors.mean()) * (b - a - 1) for a, b, _, errors in fit_intervals(keys))
 
-    def intervals(self, keys: Sequence[int]) -> list[tuple[dict[int, float], int, int]]:
-        """Errors of a few frames of each interval between key-frames, by their numbers, and its first and last frame.
-
-        The last interval of a cycle ends at the number of frames.
-        """
-        result, n, period = [], len(keys), len(self.frames)
-        for i, (a, b) in enumerate(pairwise([*keys, period] if self.cyclic else keys)):
-            # The path of an interval depends on four key-frames; numbers go on in later periods of a cycle.
-            if self.cyclic:
-                around = [keys[j % n] + period * (j // n) for j in range(i - 1, i + 3)]
+    keys = [0, n // 2] if cyclic else [0, n - 1]
+    with ProgressReport(n_keyframes or n, "key-frames", progress) as bar:
+        while len(keys) < (n_keyframes or n):
+            intervals = fit_intervals(keys)
+            if n_keyframes is None:
+                scores = [float(errors.max()) for *_, errors in intervals]
+                if max(scores) <= error:
+                    break
             else:
-                around = list(keys[max(i - 1, 0) : i + 3])
-            name = (*around, a)
-            if name not in self._known and b - a > 1:
-                samples = torch.linspace(a + 1, b - 1, min(FRAMES_TO_FIT, b - a - 1)).round().long()
-                cycles, frames = (torch.tensor(around) // period, torch.tensor(around) % period)
-                times = self.times[frames] + (self.times[-1] - self.times[0]) * cycles
-                decoder = self._decoder.with_keyframes(self.frames[frames], times)
-                errors = fit(decoder, self.frames[samples], self.times[samples]).errors
-                self._known[name] = dict(zip(samples.tolist(), errors.tolist(), strict=True))
-            result.append((self._known.get(name, {}), a, b))
-        return result
-
-    def mean(self, keys: Sequence[int]) -> float:
-        """Estimated mean error of all frames."""
-        each = [sum(e.values()) / max(len(e), 1) * (b - a - 1) for e, a, b in self.intervals(keys)]
-        return sum(each) / len(self.frames)
-
-    def _move_keyframes(self, keys: list[int]) -> list[int]:
-        """Move key-frames one at a time, by steps that halve, as long as the mean error falls."""
-        n = len(self.frames)
-        step = max(1, n // (4 * len(keys)))
-        best = self.mean(keys)
-        while step:
-            before = best
-            for j in range(1, len(keys) if self.cyclic else len(keys) - 1):
-                low, high = keys[j - 1] + 1, (keys[j + 1] if j + 1 < len(keys) else n) - 1
-                for place in {min(max(keys[j] + side * step, low), high) for side in (-1, 1)} - {keys[j]}:
-                    moved = [*keys[:j], place, *keys[j + 1 :]]
-                    if (mean := self.mean(moved)) < best * (1 - 1e-3):
-                        best, keys = mean, moved
-            if best == before:
-                step //= 2
-        return keys
+                scores = [float(errors.sum()) * (b - a - 1) for a, b, _, errors in intervals]
+            a, b, samples, errors = intervals[scores.index(max(scores))]
+            centre = float((samples * errors).sum() / errors.sum()) if errors.any() else (a + b) / 2
+            keys = sorted([*keys, min(max(round(centre), a + 1), b - 1)])
+            bar.update()
+    least, step = sum_errors(keys), 0 if n_keyframes is None else max(1, n // (4 * len(keys)))
+    while step:
+        before = least
+        for j in range(1, len(keys) - (not cyclic)):
+            for place in (keys[j] - step, keys[j] + step):
+                moved = [*keys[:j], place, *keys[j + 1 :]]
+                if moved == sorted({*moved} & {*range(n)}) and (total := sum_errors(moved)) < least * (1 - 1e-3):
+                    least, keys = total, moved
+        step //= 2 if least == before else 1
+    return keys

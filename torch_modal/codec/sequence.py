@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torch_modal.codec.fit import FittedFrames, fit
-from torch_modal.codec.selection import LARGEST_ERROR, Selection, check_motion
+from torch_modal.codec.selection import LARGEST_ERROR, check_motion, insert_keyframes
 from torch_modal.io.tensors import TensorFile, write_tensors
 from torch_modal.keyframes.arrays import check_tensor
 from torch_modal.keyframes.check import check_keyframes
@@ -23,7 +23,6 @@ from torch_modal.times import Times, locate_times
 FORMAT = "torch_modal.sequence"
 VERSION = "3"
 STORED = ("keyframes", "faces", "keyframe_times", "times", "amplitudes", "motions", "modes", "errors")
-FRAMES_AT_ONCE = 16  # frames that are decoded at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,13 +86,12 @@ class ModalSequence:
         """True for the frames that are key-frames. *Shape:* ``(T,)``."""
         return torch.isin(self.times, self.keyframe_times[: len(self.keyframes)])
 
-    def decode(self, t: Any = None, progress: Progress = False) -> Tensor:
+    def decode(self, t: Any = None) -> Tensor:
         """The frames, or the shapes at other times, by linear interpolation of the amplitudes.
 
         Args:
             t: Times, from the first to the last frame; if cyclic, any. Default: the times of the frames. *Shape:*
                 ``(N,)``, or a number.
-            progress: See :data:`torch_modal.progress.Progress`.
 
         Returns:
             float64; key-frames bit for bit. *Shape:* ``(N, V, 3)``.
@@ -107,11 +105,7 @@ class ModalSequence:
             else:
                 times = torch.as_tensor(t, dtype=torch.float64).reshape(-1)
                 a, motions = self._at(times)
-            out = torch.empty(len(times), *self.keyframes.shape[1:], dtype=torch.float64)
-            with ProgressReport(len(times), "decoded frames", progress) as bar:
-                for rows in torch.arange(len(times)).split(FRAMES_AT_ONCE):
-                    out[rows] = self.decoder(a[rows], times[rows], motions[rows])
-                    bar.update(len(rows))
+            out = self.decoder(a, times, motions)
             for shape, time in zip(self.keyframes, self.keyframe_times.tolist(), strict=False):
                 out[times == time] = shape
         return out
@@ -207,7 +201,7 @@ def encode(
     n = len(x)
     modes = extract_modes(x[0], triangles, n_modes, cache_dir=cache_dir, cache=cache).modes
     if keyframes is None or isinstance(keyframes, int):
-        keys = Selection(x, triangles, when, cyclic, modes).run(keyframes, error, progress)
+        keys = insert_keyframes(x, triangles, when, cyclic, modes, keyframes, error, progress)
     else:
         keys, required = [int(i) for i in keyframes], {0} if cyclic else {0, n - 1}
         if len(keys) < 2 or keys != sorted({*keys}) or not required <= {*keys} <= {*range(n)}:
