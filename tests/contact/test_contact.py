@@ -19,10 +19,10 @@ from torch_modal.contact import in_between as contact_layer
 from torch_modal.contact import modal, separate
 from torch_modal.contact.acceleration import AccelerationLimit
 from torch_modal.contact.active import ContactEnergy, Contacts, ContactSearch, Pull
-from torch_modal.contact.separate import Timeline, spline_weights
+from torch_modal.contact.separate import spline_weights
 from torch_modal.data.samples import load_sample
+from torch_modal.elastic.backend import TorchBackend
 from torch_modal.elastic.energy import RestShapes
-from torch_modal.elastic.term import Mesh
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.crossings import Crossings
 from torch_modal.inbetween.results import Samples
@@ -179,15 +179,8 @@ def frogs(data_dir: Path) -> Shapes:
 def deepest(x: Tensor, shapes: Shapes) -> float:
     """How deep the contacts of a shape are: of vertices, and of triangles that cross."""
     found = tm.self_contacts(x, shapes.faces, ignore=shapes.keyframes)
-    most = float(found.depth.max())
-    for one, other in x[shapes.faces[found.pairs[found.far]]]:
-        reaches = []
-        for own, plane in ((one, other), (other, one)):
-            normal = torch.linalg.cross(plane[1] - plane[0], plane[2] - plane[0])
-            height = (own - plane[0]) @ normal / normal.norm()
-            reaches.append(min(float(height.max()), -float(height.min())))
-        most = max(most, min(reaches))
-    return most
+    crossings = Crossings(Connectivity(shapes.faces.numpy()), shapes.keyframes.numpy())
+    return max(float(found.depth.max()), crossings.reach(x.numpy(), found.pairs[found.far].numpy()))
 
 
 @pytest.mark.parametrize(
@@ -265,12 +258,13 @@ def test_a_sample_does_not_depend_on_its_batch(hand: Shapes) -> None:
     assert float((moved - alone).norm(dim=-1).max()) < 1e-6 * size
 
 
-def unlimited(n: int, n_vertices: int, most: float = 10.0) -> Timeline:
+def unlimited(n: int, n_vertices: int, most: float = 10.0) -> AccelerationLimit:
     """A trajectory at rest, with a limit of accelerations between frames."""
     limit = AccelerationLimit(
-        torch.zeros(n + 2, n_vertices, 3), torch.eye(3, dtype=DOUBLE).repeat(n, 1, 1), (False, False), most
+        torch.zeros(n + 2, n_vertices, 3, dtype=DOUBLE), torch.eye(3, dtype=DOUBLE).repeat(n, 1, 1)
     )
-    return Timeline(torch.linspace(0, 1, n + 2, dtype=DOUBLE)[1:-1], limit, None)
+    limit.most = most
+    return limit
 
 
 def test_a_displacement_is_reduced_where_it_makes_shapes_worse() -> None:
@@ -361,18 +355,6 @@ def test_few_shapes_stay_beside_keyframes_that_intersect_themselves(
     assert 9 * peak_acceleration(displacement) < 2 * peak_acceleration(displacement[::3])
 
 
-@pytest.mark.slow
-def test_no_shape_of_a_path_is_made_worse_at_searched_times(frogs: Shapes) -> None:
-    shapes = frogs.pick(1, 2)
-    t = torch.arange(3, 64, 7, dtype=DOUBLE) / 64  # every other one is searched
-    with torch.no_grad():
-        plain = tm.Path(shapes.bases, shapes.faces)(shapes.keyframes, t)
-        pushed, solution = tm.Path(shapes.bases, shapes.faces, contact=True).solve(shapes.keyframes, t)[:2]
-    before, after = far(plain, shapes), far(pushed, shapes)
-    assert int(before.max()) > 0 and bool((after <= before)[1::2].all())
-    assert solution.n_crossing.tolist() == after.tolist()
-
-
 def test_what_contact_needs_is_said_before_any_work(hand: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ValueError, match="joint"):
         tm.Objective(space="paired", contact=True)
@@ -456,17 +438,6 @@ def test_path_takes_any_time(hand: Shapes) -> None:
     assert torch.equal(shapes[3], hand.keyframes[1])
 
 
-@pytest.mark.filterwarnings("ignore:in .* in-betweens, parts still")
-def test_limit_keeps_a_trajectory_from_popping(hand: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
-    # Three times the peak acceleration, if nothing but this little weight held it.
-    monkeypatch.setattr(modal, "SMOOTHNESS", 0.02)
-    options = {"bases": hand.bases, "progress": False}
-    plain = tm.subdivide(hand.keyframes, hand.faces, 4, **options)
-    frames = tm.subdivide(hand.keyframes, hand.faces, 4, contact=True, **options)
-    assert not torch.equal(frames, plain)
-    assert peak_acceleration(frames) < 1.3 * peak_acceleration(plain)
-
-
 def test_nothing_changes_where_nothing_touches(bars: Shapes) -> None:
     pair = bars.pick(0, 1)
     found = tm.subdivide(pair.keyframes, pair.faces, 2, bases=pair.bases, contact=True, progress=False)
@@ -496,31 +467,18 @@ def test_space_draws_from_tables_without_crossings(hand: Shapes) -> None:
     assert int(far(space.in_betweens.table(0, 1).double(), hand).sum()) == 0
 
 
-@pytest.mark.slow
-def test_scanned_like_figure_walks_with_few_crossings(women: Shapes) -> None:
-    """Thighs and hands of 13,380 vertices: of some 150 pairs, a few are left where parts lie deep in each other."""
-    pair = women.pick(1, 2)
-    layers = [tm.InBetween(pair.bases, pair.faces, contact=contact) for contact in (False, True)]
-    with torch.no_grad():
-        plain, pushed = (layer.solve(*pair.keyframes, 0.5) for layer in layers)
-    crossings = Crossings(Connectivity(pair.faces.numpy()), pair.keyframes.numpy())
-    before, after = (len(crossings.far_pairs(result.shapes.numpy())) for result in (plain, pushed))
-    assert before > 50 and after <= 0.2 * before
-    assert int(pushed.solution.n_crossing) <= 0.2 * before
-
-
 def test_shapes_beside_keyframes_that_intersect_themselves_all_take_steps() -> None:
     t = torch.arange(1, 64, dtype=DOUBLE) / 64
     for pairs, some in (([], [1]), ([(0, 1)], range(1, 8))):
-        search: Any = SimpleNamespace(search=SimpleNamespace(crossings=SimpleNamespace(known_pairs=pairs)))
+        search: Any = SimpleNamespace(search=SimpleNamespace(known_pairs=pairs))
         wanted = {*range(4, 64, 4), *some, *(64 - i for i in some)}
         assert separate._choose_shapes(t, search).tolist() == [i - 1 for i in sorted(wanted)]
 
 
 def test_neighbours_in_time_are_watched_on_either_side(hand: Shapes) -> None:
-    search = ContactSearch(Mesh.of(hand.faces, 3782), hand.keyframes, torch.ones(3782), 9)
+    search = ContactSearch(TorchBackend(), Connectivity(hand.faces.numpy()), hand.keyframes, hand.keyframes[0], 9)
     search.watch(Contacts(torch.tensor([4]), hand.faces[:1, [0, 1, 2, 0]]), 2)
-    rings = search.search.crossings.grow(hand.faces[0].numpy(), 2)
+    rings = search.search.grow(hand.faces[0].numpy(), 2)
     assert 3 < rings.sum() < 100
     assert [bool((row == rings).all()) for row in search.watched] == [2 <= i <= 6 for i in range(9)]
 
@@ -557,7 +515,8 @@ def test_each_side_has_half_of_the_room_at_a_keyframe(goes_on: tuple[bool, bool]
     x = torch.zeros(4, 1, 3, dtype=DOUBLE)
     x[[0, 3], 0, 0] = torch.tensor([0.4, 0.2], dtype=DOUBLE)
     turn = torch.tensor([[0, -1, 0], [1, 0, 0], [0, 0, 1]], dtype=DOUBLE)  # the viewer sees -y as x
-    limit = AccelerationLimit(x, turn.repeat(2, 1, 1), goes_on, 1.0)
+    limit = AccelerationLimit(x, turn.repeat(2, 1, 1), goes_on)
+    limit.most = 1.0
     found, limited = limit.nearest(torch.tensor([0, -0.7, 0], dtype=DOUBLE).expand(2, 1, 3))
     assert len(limited) == any(goes_on)  # |0.4 - 2 * 0.7 + 0.7| and |0.2 + 0.7 - 2 * 0.7| are below 1
     for side, bounded in zip((0.4 - 2 * found[0, 0, 1], 0.2 - 2 * found[1, 0, 1]), goes_on, strict=True):
@@ -572,7 +531,7 @@ def test_shapes_rest_as_far_as_accelerations_allow(generator: torch.Generator, m
 
     class Fake:
         areas, n_far = torch.ones(3, dtype=DOUBLE), 99
-        search = SimpleNamespace(crossings=SimpleNamespace(known_pairs=[]))
+        search = SimpleNamespace(known_pairs=[])
 
         def __call__(self, x: Tensor, some: Tensor) -> tuple[Contacts, Tensor]:
             self.n_far -= 1  # the last is the best
@@ -594,7 +553,7 @@ def test_shapes_rest_as_far_as_accelerations_allow(generator: torch.Generator, m
     fake, trajectory = Fake(), unlimited(n, 3, 1.0)
     given: Any = torch.zeros_like(places), relax, fake, trajectory
     x, _ = separate.separate(*given)
-    differences = trajectory.limit.differences.numpy()
+    differences = trajectory.differences.numpy()
     for v in range(3):
         best = minimize(
             lambda d, v=v: float((springs[:, 0].numpy() * (d.reshape(n, 3) - places[:, v].numpy()) ** 2).sum()),

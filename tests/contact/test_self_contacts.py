@@ -34,26 +34,15 @@ def two_boxes(overlap: float, levels: int = 2, width: float = 0.613) -> tuple[to
 
 def cross_by_fractions(one: np.ndarray, other: np.ndarray) -> bool:
     """Whether two triangles cross, in exact arithmetic: the segments that the planes cut out overlap by a length."""
-    ends = []
-    triangles = [[[Fraction(float(c)) for c in corner] for corner in triangle] for triangle in (one, other)]
-
-    def minus(a: list[Fraction], b: list[Fraction]) -> list[Fraction]:
-        return [p - q for p, q in zip(a, b, strict=True)]
-
-    def cross(a: list[Fraction], b: list[Fraction]) -> list[Fraction]:
-        return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
-
-    def dot(a: list[Fraction], b: list[Fraction]) -> Fraction:
-        return sum((p * q for p, q in zip(a, b, strict=True)), Fraction(0))
-
-    normals = [cross(minus(b, a), minus(c, a)) for a, b, c in triangles]
-    line = cross(*normals)
-    for own, plane, normal in zip(triangles, triangles[::-1], normals[::-1], strict=True):
-        heights = [dot(minus(corner, plane[0]), normal) for corner in own]
+    ends, exact = [], np.vectorize(lambda x: Fraction(float(x)), otypes=[object])
+    triangles = [exact(one), exact(other)]
+    normals = [np.cross(b - a, c - a) for a, b, c in triangles]
+    line = np.cross(*normals)
+    for corners, plane, normal in zip(triangles, triangles[::-1], normals[::-1], strict=True):
+        heights, places = (corners - plane[0]) @ normal, corners @ line
         if min(heights) >= 0 or max(heights) <= 0:
             return False
-        places = [dot(corner, line) for corner in own]
-        met = [place for place, height in zip(places, heights, strict=True) if height == 0]
+        met = list(places[heights == 0])
         for i, j in itertools.combinations(range(3), 2):
             if heights[i] * heights[j] < 0:
                 met.append(places[i] + (places[j] - places[i]) * heights[i] / (heights[i] - heights[j]))

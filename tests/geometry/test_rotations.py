@@ -167,15 +167,10 @@ def test_the_corner_that_faces_begin_with_changes_nothing(name: str, kind: str, 
     for corners in (faces, faces.gather(1, (first + torch.arange(3)) % 3)):
         mesh = Connectivity(corners.numpy())
         blend, spline = RotationBlend(mesh, x, backend), Spline(mesh, x, times, None, backend)
-        shapes.append(
-            torch.cat(
-                [
-                    blended(blend, x[:1], x[1:2], half),
-                    blend(x[None], torch.tensor([[0.5, 0.2, 0.3]], dtype=torch.float64), x[:1]),
-                    spline(spline.knots(x[None]), 1, torch.tensor([0]), half) / spline.alignment.scale,
-                ]
-            )
-        )
+        place = spline.knots(x[None]), 1, torch.tensor([0]), half
+        bent = spline(*place, spline.straight(*place)) / spline.alignment.scale
+        mean = blend(x[None], torch.tensor([[0.5, 0.2, 0.3]], dtype=torch.float64), x[:1])
+        shapes.append(torch.cat([blended(blend, x[:1], x[1:2], half), mean, bent]))
     size = (x[0].amax(0) - x[0].amin(0)).norm()
     assert float((shapes[0] - shapes[1]).norm(dim=-1).max() / size) < 1e-12
 

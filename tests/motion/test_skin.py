@@ -11,7 +11,6 @@ from torch import Tensor
 
 import torch_modal as tm
 from torch_modal.data.samples import load_sample
-from torch_modal.errors import MeshWarning
 from torch_modal.geometry.rotations import exp, log
 from torch_modal.motion.skin import _convex_weights, _Decomposition, _halfway_errors
 
@@ -148,15 +147,6 @@ def test_samples_are_followed() -> None:
     assert tm.bake(frames, hand.faces, 20).error < 5e-4
 
 
-def test_fewest_bones_of_a_tolerance() -> None:
-    errors = {n: tm.bake(BENT, FACES, n).error for n in range(1, 9)}
-    skin = tm.bake(BENT, FACES, 8, tolerance=0.01)
-    n = skin.weights.shape[1]
-    assert skin.error == errors[n] <= 0.01 < errors[n - 1]
-    with pytest.warns(MeshWarning, match="2 bones leave an error of .* above the tolerance of 1e-06"):
-        assert tm.bake(BENT, FACES, 2, tolerance=1e-6).weights.shape[1] == 2
-
-
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_dtype_gradients_and_determinism(dtype: torch.dtype) -> None:
     given = BENT.to(dtype).requires_grad_()
@@ -196,7 +186,6 @@ def test_open_and_ugly_meshes_in_millimetres() -> None:
         ({"faces": [[0, 1, 98]]}, "faces must index the 98 vertices"),
         ({"bones": 99}, "bones must be a whole number from 1 to the number of vertices, 98; got 99"),
         *(({"bones": bones}, "bones must be") for bones in (0, 2.5)),
-        *(({"tolerance": x}, "tolerance must be a positive part") for x in (0.0, float("nan"))),
         ({"times": [0, 1, 2]}, "times must be 7 or 8 ascending numbers, one for each frame"),
     ],
 )

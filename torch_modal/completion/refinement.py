@@ -16,7 +16,6 @@ from torch_modal.elastic.energy import RestShapes
 from torch_modal.elastic.steps import ExtraEnergies, FineEnergy
 from torch_modal.elastic.term import Mesh
 from torch_modal.elastic.volume import encloses
-from torch_modal.geometry.connectivity import vertex_areas
 from torch_modal.inbetween.settings import Objective, stiffnesses
 from torch_modal.progress import ProgressReport
 from torch_modal.registration.fit import ElasticSurface
@@ -122,10 +121,8 @@ class Refinement:
 
         *Shape:* ``(T, V, 3)``.
         """
-        template = self.problem.template.numpy()
-        areas = torch.from_numpy(vertex_areas(template, self.problem.mesh.faces))
-        pairs = self.backend.crossings(self.problem.mesh, template)
-        search, shapes = ContactSearch(self.mesh, self.problem.whole, areas, 1, pairs, template), []
+        problem, shapes = self.problem, []
+        search = ContactSearch(self.backend, problem.mesh, problem.whole, problem.template, 1)
         for solve in solves:
 
             def relax(x: Tensor, _: Tensor, extra: ExtraEnergies, solve: LastSolve = solve) -> Tensor:

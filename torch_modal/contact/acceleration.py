@@ -34,14 +34,13 @@ class AccelerationLimit:
         rotations: Rotations from the coordinates of displacements to the viewer's. *Shape:* ``(T, 3, 3)``.
         goes_on: True if the motion continues beyond the first and the last shape. Each side has half of the room
             there: the motion must not bounce off a key-frame.
-        most: The bound. Default: :data:`ACCELERATION_ROOM` times the largest acceleration, or :data:`LEAST_LIMIT`.
     """
 
-    def __init__(
-        self, shapes: Tensor, rotations: Tensor, goes_on: tuple[bool, bool] = (False, False), most: float | None = None
-    ) -> None:
+    def __init__(self, shapes: Tensor, rotations: Tensor, goes_on: tuple[bool, bool] = (False, False)) -> None:
         x = shapes.double().nan_to_num()
         accelerations = x[2:] - 2 * x[1:-1] + x[:-2]
+        #: The times of the displacements, from 0 to 1 at the ends. *Shape:* ``(T,)``.
+        self.times = torch.arange(1, len(x) - 1).to(shapes) / (len(x) - 1)
         each = torch.eye(len(x), dtype=x.dtype, device=x.device)[:, 1:-1]
         second = each[2:] - 2 * each[1:-1] + each[:-2]
         ends = [i for i, beyond in zip((0, -1), goes_on, strict=True) if beyond]
@@ -50,9 +49,9 @@ class AccelerationLimit:
         #: Accelerations of a displacement from its values at each time. *Shape:* ``(N, T)``.
         self.differences = torch.cat([second, *(2 * each[1:-1][i][None] for i in ends)])
         self.rotations = rotations.double()
-        self.most = most or max(
-            ACCELERATION_ROOM * float(accelerations.norm(dim=-1).max()), LEAST_LIMIT / (len(x) - 1) ** 2
-        )
+        room = ACCELERATION_ROOM * float(accelerations.norm(dim=-1).max())
+        #: The bound.
+        self.most = max(room, LEAST_LIMIT / (len(x) - 1) ** 2)
 
     def nearest(self, wanted: Tensor, weights: Tensor | float = 1.0) -> tuple[Tensor, Tensor]:
         """Find the displacement nearest to a wanted one, in least squares, that keeps each vertex below the bound.

@@ -5,18 +5,18 @@ With the height :math:`g` of a vertex over the plane of a face, the energy of th
 zero, with its first derivative, where the gap is kept.
 """
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from torch_modal.arrays import FloatArray
 from torch_modal.autograd import is_transformed
 from torch_modal.contact.detect import Search
+from torch_modal.elastic.backend import TorchBackend
 from torch_modal.elastic.steps import Point
-from torch_modal.elastic.term import Mesh
-from torch_modal.geometry.crossings import Crossings, FloatArray, IntArray
+from torch_modal.geometry.connectivity import Connectivity, vertex_areas
 from torch_modal.geometry.vectors import cross, inverse, norm, pick
 
 GAP = 0.15
@@ -62,62 +62,45 @@ class ContactSearch:
     Vertices next to an intersection are watched in all later searches.
 
     Args:
+        backend: Finds the pairs of triangles that cross.
         mesh: Their connectivity.
         known: Shapes whose own intersections stay as they are, in the frame. *Shape:* ``(K, V, 3)``.
-        areas: Areas of the vertices, constants of the gradient. *Shape:* ``(V,)``.
+        like: The shape whose lengths and areas count. *Shape:* ``(V, 3)``.
         n_shapes: T.
-        pairs: The ``search`` of :class:`~torch_modal.geometry.crossings.Crossings`.
-        like: Its ``like``.
     """
 
-    def __init__(
-        self,
-        mesh: Mesh,
-        known: Tensor,
-        areas: Tensor,
-        n_shapes: int,
-        pairs: Callable[[FloatArray], IntArray] | None = None,
-        like: FloatArray | None = None,
-    ) -> None:
-        shapes = known.detach().double().cpu().numpy()
-        self.search = Search(Crossings(mesh.connectivity, shapes, like, pairs))
-        self.faces = torch.tensor(mesh.connectivity.faces)
-        self.areas = areas
+    def __init__(self, backend: TorchBackend, mesh: Connectivity, known: Tensor, like: Tensor, n_shapes: int) -> None:
+        reference = _numbers(like)
+        self.search = Search(mesh, _numbers(known), reference, backend.crossings(mesh, reference))
+        #: Areas of the vertices, constants of the gradient. *Shape:* ``(V,)``.
+        self.areas = torch.from_numpy(vertex_areas(reference, mesh.faces)).to(known)
         self.watched = np.zeros((n_shapes, known.shape[1]), dtype=bool)
 
     def __call__(self, x: Tensor, some: Tensor) -> tuple[Contacts, Tensor]:
         """Contacts of some of the shapes, and their numbers of far pairs. *Shape:* ``(T, V, 3), (S,) -> (S,)``."""
-        shapes, elements, n_far = [], [], []
+        columns, n_far = [np.zeros((5, 0), dtype=np.int64)], []
         for i in some.tolist():
-            if not bool(x[i].isfinite().all()):
-                n_far.append(0)
-                continue
-            *pairs, n = self.search(_numbers(x[i]), self.watched[i])
-            vertices, faces = map(torch.from_numpy, pairs)
-            shapes.append(torch.full_like(vertices, i))
-            elements.append(torch.cat([self.faces[faces], vertices[:, None]], 1))
+            vertices, faces, n = self.search(_numbers(x[i]), self.watched[i])
+            columns.append(np.stack([np.full(len(faces), i), *self.search.mesh.faces[faces].T, vertices]))
             n_far.append(n)
-        every = torch.cat([torch.zeros(0, dtype=torch.int64), *shapes]).to(x.device)
-        corners = torch.cat([torch.zeros(0, 4, dtype=torch.int64), *elements]).to(x.device)
-        return Contacts(every, corners), torch.tensor(n_far, dtype=torch.int64, device=x.device)
+        shapes, *elements = torch.from_numpy(np.concatenate(columns, 1)).to(x.device)
+        return Contacts(shapes, torch.stack(elements, 1)), torch.tensor(n_far, dtype=torch.int64, device=x.device)
 
     def count(self, x: Tensor) -> Tensor:
         """Numbers of far pairs of triangles. *Shape:* ``(S, V, 3) -> (S,)``, int64."""
-        crossings = self.search.crossings
-        counts = [len(crossings.far_pairs(_numbers(shape))) if bool(shape.isfinite().all()) else 0 for shape in x]
-        return torch.tensor(counts, dtype=torch.int64, device=x.device)
+        return torch.tensor([len(self.search.far_pairs(y)) for y in _numbers(x)], dtype=torch.int64, device=x.device)
 
     def depth(self, x: Tensor) -> float:
         """Depth of the deepest contact of a shape, with the gap. *Shape:* ``(V, 3)``."""
         shape = _numbers(x)
-        pairs = self.search.crossings.far_pairs(shape)
-        return GAP + max(float(self.search.depth(shape, pairs).max()), self.search.crossings.reach(shape, pairs))
+        pairs = self.search.far_pairs(shape)
+        return GAP + max(float(self.search.depth(shape, pairs).max()), self.search.reach(shape, pairs))
 
     def watch(self, contacts: Contacts, around: int) -> None:
         """Watch the surroundings of contacts, in their shapes and in so many neighbours in time on either side."""
         for i in contacts.shapes.unique().tolist():
             vertices = contacts.elements[contacts.shapes == i].unique().cpu().numpy()
-            self.watched[max(0, i - around) : i + around + 1] |= self.search.crossings.grow(vertices, 2)
+            self.watched[max(0, i - around) : i + around + 1] |= self.search.grow(vertices, 2)
 
 
 def _numbers(x: Tensor) -> FloatArray:

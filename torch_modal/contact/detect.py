@@ -4,6 +4,7 @@ A contact pairs a vertex with a face where parts pass through each other, or nea
 pairs a vertex with a face that it was behind in a known shape: a self-intersection of a key-frame stays as it is there.
 """
 
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -33,32 +34,30 @@ _NEAREST = 64
 """Number of faces, by their centres, among which the nearest is searched; four times as many from inside."""
 
 
-class Search:
+class Search(Crossings):
     """Search for active contacts between parts of a connectivity, with the key-frames as its known shapes."""
 
-    def __init__(self, crossings: Crossings) -> None:
-        self.crossings = crossings
-        i, j = crossings.mesh.edges.T
-        self._edge = float(np.linalg.norm(crossings.like[i] - crossings.like[j], axis=1).mean())
-        self._known = [Surface(x, crossings.mesh) for x in crossings.known]
+    @cached_property
+    def known_surfaces(self) -> list[Surface]:
+        """Surfaces of the known shapes."""
+        return [Surface(x, self.mesh) for x in self.known]
 
     def __call__(self, x: FloatArray, watched: BoolArray) -> tuple[IntArray, IntArray, int]:
         """Vertices and faces that face each other, and the number of far pairs; none where nothing intersects.
 
         Vertices next to the intersections are added to ``watched``. *Shape:* ``(V, 3), (V,) -> (n,), (n,)``.
         """
-        crossings = self.crossings
-        pairs = crossings.far_pairs(x)
+        pairs = self.far_pairs(x)
         if not len(pairs):
             none = np.zeros(0, np.int64)
             return none, none, 0
         corners = np.zeros(len(x), dtype=bool)
-        corners[crossings.mesh.faces[pairs.reshape(-1)]] = True
-        before = crossings.known_inside
-        surface = Surface(x, crossings.mesh)
-        winds = crossings.encloses(surface, crossings.within(corners, DEEP) | (watched & before))
-        inside = crossings.select_connected(winds & ~before, corners)
-        watched |= crossings.grow(np.flatnonzero(corners), 2) | crossings.grow(np.flatnonzero(inside))
+        corners[self.mesh.faces[pairs.reshape(-1)]] = True
+        before = self.known_inside
+        surface = Surface(x, self.mesh)
+        winds = self.encloses(surface, self.within(corners, DEEP) | (watched & before))
+        inside = self.select_connected(winds & ~before, corners)
+        watched |= self.grow(np.flatnonzero(corners), 2) | self.grow(np.flatnonzero(inside))
         # Vertices inside in a key-frame must not enter elsewhere.
         return *self.opposite(surface, watched, inside, winds & before & watched), len(pairs)
 
@@ -76,13 +75,13 @@ class Search:
         Returns:
             Vertices and faces. *Shape:* ``(n,), (n,)``.
         """
-        crossings, corners = self.crossings, self.crossings.mesh.faces
-        reach, near = DEEPEST_CONTACT * crossings.diagonal, WATCHED_WITHIN * crossings.diagonal
+        corners, edge = self.mesh.faces, self.lengths.data.mean()
+        reach, near = DEEPEST_CONTACT * self.diagonal, WATCHED_WITHIN * self.diagonal
         some = np.flatnonzero(seeds[corners].any(1))
         tree = cKDTree(surface.face_centres[some])
         within = inside | stuck
         parts = [np.zeros((2, 0), np.int64)]
-        for chosen, radius, n in ((seeds & ~within, near + 1.5 * self._edge, _NEAREST), (within, reach, 4 * _NEAREST)):
+        for chosen, radius, n in ((seeds & ~within, near + 1.5 * edge, _NEAREST), (within, reach, 4 * _NEAREST)):
             queried, n = np.flatnonzero(chosen), min(n, len(some))
             distance, faces = tree.query(surface.vertices[queried], n, distance_upper_bound=radius)
             there = np.isfinite(distance.reshape(-1))
@@ -91,20 +90,20 @@ class Search:
         v, f = _select(dot(surface.vertex_normals[v], surface.face_normals[f]) < FACING, v, f)
         v, f = _select(~(corners[f] == v[:, None]).any(1), v, f)
         height = _heights(surface, v, f)
-        keep = (height < near) & (height > -reach) & ((height > -_BEHIND * self._edge) | within[v])
+        keep = (height < near) & (height > -reach) & ((height > -_BEHIND * edge) | within[v])
         v, f, height = _select(keep, v, f, height)
         distance = _distances(surface, v, f)
         v, f, distance = _select(np.abs(height) > _STRAIGHT * distance - 1e-9 * reach, v, f, distance)
-        for known in self._known:
-            behind = _heights(known, v, f) <= -1e-3 * self._edge
+        for known in self.known_surfaces:
+            behind = _heights(known, v, f) <= -1e-3 * edge
             behind[behind] = _distances(known, v[behind], f[behind]) <= 1.5 * reach
             v, f, distance = _select(~behind | stuck[v], v, f, distance)
-        unit = _TIE * crossings.diagonal
+        unit = _TIE * self.diagonal
         first = _nearest_faces(v, f, distance / unit, _heights(surface, v, f) / unit)
         v, f = v[first], f[first]
         # Folds are inside, too, where they are in a key-frame.
         keep = np.ones(len(v), dtype=bool)
-        keep[stuck[v]] = crossings.are_far_apart(v[stuck[v]], corners[f[stuck[v]]])
+        keep[stuck[v]] = self.are_far_apart(v[stuck[v]], corners[f[stuck[v]]])
         return v[keep], f[keep]
 
     def depth(self, x: FloatArray, pairs: IntArray) -> FloatArray:
@@ -114,16 +113,14 @@ class Search:
 
         *Shape:* ``(V, 3), (P, 2) -> (V,)``, with the pairs of faces that cross.
         """
-        crossings, faces = self.crossings, self.crossings.mesh.faces
-        deep = np.zeros(len(x))
-        inside = np.flatnonzero(crossings.inside(x, pairs))
+        faces, inside = self.mesh.faces, np.flatnonzero(self.inside(x, pairs))
         if not len(inside):
-            return deep
+            return np.zeros(len(x))
         patch = np.full(len(x), -1)
-        patch[inside] = connected_components(crossings.adjacency[inside][:, inside], directed=False)[1]
+        patch[inside] = connected_components(self.adjacency[inside][:, inside], directed=False)[1]
         # The patch of each face that is inside as a whole.
         of_face = np.where((patch[faces] == patch[faces[:, :1]]).all(1), patch[faces[:, 0]], -1)
-        surface = Surface(x, crossings.mesh)
+        surface = Surface(x, self.mesh)
         n = min(_NEAREST, len(faces))
         v: Any = np.repeat(inside, n)
         f: Any = np.asarray(cKDTree(surface.face_centres).query(x[inside], n)[1]).reshape(-1)
@@ -132,9 +129,7 @@ class Search:
         v, f = _select(_heights(surface, v, f) < 0, v, f)
         least = np.full(len(x), np.inf)
         np.minimum.at(least, v, _distances(surface, v, f))
-        is_deep = np.isfinite(least)
-        deep[is_deep] = least[is_deep]
-        return deep
+        return np.where(np.isfinite(least), least, 0.0)
 
 
 def _heights(surface: Surface, v: IntArray, f: IntArray) -> FloatArray:

@@ -10,11 +10,10 @@ from torch_modal import trees
 from torch_modal.contact.acceleration import AccelerationLimit
 from torch_modal.contact.active import ContactEnergy, ContactSearch, refuse_transforms
 from torch_modal.contact.modal import modal_displacement
-from torch_modal.contact.separate import Timeline, separate, spline_weights
+from torch_modal.contact.separate import separate, spline_weights
 from torch_modal.elastic.energy import RestShapes
 from torch_modal.elastic.minimise import Solution
 from torch_modal.elastic.steps import ExtraEnergies
-from torch_modal.geometry.connectivity import vertex_areas
 from torch_modal.inbetween.alignment import Pose
 from torch_modal.inbetween.joint import JointSpace
 from torch_modal.inbetween.results import InBetweenResult, Samples
@@ -113,19 +112,15 @@ def push_apart(
         return modal_displacement(*basis, x[some], contact, accelerations)
 
     search = contact_search(core, ends[0], len(u))
-    timeline = Timeline(u, limit, in_modes if isinstance(core.space, JointSpace) else None)
-    pushed, n_crossing = separate(x, _steps(core, rests), search, timeline)
+    start = in_modes if isinstance(core.space, JointSpace) else None
+    pushed, n_crossing = separate(x, _steps(core, rests), search, limit, start)
     field = pushed - x if pushed is not x or bool(n_crossing.any()) else None
-    return Displacement(field, u, n_crossing, contact_search(core, ends[0], 1))
+    return Displacement(field, u, n_crossing, search)
 
 
 def contact_search(core: InBetweenSolver, ends: Tensor, n_shapes: int) -> ContactSearch:
     """Search in shapes between key-frames. *Shape:* ``(K, V, 3)``."""
-    connectivity = core.mesh.connectivity
-    reference = core.alignment.reference.detach().cpu().double().numpy()
-    areas = vertex_areas(reference, connectivity.faces)
-    pairs = core.backend.crossings(connectivity, reference)
-    return ContactSearch(core.mesh, ends, torch.from_numpy(areas).to(ends), n_shapes, pairs, reference)
+    return ContactSearch(core.backend, core.mesh.connectivity, ends, core.alignment.reference, n_shapes)
 
 
 def _steps(core: InBetweenSolver, rests: RestShapes) -> Callable[[Tensor, Tensor, ExtraEnergies], Tensor]:

@@ -11,7 +11,7 @@ from torch_modal.arrays import BoolArray
 from torch_modal.contact.detect import Search
 from torch_modal.errors import MeshError
 from torch_modal.geometry.connectivity import Connectivity
-from torch_modal.geometry.crossings import Crossings, require_contact
+from torch_modal.geometry.crossings import require_contact
 from torch_modal.keyframes.arrays import as_positions
 from torch_modal.keyframes.check import check_arrays
 
@@ -70,16 +70,16 @@ def self_contacts(x: Any, faces: Any, ignore: Any = None) -> SelfContacts:
             message = f"ignore has {ignored.shape[-2]} vertices, the shapes have {shapes.shape[1]}; they must be equal"
             raise MeshError(message)
         known = check_arrays(ignored.reshape(-1, *ignored.shape[-2:]), faces)[1]
-    crossings = Crossings(Connectivity(corners, shapes.shape[1]), known, known[0] if len(known) else shapes[0])
-    if not crossings.diagonal > 0:
+    search = Search(Connectivity(corners, shapes.shape[1]), known, known[0] if len(known) else shapes[0])
+    if not search.diagonal > 0:
         raise MeshError("all vertices of a shape lie at one place: it has no size")
-    search, pairs = Search(crossings), [crossings.pairs(shape) for shape in shapes]
-    far = [crossings.is_far(shape_pairs) for shape_pairs in pairs]
+    pairs = [search.pairs(shape) for shape in shapes]
+    far = [search.is_far(shape_pairs) for shape_pairs in pairs]
     depth = [search.depth(x, crossing[is_far]) for x, crossing, is_far in zip(shapes, pairs, far, strict=True)]
     lead, device = positions.shape[:-2], positions.device
     of_shape = np.repeat(np.arange(len(shapes)), [len(shape_pairs) for shape_pairs in pairs])
     every, are_far = np.concatenate(pairs), np.concatenate(far)
-    are_new = crossings.is_new(every)
+    are_new = search.is_new(every)
 
     def tensor(array: NDArray[Any]) -> Tensor:
         return torch.from_numpy(array).to(device)

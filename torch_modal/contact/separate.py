@@ -11,7 +11,6 @@ displacement within the bound on accelerations. A shape alone has no such bound,
 
 import math
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -40,22 +39,12 @@ GROWTH, MOST_WEIGHT = 3.0, 1e5
 """Growth of the weight that keeps a worse shape where it was, and the weight from which it does not move at all."""
 
 
-class Timeline(NamedTuple):
-    """Shapes at T even times in (0, 1) between two ends, which have no displacement."""
-
-    t: Tensor
-    limit: AccelerationLimit
-    in_modes: Callable[[Tensor, ContactEnergy, Tensor], Tensor] | None
-    """First displacement of some of the shapes, from their indices, contacts and second differences in time.
-
-    *Shape:* ``(S,), (N, S) -> (S, V, 3)``; None: without a start in modes."""
-
-
 def separate(
     start: Tensor,
     relax: Callable[[Tensor, Tensor, ExtraEnergies], Tensor],
     search: ContactSearch,
-    timeline: Timeline | None = None,
+    limit: AccelerationLimit | None = None,
+    in_modes: Callable[[Tensor, ContactEnergy, Tensor], Tensor] | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Separate the parts of T shapes that pass through each other; the shapes as they are, where none do.
 
@@ -67,7 +56,9 @@ def separate(
         relax: Takes a Newton step of all vertices of some of the shapes, from the shapes, their indices and further
             energies. *Shape:* ``(S, V, 3), (S,) -> (S, V, 3)``.
         search: Search for contacts between the known shapes.
-        timeline: Of several shapes; None for one alone.
+        limit: Of shapes at even times between two ends, which have no displacement; None for one shape alone.
+        in_modes: First displacement of some of the shapes, from their indices, contacts and second differences in time.
+            *Shape:* ``(S,), (N, S) -> (S, V, 3)``.
 
     Returns:
         The shapes, and the number of far pairs of triangles that are left in each. *Shape:* ``(T, V, 3), (T,)``.
@@ -81,29 +72,29 @@ def separate(
     if not len(active.shapes):
         return start, n_before
     search.watch(active, AROUND)
-    chosen = every if timeline is None else _choose_shapes(timeline.t, search)
+    chosen = every if limit is None else _choose_shapes(limit.times, search)
     x = start
-    if timeline is not None and timeline.in_modes is not None:
-        spline = spline_weights(timeline.t[chosen], timeline.t)
-        bend = (timeline.limit.differences[:n] @ spline.double()).to(start)
-        first = timeline.in_modes(chosen, ContactEnergy(active.rows(chosen), areas, start), bend)
+    if limit is not None and in_modes is not None:
+        spline = spline_weights(limit.times[chosen], limit.times)
+        bend = (limit.differences[:n] @ spline.double()).to(start)
+        first = in_modes(chosen, ContactEnergy(active.rows(chosen), areas, start), bend)
         x = start + torch.tensordot(spline, first, 1)
     n_far, best, n_best = n_before, start, n_before
-    most = MOST_MOVED * search.depth(start[0]) if timeline is None else math.inf
+    most = MOST_MOVED * search.depth(start[0]) if limit is None else math.inf
     # Shapes that relax on their own, what the bound took from them so far, and springs of the vertices it limits.
     alone, dual, springs = x, torch.zeros_like(x), torch.zeros_like(x[0, :, 0])
     for k in range(1, SEPARATION_ROUNDS[1] + 1):
         # In a trajectory, wider gaps where it cannot be separated would disturb neighbouring shapes.
-        gap = GAP if timeline is not None else GAP + WIDER * max(0, k - SEPARATION_ROUNDS[0])
+        gap = GAP if limit is not None else GAP + WIDER * max(0, k - SEPARATION_ROUNDS[0])
         energies = _energies(active.rows(chosen), Pull((x - dual)[chosen].detach(), springs), areas, gap)
         alone = x.index_copy(0, chosen, relax(alone[chosen], chosen, energies))
-        if timeline is None:
+        if limit is None:
             x = alone
         else:
             wanted = (alone + dual - start)[chosen]
             if len(chosen) < n:
-                wanted = torch.tensordot(spline_weights(timeline.t[chosen], timeline.t), wanted, 1)
-            field, limited = timeline.limit.nearest(wanted)
+                wanted = torch.tensordot(spline_weights(limit.times[chosen], limit.times), wanted, 1)
+            field, limited = limit.nearest(wanted)
             x = start + field
             dual = dual.index_add(0, chosen, (alone - x)[chosen])
             springs[limited] = PULL * areas[limited]
@@ -122,9 +113,9 @@ def separate(
         if not bool(n_far.any()):
             break
         chosen = torch.unique(torch.cat([chosen, torch.nonzero(n_far).flatten()]))
-    if timeline is None or best is start:
+    if limit is None or best is start:
         return best, n_best
-    return _never_worse(start, best - start, search, timeline, n_before)
+    return _never_worse(start, best - start, search, limit, n_before)
 
 
 def _choose_shapes(t: Tensor, search: ContactSearch) -> Tensor:
@@ -133,7 +124,7 @@ def _choose_shapes(t: Tensor, search: ContactSearch) -> Tensor:
     stride = max(1, (len(t) + 1) // SOLVED)
     chosen = torch.zeros(len(t), dtype=torch.bool, device=t.device)
     chosen[stride - 1 :: stride] = chosen[0] = chosen[-1] = True
-    if len(search.search.crossings.known_pairs):
+    if len(search.search.known_pairs):
         chosen |= (t < BESIDE) | (t > 1 - BESIDE)
     return torch.nonzero(chosen).flatten()
 
@@ -150,7 +141,7 @@ def _energies(active: Contacts, pull: Pull, areas: Tensor, gap: float = GAP) -> 
 
 
 def _never_worse(
-    start: Tensor, field: Tensor, search: ContactSearch, timeline: Timeline, n_before: Tensor
+    start: Tensor, field: Tensor, search: ContactSearch, limit: AccelerationLimit, n_before: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Shapes and their far pairs, with less and less of the displacement at the times where it adds some."""
     # The others keep as much of it as the bound allows: if it faded out next to them, they would become worse.
@@ -161,7 +152,7 @@ def _never_worse(
         if not bool(worse.any()):
             return start + kept, n_far
         weights = torch.where(worse, GROWTH * weights, weights)
-        kept, _ = timeline.limit.nearest(field * (weights == 1)[:, None, None], weights)
+        kept, _ = limit.nearest(field * (weights == 1)[:, None, None], weights)
         kept = kept * (weights < MOST_WEIGHT)[:, None, None]
 
 

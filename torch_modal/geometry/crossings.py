@@ -104,8 +104,10 @@ class Crossings:
         """Pairs of triangles that share no vertex and cross, the smaller number first, sorted.
 
         By :func:`~torch_modal.geometry.triangle_pairs.triangles_cross`: those that only touch, or lie in one plane, do
-        not cross. *Shape:* ``(V, 3) -> (P, 2)``.
+        not cross. A shape that is not finite has none. *Shape:* ``(V, 3) -> (P, 2)``.
         """
+        if not np.isfinite(x).all():
+            return np.zeros((0, 2), np.int64)
         if self._search is None:
             predicates = extras.require("igl.predicates", "contact", "contact")
             pairs = predicates.find_self_intersections(np.ascontiguousarray(x), self.mesh.faces.copy())[1]

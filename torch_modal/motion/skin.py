@@ -5,9 +5,6 @@ The squared error needs few sums. With :math:`p = (x, 1)` at rest and bones :mat
 :math:`\sum_v w_{vj} w_{vk}\, p_v p_v^T` and :math:`\sum_v w_{vj}\, x_{tv}\, p_v^T`.
 """
 
-import bisect
-import functools
-import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -15,7 +12,6 @@ import torch
 from torch import Tensor
 
 from torch_modal.arrays import Array
-from torch_modal.errors import MeshWarning
 from torch_modal.geometry.connectivity import merge_seams
 from torch_modal.geometry.inspect import diagonals
 from torch_modal.geometry.rigid import best_rotation
@@ -38,13 +34,7 @@ IDENTITY_SHARE = 1e-4  # part of the identity in the rotation of a bone's vertic
 
 
 @torch.no_grad()
-def bake(
-    frames: Array,
-    faces: Array,
-    bones: int = 40,
-    times: Times = None,
-    tolerance: float | None = None,
-) -> Skin:
+def bake(frames: Array, faces: Array, bones: int = 40, times: Times = None) -> Skin:
     """A motion as linear blend skinning: bones that move rigidly, and their weights at each vertex.
 
     Bones start from clusters of vertices that move alike, split where the error is largest; then weights and bones are
@@ -57,17 +47,12 @@ def bake(
         bones: Most bones.
         times: When the frames are, ascending, for :func:`torch_modal.save_animation`; of a cycle, with the time when it
             begins again.
-        tolerance: Take the fewest bones with an error, the root mean square distance over the bounding-box diagonal, of
-            at most this. The search makes several fits.
 
     Returns:
         The skin, in the coordinates, dtype and device of the frames; without gradients.
 
     Raises:
         ValueError: An argument cannot be used; the message says why.
-
-    Warns:
-        MeshWarning: That many bones do not meet the tolerance.
     """
     shapes, triangles = check_frames(frames, faces)
     n, n_vertices = shapes.shape[:2]
@@ -75,8 +60,6 @@ def bake(
         raise ValueError(f"bones need 2 frames and {LEAST_BONE_VERTICES} vertices or more, got {n} of {n_vertices}")
     if not isinstance(bones, int) or not 1 <= bones <= n_vertices:
         raise ValueError(f"bones must be a whole number from 1 to the number of vertices, {n_vertices}; got {bones!r}")
-    if tolerance is not None and not 0 < tolerance < np.inf:
-        raise ValueError(f"tolerance must be a positive part of the diagonal, such as 0.001; got {tolerance}")
     when = None if times is None else check_times(times, n, None, "frame")
     diagonal = float(diagonals(shapes[:1])[0])
     if diagonal == 0:
@@ -88,34 +71,18 @@ def bake(
     centres = shapes.mean(1, keepdims=True)
     fit = _Decomposition(torch.from_numpy((shapes[:, first] - centres) / diagonal).to(like.device))
 
-    @functools.cache
-    def skin(most: int) -> Skin:
-        weights, fitted = (x.cpu() for x in fit.solve(most))
-        after = torch.from_numpy(centres)
-        transforms = torch.eye(4, dtype=torch.float64).repeat(*fitted.shape[:2], 1, 1)
-        transforms[..., :3, :3] = fitted[..., :3]
-        transforms[..., :3, 3] = fitted[..., 3] * diagonal + after - fitted[..., :3] @ after[0, 0]
-        skin = Skin(like[0], weights[copies].to(like), transforms.to(like), 0.0, 0.0, when)
-        goal = torch.from_numpy(shapes)
-        at, between = (
-            float(off.square().sum(-1).mean().sqrt()) / diagonal
-            for off in (skin.shapes().double().cpu() - goal, _halfway_errors(skin, goal))
-        )
-        return replace(skin, error_at_frames=at, error_between_frames=between)
-
-    best = skin(bones)
-    if tolerance is None:
-        return best
-    n = best.weights.shape[1]
-    if best.error > tolerance:
-        warnings.warn(
-            f"{n} bones leave an error of {best.error:.2g} of the diagonal, above the tolerance of {tolerance:g}",
-            MeshWarning,
-            stacklevel=2,
-        )
-        return best
-    fewest = 1 + bisect.bisect_left(range(1, n), True, key=lambda most: skin(most).error <= tolerance)
-    return skin(fewest) if fewest < n else best
+    weights, fitted = (x.cpu() for x in fit.solve(bones))
+    after = torch.from_numpy(centres)
+    transforms = torch.eye(4, dtype=torch.float64).repeat(*fitted.shape[:2], 1, 1)
+    transforms[..., :3, :3] = fitted[..., :3]
+    transforms[..., :3, 3] = fitted[..., 3] * diagonal + after - fitted[..., :3] @ after[0, 0]
+    skin = Skin(like[0], weights[copies].to(like), transforms.to(like), 0.0, 0.0, when)
+    goal = torch.from_numpy(shapes)
+    at, between = (
+        float(off.square().sum(-1).mean().sqrt()) / diagonal
+        for off in (skin.shapes().double().cpu() - goal, _halfway_errors(skin, goal))
+    )
+    return replace(skin, error_at_frames=at, error_between_frames=between)
 
 
 class _Decomposition:
