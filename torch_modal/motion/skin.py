@@ -5,6 +5,9 @@ The squared error needs few sums. With :math:`p = (x, 1)` at rest and bones :mat
 :math:`\sum_v w_{vj} w_{vk}\, p_v p_v^T` and :math:`\sum_v w_{vj}\, x_{tv}\, p_v^T`.
 """
 
+import bisect
+import functools
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +15,7 @@ import torch
 from torch import Tensor
 
 from torch_modal.arrays import Array
+from torch_modal.errors import MeshWarning
 from torch_modal.geometry.connectivity import merge_seams
 from torch_modal.geometry.inspect import diagonals
 from torch_modal.geometry.rigid import best_rotation
@@ -21,7 +25,6 @@ from torch_modal.io.write import check_frames
 from torch_modal.times import Times, check_times
 
 MOST_ROUNDS = 20  # at most; fewer where one lowers the error by less than a hundredth
-INFLUENCES = 4  # most bones of a vertex, as files hold them
 SWEEPS = 2  # over the bones in a round
 LEAST_BONE_VERTICES = 4  # vertices of a new bone; fewer leave its rotation undetermined
 EQUAL = 1e-5  # mean distance of a cluster's vertices, over the diagonal, below which it is one bone
@@ -34,7 +37,14 @@ IDENTITY_SHARE = 1e-4  # part of the identity in the rotation of a bone's vertic
 
 
 @torch.no_grad()
-def bake(frames: Array, faces: Array, bones: int = 40, times: Times = None) -> Skin:
+def bake(
+    frames: Array,
+    faces: Array,
+    bones: int = 40,
+    influences: int = 4,
+    times: Times = None,
+    tolerance: float | None = None,
+) -> Skin:
     """A motion as linear blend skinning: bones that move rigidly, and their weights at each vertex.
 
     Bones start from clusters of vertices that move alike, split where the error is largest; then weights and bones are
@@ -45,14 +55,20 @@ def bake(frames: Array, faces: Array, bones: int = 40, times: Times = None) -> S
         frames: Vertex positions, two frames or more. Frame 0 is the rest shape. *Shape:* ``(T, V, 3)``.
         faces: Vertex indices. *Shape:* ``(F, 3)``.
         bones: Most bones.
+        influences: Most bones of a vertex, 1 to 4.
         times: When the frames are, ascending, for :func:`torch_modal.save_animation`; of a cycle, with the time when it
             begins again.
+        tolerance: Take the fewest bones with an error, the root mean square distance over the bounding-box diagonal, of
+            at most this. The search makes several fits.
 
     Returns:
         The skin, in the coordinates, dtype and device of the frames; without gradients.
 
     Raises:
         ValueError: An argument cannot be used; the message says why.
+
+    Warns:
+        MeshWarning: That many bones do not meet the tolerance.
     """
     shapes, triangles = check_frames(frames, faces)
     n, n_vertices = shapes.shape[:2]
@@ -60,6 +76,10 @@ def bake(frames: Array, faces: Array, bones: int = 40, times: Times = None) -> S
         raise ValueError(f"bones need 2 frames and {LEAST_BONE_VERTICES} vertices or more, got {n} of {n_vertices}")
     if not isinstance(bones, int) or not 1 <= bones <= n_vertices:
         raise ValueError(f"bones must be a whole number from 1 to the number of vertices, {n_vertices}; got {bones!r}")
+    if influences not in (1, 2, 3, 4):
+        raise ValueError(f"influences must be 1, 2, 3 or 4 bones of a vertex, got {influences!r}")
+    if tolerance is not None and not 0 < tolerance < np.inf:
+        raise ValueError(f"tolerance must be a positive part of the diagonal, such as 0.001; got {tolerance}")
     when = None if times is None else check_times(times, n, None, "frame")
     diagonal = float(diagonals(shapes[:1])[0])
     if diagonal == 0:
@@ -69,26 +89,41 @@ def bake(frames: Array, faces: Array, bones: int = 40, times: Times = None) -> S
     copies = merge_seams(shapes, triangles)
     first = np.unique(copies, return_index=True)[1]
     centres = shapes.mean(1, keepdims=True)
-    fit = _Decomposition(torch.from_numpy((shapes[:, first] - centres) / diagonal).to(like.device))
+    fit = _Decomposition(torch.from_numpy((shapes[:, first] - centres) / diagonal).to(like.device), influences)
 
-    weights, fitted = (x.cpu() for x in fit.solve(bones))
-    after = torch.from_numpy(centres)
-    transforms = torch.eye(4, dtype=torch.float64).repeat(*fitted.shape[:2], 1, 1)
-    transforms[..., :3, :3] = fitted[..., :3]
-    transforms[..., :3, 3] = fitted[..., 3] * diagonal + after - fitted[..., :3] @ after[0, 0]
-    skin = Skin(like[0], weights[copies].to(like), transforms.to(like), 0.0, 0.0, when)
-    goal = torch.from_numpy(shapes)
-    at, between = (
-        float(off.square().sum(-1).mean().sqrt()) / diagonal
-        for off in (skin.shapes().double().cpu() - goal, _halfway_errors(skin, goal))
-    )
-    return replace(skin, error_at_frames=at, error_between_frames=between)
+    @functools.cache
+    def skin(most: int) -> Skin:
+        weights, fitted = (x.cpu() for x in fit.solve(most))
+        after = torch.from_numpy(centres)
+        transforms = torch.eye(4, dtype=torch.float64).repeat(*fitted.shape[:2], 1, 1)
+        transforms[..., :3, :3] = fitted[..., :3]
+        transforms[..., :3, 3] = fitted[..., 3] * diagonal + after - fitted[..., :3] @ after[0, 0]
+        skin = Skin(like[0], weights[copies].to(like), transforms.to(like), 0.0, 0.0, when)
+        goal = torch.from_numpy(shapes)
+        at, between = (
+            float(off.square().sum(-1).mean().sqrt()) / diagonal
+            for off in (skin.shapes().double().cpu() - goal, _halfway_errors(skin, goal))
+        )
+        return replace(skin, error_at_frames=at, error_between_frames=between)
+
+    best = skin(bones)
+    if tolerance is not None and best.error > tolerance:
+        message = (
+            f"{bones} bones leave an error of {best.error:.2g} of the diagonal, above the tolerance of {tolerance:g}"
+        )
+        warnings.warn(message, MeshWarning, stacklevel=2)
+    elif tolerance is not None:
+        fewer = range(1, best.weights.shape[1])
+        n = bisect.bisect_left(fewer, True, key=lambda most: skin(most).error <= tolerance)
+        return skin(fewer[n]) if n < len(fewer) else best
+    return best
 
 
 class _Decomposition:
     """Fits bones ``(T, J, 3, 4)`` and weights ``(V, J)`` to shapes ``(T, V, 3)``."""
 
-    def __init__(self, x: Tensor) -> None:
+    def __init__(self, x: Tensor, influences: int) -> None:
+        self.influences = influences
         self.rest = torch.nn.functional.pad(x[0], (0, 1), value=1)
         self.shapes, self.rows = x, x.mT.flatten(0, 1)
         self.still = torch.eye(3, 4).to(x).repeat(len(x), 1, 1, 1)
@@ -96,10 +131,10 @@ class _Decomposition:
     def solve(self, most: int) -> tuple[Tensor, Tensor]:
         """Weights in whole parts of :data:`WEIGHT_STEPS`, and bones."""
         bones = self._cluster_bones(most)
-        weights, error = self._fit_weights(bones)
+        weights, error = self._fit_weights(bones, self.influences)
         for _ in range(MOST_ROUNDS):
             last, bones = error.mean(), self._fit_bones(bones, weights)
-            weights, error = self._fit_weights(bones)
+            weights, error = self._fit_weights(bones, self.influences)
             if error.mean() > 0.98 * last:
                 break
         ties, total = torch.full_like(bones[0, :, 0, 0], TIES[0]), error.sum() + EQUAL**2 * len(error)
@@ -108,7 +143,7 @@ class _Decomposition:
             steps = bones[1:, ..., :3] @ bones[:-1, ..., :3].mT
             beyond = (steps * _frame_rotations(self.shapes, weights)[0]).sum((-2, -1)) < 1 + 2 * LARGEST_TURN
             ties = torch.where(beyond.any(0), (4 * ties).clamp_max(TIES[1]), ties)
-            weights, error = self._fit_weights(bones)
+            weights, error = self._fit_weights(bones, self.influences)
         used = weights.sum(0) * WEIGHT_STEPS >= 1
         weights, bones, ties = weights[:, used], bones[:, used], ties[used]
         whole = (weights * WEIGHT_STEPS).floor()
@@ -138,7 +173,7 @@ class _Decomposition:
                 bones = self._fit_bones(bones, weights)
         return bones
 
-    def _fit_weights(self, bones: Tensor, influences: int = INFLUENCES) -> tuple[Tensor, Tensor]:
+    def _fit_weights(self, bones: Tensor, influences: int) -> tuple[Tensor, Tensor]:
         """Weights of least squared distance, and its mean over the frames at each vertex.
 
         Bones are added one by one: that towards which a straight step lowers the distance most.
