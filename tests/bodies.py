@@ -2,7 +2,7 @@
 
 A body is a surface at rest along the x axis and a motion of space. The key-frames are the motion's ends, and the motion
 half-way is the true in-between: every motion here turns its body by an angle that grows evenly with time, and keeps the
-lengths along its centre line (bar, limb, tube) or everywhere (sheet).
+lengths along its centre line (bar, limb) or everywhere (sheet).
 """
 
 from collections.abc import Callable
@@ -75,20 +75,18 @@ def bar_surface(cells: tuple[int, int, int], size: tuple[float, float, float]) -
     return vertices - [0, size[1] / 2, size[2] / 2], faces
 
 
-def turned_surface(profile: FloatArray, spacing: float, closed: bool = False) -> tuple[FloatArray, IntArray]:
+def turned_surface(profile: FloatArray, spacing: float) -> tuple[FloatArray, IntArray]:
     """A profile turned about the x axis, in triangles of about one size.
 
     Args:
-        profile: Corners ``(x, r)``; the first and the last lie on the axis unless it is closed. *Shape:* ``(n, 2)``.
+        profile: Corners ``(x, r)``; the first and the last lie on the axis. *Shape:* ``(n, 2)``.
         spacing: Length of an edge, about.
-        closed: Whether the last corner is joined to the first, round a hole.
     """
-    ends = np.concatenate([profile, profile[:1]]) if closed else profile
     points = []
-    for start, stop in pairwise(ends):
+    for start, stop in pairwise(profile):
         n = max(1, round(np.linalg.norm(stop - start) / spacing))
         points.append(start + (stop - start) * np.arange(n)[:, None] / n)
-    line = np.concatenate(points if closed else [*points, ends[-1:]])
+    line = np.concatenate([*points, profile[-1:]])
     vertices, rings, n_vertices = [], [], 0
     for x, r in line:
         n = max(8, round(2 * np.pi * r / spacing)) if r > 0 else 1
@@ -96,8 +94,7 @@ def turned_surface(profile: FloatArray, spacing: float, closed: bool = False) ->
         vertices.append(np.stack([np.full(n, x), r * np.cos(angle), r * np.sin(angle)], axis=1))
         rings.append(np.arange(n_vertices, n_vertices + n))
         n_vertices += n
-    pairs = zip(rings, [*rings[1:], rings[0]] if closed else rings[1:], strict=False)
-    faces = np.concatenate([_stitched(a, b) for a, b in pairs])
+    faces = np.concatenate([_stitched(a, b) for a, b in pairwise(rings)])
     points = np.concatenate(vertices)
     return points, faces if volume_of(points, faces) > 0 else faces[:, ::-1].copy()
 
@@ -152,17 +149,7 @@ def twisted_plate(thickness: float) -> tuple[FloatArray, FloatArray, IntArray]:
 # -------------------------------------------------------------------------------------------------------------- bodies
 
 BAR = 4.0
-WALL = 0.06
 LIMB = 5.0
-
-
-def _bar() -> tuple[FloatArray, IntArray]:
-    return bar_surface((52, 13, 13), (BAR, 1.0, 1.0))
-
-
-def _tube() -> tuple[FloatArray, IntArray]:
-    outer, inner = 0.6 + WALL / 2, 0.6 - WALL / 2
-    return turned_surface(np.array([[0, outer], [BAR, outer], [BAR, inner], [0, inner]]), 0.11, closed=True)
 
 
 def _vessel() -> tuple[FloatArray, IntArray]:
@@ -172,23 +159,13 @@ def _vessel() -> tuple[FloatArray, IntArray]:
     return turned_surface(np.concatenate([outer, inner]), 0.14)
 
 
-def _limb() -> tuple[FloatArray, IntArray]:
-    """A ball with a limb a tenth as thick, which ends round."""
-    return _ball_with(0.1, 0.085)
-
-
-def _ball_with(radius: float, spacing: float) -> tuple[FloatArray, IntArray]:
-    """A ball of radius 1 with a limb of another."""
+def _ball_with_limb(radius: float, spacing: float) -> tuple[FloatArray, IntArray]:
+    """A ball of radius 1 with a limb of another, which ends round."""
     ball, root = np.linspace(np.pi, np.arcsin(radius), 40), np.linspace(np.pi / 2, 0, 4)[1:]
     profile = [[np.cos(a), np.sin(a)] for a in ball] + [[LIMB, radius]]
     profile += [[LIMB + radius * np.cos(a), radius * np.sin(a)] for a in root]
     profile[0][1] = profile[-1][1] = 0.0
     return turned_surface(np.array(profile), spacing)
-
-
-def _wire() -> tuple[FloatArray, IntArray]:
-    """The same with a leg of a fortieth."""
-    return _ball_with(0.025, 0.045)
 
 
 def _rod() -> tuple[FloatArray, IntArray]:
@@ -200,47 +177,22 @@ def _rod() -> tuple[FloatArray, IntArray]:
     return turned_surface(profile, 0.03)
 
 
-def _sheet() -> tuple[FloatArray, IntArray]:
-    return sheet_surface((72, 36), (BAR, 2.0))
-
+_bar = partial(bar_surface, (52, 13, 13), (BAR, 1.0, 1.0))
 
 _BENT = {
     "bar bent": (_bar, bend, 0.0, BAR),
     "bar twisted": (_bar, twist, 0.0, BAR),
-    "tube bent": (_tube, bend, 0.0, BAR),
     "vessel bent": (_vessel, bend, 0.3, 3.2),
-    "limb bent": (_limb, bend, 1.5, LIMB),
-    "elbow bent": (_limb, bend, 2.6, 3.4),
-    "wire bent": (_wire, bend, 1.5, LIMB),
+    "limb bent": (partial(_ball_with_limb, 0.1, 0.085), bend, 1.5, LIMB),
+    "wire bent": (partial(_ball_with_limb, 0.025, 0.045), bend, 1.5, LIMB),
     "rod bent": (_rod, bend, 0.0, BAR),
-    "sheet rolled": (_sheet, bend, 0.0, BAR),
-    "gutter rolled": (_sheet, bend, 0.0, BAR),
+    "gutter rolled": (partial(sheet_surface, (72, 36), (BAR, 2.0)), bend, 0.0, BAR),
 }
 GUTTER = 1 / 3
 """How far the gutter, a sheet, is rolled already at the first key-frame: a flat one has no inside to be filled."""
-BODIES = (
-    "bar bent 90",
-    "bar bent 180",
-    "bar twisted 90",
-    "bar twisted 180",
-    "tube bent 90",
-    "vessel bent 60",
-    "limb bent 120",
-    "elbow bent 120",
-    "sheet rolled 270",
-    "gutter rolled 270",
-)
-"""The bodies that are looked at by default; :func:`body` takes other angles as well."""
 
 
 @cache
-def _at_rest(make: Callable[[], tuple[FloatArray, IntArray]]) -> tuple[FloatArray, IntArray]:
-    surface_at_rest = make()
-    for array in surface_at_rest:
-        array.setflags(write=False)  # others get the same arrays
-    return surface_at_rest
-
-
 def body(name: str) -> Body:
     """One of the bodies, of 2,000 to 4,000 vertices, by what is moved, how, and by how many degrees in its whole.
 
@@ -252,7 +204,7 @@ def body(name: str) -> Body:
         raise ValueError(f"there is no body {name!r}; there are, with an angle, {', '.join(_BENT)}")
     make, bending, start, stop = _BENT[kind]
     motion = partial(bending, angle=np.radians(int(degrees)), start=start, stop=stop)
-    return Body(*_at_rest(make), partial(_later, motion) if kind.startswith("gutter") else motion)
+    return Body(*make(), partial(_later, motion) if kind.startswith("gutter") else motion)
 
 
 def _later(motion: Motion, points: FloatArray, time: float) -> FloatArray:

@@ -177,9 +177,9 @@ def listen_to_ctrl_c() -> None:
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
-def processes(mark: str) -> list[str]:
-    """Command lines of running processes that have a text in them or in their working directory."""
-    found = []
+def processes(mark: str) -> dict[int, str]:
+    """Command lines, by number, of running processes that have a text in them or in their working directory."""
+    found = {}
     for folder in Path("/proc").glob("[0-9]*"):
         try:
             command = (folder / "cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace")
@@ -187,7 +187,7 @@ def processes(mark: str) -> list[str]:
         except OSError:
             continue
         if mark in command or mark in place:
-            found.append(command)
+            found[int(folder.name)] = command
     return found
 
 

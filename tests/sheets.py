@@ -4,7 +4,8 @@ from collections.abc import Callable
 
 import numpy as np
 from bodies import FloatArray, IntArray
-from scipy.interpolate import CubicHermiteSpline
+from matplotlib.path import Path
+from scipy.interpolate import CubicSpline
 from scipy.spatial import Delaunay, cKDTree
 
 Direction = Callable[[FloatArray], FloatArray]
@@ -29,10 +30,7 @@ def cylinder(points: FloatArray, time: float, direction: Direction, rulings: flo
         return np.stack([np.cos(angle), np.sin(angle)], 1)
 
     grid = np.linspace(along.min(), along.max(), 20_001)
-    middle = (grid[1:] + grid[:-1]) / 2
-    slopes = tangent(grid)
-    steps = (grid[1] - grid[0]) * (slopes[:-1] + 4 * tangent(middle) + slopes[1:]) / 6
-    x, z = CubicHermiteSpline(grid, np.concatenate([np.zeros((1, 2)), np.cumsum(steps, 0)]), slopes)(along).T
+    x, z = CubicSpline(grid, tangent(grid)).antiderivative()(along).T
     return np.stack([c * x + s * across, c * across - s * x, z], 1)
 
 
@@ -57,6 +55,7 @@ def pattern(outline: FloatArray, spacing: float) -> tuple[FloatArray, IntArray]:
         outline: Its corners, counterclockwise. *Shape:* ``(n, 2)``.
         spacing: About the length of the edges.
     """
+    polygon = Path(outline)
     random = np.random.default_rng(0)
     sides = np.roll(outline, -1, 0) - outline
     counts = np.ceil(np.linalg.norm(sides, axis=1) / spacing).astype(int)
@@ -68,24 +67,14 @@ def pattern(outline: FloatArray, spacing: float) -> tuple[FloatArray, IntArray]:
     x[1::2] += spacing / 2
     grid = np.stack([x.ravel(), y.ravel()], 1)
     grid = grid + random.uniform(-0.3, 0.3, grid.shape) * spacing
-    grid = grid[_inside(grid, outline) & (cKDTree(border).query(grid)[0] > 0.6 * spacing)]
+    grid = grid[polygon.contains_points(grid) & (cKDTree(border).query(grid)[0] > 0.6 * spacing)]
     points = np.concatenate([border, grid])
     faces = Delaunay(points).simplices.astype(np.int64)
     a, b, c = (points[corner] for corner in faces.T)
     doubled = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
     faces = np.where((doubled < 0)[:, None], faces[:, ::-1], faces)
-    kept = _inside((a + b + c) / 3, outline) & (np.abs(doubled) > 1e-3 * spacing**2)
+    kept = polygon.contains_points((a + b + c) / 3) & (np.abs(doubled) > 1e-3 * spacing**2)
     return np.column_stack([points, np.zeros(len(points))]), faces[kept]
-
-
-def _inside(points: FloatArray, outline: FloatArray) -> np.ndarray:
-    """Whether points lie in a polygon: rays to the right cross its sides an odd number of times. *Shape:* ``(n,)``."""
-    (ax, ay), (bx, by) = outline.T[:, :, None], np.roll(outline, -1, 0).T[:, :, None]
-    x, y = points.T
-    with np.errstate(divide="ignore", invalid="ignore"):
-        crossed = ((ay > y) != (by > y)) & (x < ax + (y - ay) * (bx - ax) / (by - ay))
-    inside: np.ndarray = crossed.sum(0) % 2 == 1
-    return inside
 
 
 def rectangle(length: float, width: float, spacing: float) -> tuple[FloatArray, IntArray]:

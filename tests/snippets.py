@@ -6,6 +6,7 @@ import ast
 import re
 import shlex
 from collections.abc import Iterator
+from glob import glob
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -70,8 +71,4 @@ def commands(block: Block) -> Iterator[list[str]]:
 
 def expanded(words: list[str]) -> list[str]:
     """Words with the files that their patterns match in the current folder, as a shell has it."""
-    found: list[str] = []
-    for word in words:
-        matches = sorted(map(str, Path().glob(word))) if re.search(r"[*?\[]", word) else []
-        found += matches or [word]
-    return found
+    return [name for word in words for name in sorted(glob(word)) or [word]]

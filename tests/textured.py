@@ -26,30 +26,17 @@ def tube(n_around: int = 12, n_along: int = 8) -> tuple[np.ndarray, np.ndarray, 
     heights = np.linspace(0, 6, n_along)
     rings = [np.column_stack([ring * (1 + 0.1 * np.sin(h)), np.full(n_around, h)]) for h in heights]
     vertices = np.concatenate([*rings, [[0, 0, -0.5], [0, 0, 6.5]]])
-    quads = [
-        [
-            r * n_around + i,
-            r * n_around + (i + 1) % n_around,
-            (r + 1) * n_around + (i + 1) % n_around,
-            (r + 1) * n_around + i,
-        ]
-        for r in range(n_along - 1)
-        for i in range(n_around)
-    ]
-    return vertices, np.array(quads), angle
+    first = np.arange(n_around * (n_along - 1))
+    following = first - first % n_around + (first + 1) % n_around
+    quads = np.stack([first, following, following + n_around, first + n_around], axis=1)
+    return vertices, quads, angle
 
 
 def bend(x: np.ndarray, turn: float = 0.9) -> np.ndarray:
     """Bend a bar of length 6 along z by an angle."""
     radius = 6 / turn
-    return np.stack(
-        [
-            radius - (radius - x[:, 0]) * np.cos(x[:, 2] / radius),
-            x[:, 1],
-            (radius - x[:, 0]) * np.sin(x[:, 2] / radius),
-        ],
-        1,
-    )
+    angle, height = x[:, 2] / radius, radius - x[:, 0]
+    return np.stack([radius - height * np.cos(angle), x[:, 1], height * np.sin(angle)], 1)
 
 
 def textured_obj(folder: Path, name: str, shape: np.ndarray | None = None, blanks: bool = True) -> Path:
@@ -145,12 +132,8 @@ def textured_glb(path: Path, shape: np.ndarray | None = None) -> Path:
             roughnessFactor=0.5,
             baseColorFactor=[255, 255, 255, 255],
         )
-        mesh = trimesh.Trimesh(
-            local,
-            own.reshape(-1, 3),
-            process=False,
-            visual=trimesh.visual.TextureVisuals(uv=uv[used], material=material),
-        )
+        visual = trimesh.visual.TextureVisuals(uv=uv[used], material=material)
+        mesh = trimesh.Trimesh(local, own.reshape(-1, 3), process=False, visual=visual)
         assert len(mesh.vertex_normals) == len(used)  # so that they are exported
         scene.add_geometry(mesh, node_name=f"{name}-node", geom_name=name, transform=transform)
     path.write_bytes(scene.export(file_type="glb", include_normals=True))

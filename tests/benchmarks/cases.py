@@ -16,7 +16,7 @@ from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.io.read import SUFFIXES
 
 sys.path.append(str(Path(__file__).parents[1]))  # beside the tests
-from bodies import BODIES, body
+from bodies import body
 
 DATA = Path(__file__).parents[2].parent / "shared" / "data"
 HALF = 0.5
@@ -170,7 +170,7 @@ def samples() -> Iterator[Case]:
             yield Case(f"sample {name} {i}/{(i + 1) % n}", shapes, i, (i + 1) % n, truths)
 
 
-def bodies(names: Iterable[str] = BODIES) -> Iterator[Case]:
+def bodies(names: Iterable[str]) -> Iterator[Case]:
     """Synthetic bodies that bend far, and thin and hollow ones."""
     for name in names:
         shape = body(name)

@@ -94,7 +94,7 @@ def scratch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def n_meshers(scratch: Path) -> int:
-    return sum("_tetwild_worker" in line for line in processes(str(scratch)))
+    return sum("_tetwild_worker" in line for line in processes(str(scratch)).values())
 
 
 @pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL], ids=lambda s: s.name)

@@ -16,36 +16,26 @@ EXTENSION = Path(__file__).parents[2] / "examples" / "blender" / "in_between_key
 PROGRAM = str(Path(sys.executable).with_name("torch-modal"))
 
 
-class Key:
-    """A shape key."""
-
-    def __init__(self, name: str, points: Any) -> None:
-        self.name, self.value, self.mute = name, 0.0, False
-        self.data = [SimpleNamespace(co=tuple(map(float, point))) for point in points]
-        self.inserted: list[tuple[float, float]] = []
-
-    def keyframe_insert(self, path: str, frame: float) -> None:
-        assert path == "value"
-        self.inserted.append((frame, self.value))
-
-
 class Body:
     """A mesh object with shape keys."""
 
     type = "MESH"
 
     def __init__(self, shapes: Shapes) -> None:
-        self.keys = [Key(name, x.tolist()) for name, x in zip("abc", shapes.keyframes, strict=False)]
-        parts = [SimpleNamespace(vertices=tuple(face)) for face in shapes.faces.tolist()]
+        self.keys: list[Any] = []
+        for name, x in zip("abc", shapes.keyframes, strict=False):
+            self.shape_key_add(name, False, x.tolist())
+        triangles = [SimpleNamespace(vertices=tuple(face)) for face in shapes.faces.tolist()]
         blocks = SimpleNamespace(key_blocks=self.keys)
-        self.data = SimpleNamespace(shape_keys=blocks, loop_triangles=parts, calc_loop_triangles=lambda: None)
+        self.data = SimpleNamespace(shape_keys=blocks, loop_triangles=triangles, calc_loop_triangles=lambda: None)
+        self.shape_key_remove = self.keys.remove
 
-    def shape_key_add(self, name: str, from_mix: bool) -> Key:
-        self.keys.append(Key(name, [point.co for point in self.keys[0].data]))
-        return self.keys[-1]
-
-    def shape_key_remove(self, key: Key) -> None:
-        self.keys.remove(key)
+    def shape_key_add(self, name: str, from_mix: bool, points: Any = ()) -> Any:
+        data = [SimpleNamespace(co=point) for point in points or [point.co for point in self.keys[0].data]]
+        key = SimpleNamespace(name=name, data=data, value=0.0, mute=False, inserted=[])
+        key.keyframe_insert = lambda path, frame: key.inserted.append((path, frame, key.value))
+        self.keys.append(key)
+        return key
 
 
 @pytest.fixture
@@ -97,7 +87,7 @@ def test_shapes_are_added_and_animated(addon: ModuleType, bars: Shapes) -> None:
     assert torch.equal(points[::2], bars.keyframes)
     straight = 0.5 * (bars.keyframes[0] + bars.keyframes[1])
     assert 1e-3 < float((points[1] - straight).abs().max()) < 1
-    assert own[2].inserted == [(12, 0.0), (14, 1.0), (16, 0.0)]
+    assert own[2].inserted == [("value", 12, 0.0), ("value", 14, 1.0), ("value", 16, 0.0)]
     assert [key.mute for key in body.keys] == [False, True, True, *[False] * 5]
 
 

@@ -43,14 +43,6 @@ OPENING = re.compile(r"(What|Whether|Where|The same|As the|Of|How)\b")
 LAYOUT = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER}
 
 
-def docstring(node: ast.AST) -> ast.Expr | None:
-    """The statement that documents a module, a class or a function."""
-    if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef) and ast.get_docstring(node):
-        first = node.body[0]
-        return first if isinstance(first, ast.Expr) else None
-    return None
-
-
 def lines_of_code(text: str, tree: ast.Module) -> int:
     """Number of lines without blanks, comments, and strings that are statements."""
     strings = [
@@ -68,11 +60,12 @@ def sizes() -> dict[str, int]:
     texts = [path.read_text(encoding="utf-8") for path in sorted(PACKAGE.rglob("*.py"))]
     trees = [ast.parse(text) for text in texts]
     nodes = [node for tree in trees for node in ast.walk(tree)]
-    words = [statement.value.value for statement in map(docstring, nodes) if statement is not None]  # type: ignore[attr-defined]
+    documented = (node for node in nodes if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef))
+    words = [text for node in documented if (text := ast.get_docstring(node))]
     return {
         "lines of code": sum(map(lines_of_code, texts, trees)),
         "functions": sum(isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) for node in nodes),
-        "docstrings that begin with no noun": sum(OPENING.match(text.strip()) is not None for text in words),
+        "docstrings that begin with no noun": sum(OPENING.match(text) is not None for text in words),
     }
 
 

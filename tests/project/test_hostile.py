@@ -4,14 +4,14 @@ import os
 import signal
 import subprocess
 import sys
-import threading
-import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 import torch
-from conftest import listen_to_ctrl_c
+from conftest import listen_to_ctrl_c, processes, wait_until
 from hostile_inputs import CASES, EITHER, ERROR
 from torch.utils.data import DataLoader, Dataset
 
@@ -20,13 +20,8 @@ from torch_modal.threads import n_threads
 
 ROOT = Path(tm.__file__).parents[1]
 TESTS = Path(__file__).parents[1]
+ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), str(TESTS)])}
 IN_EVERY_RUN = ("nan", "half-flipped")
-POSIX = pytest.mark.skipif(not hasattr(os, "killpg"), reason="process groups are POSIX")
-
-
-def environment(cache: Path | None = None) -> dict[str, str]:
-    path = os.pathsep.join([str(ROOT), str(TESTS)])
-    return {**os.environ, "PYTHONPATH": path, **({} if cache is None else {"TORCH_MODAL_CACHE": str(cache)})}
 
 
 @pytest.mark.parametrize(
@@ -34,7 +29,7 @@ def environment(cache: Path | None = None) -> dict[str, str]:
 )
 def test_error_or_right_result(name: str, tmp_path: Path) -> None:
     command = [sys.executable, str(TESTS / "hostile_inputs.py"), name]
-    run = subprocess.run(command, capture_output=True, text=True, timeout=240, cwd=tmp_path, env=environment())
+    run = subprocess.run(command, capture_output=True, text=True, timeout=240, cwd=tmp_path, env=ENVIRONMENT)
     assert run.returncode == 0, run.stderr
     said, wanted = run.stdout.strip(), CASES[name][2]
     if wanted == EITHER:
@@ -72,76 +67,48 @@ class OneByLattice:
 """ + CALL.replace("[v, v", "[v, v * (1, 1, 1.1), v").replace('"tetwild"', "OneByLattice()")
 
 
-def start(cache: Path, code: str = CALL) -> "subprocess.Popen[str]":
-    return subprocess.Popen(
+@contextmanager
+def meshing(folder: Path, code: str, n: int) -> Iterator[tuple["subprocess.Popen[str]", list[int]]]:
+    """A process in the middle of meshing, and its workers, ``n`` or more."""
+    if not Path("/proc/self/stat").exists():
+        pytest.skip("workers are found through /proc, which this system does not have")
+    process = subprocess.Popen(
         [sys.executable, "-c", code],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        env=environment(cache),
-        preexec_fn=listen_to_ctrl_c if os.name == "posix" else None,
+        env={**ENVIRONMENT, "TORCH_MODAL_CACHE": str(folder / "cache"), "TMPDIR": str(folder)},
+        preexec_fn=listen_to_ctrl_c,
     )
 
+    def workers() -> list[int]:
+        return [pid for pid, command in processes(str(folder)).items() if "_tetwild_worker" in command]
 
-def workers_of(pid: int) -> list[int]:
-    """Children of a process that run the mesher."""
-    found = []
-    for folder in Path("/proc").iterdir():
-        try:
-            parent = int((folder / "stat").read_text().rpartition(")")[2].split()[1])
-            if parent == pid and b"_tetwild_worker" in (folder / "cmdline").read_bytes():
-                found.append(int(folder.name))
-        except (OSError, ValueError, IndexError):
-            continue
-    return found
-
-
-@pytest.fixture
-def running(tmp_path: Path) -> Iterator[tuple["subprocess.Popen[str]", int]]:
-    """A process in the middle of meshing, and its worker."""
-    if not Path("/proc/self/stat").exists():
-        pytest.skip("workers are found through /proc, which this system does not have")
-    process = start(tmp_path / "cache", FINE)
     try:
-        end = time.monotonic() + 60
-        while not (workers := workers_of(process.pid)):
-            assert process.poll() is None and time.monotonic() < end
-            time.sleep(0.01)
-        yield process, workers[0]
+        wait_until(lambda: len(workers()) >= n or process.poll() is not None)
+        assert process.poll() is None
+        yield process, workers()
     finally:
         process.kill()
         process.communicate()
 
 
-@POSIX
-def test_a_killed_worker_is_an_error_that_says_so(running: tuple["subprocess.Popen[str]", int], tmp_path: Path) -> None:
-    process, worker = running
-    os.kill(worker, signal.SIGKILL)
-    _, errors = process.communicate(timeout=60)
+def test_a_killed_worker_is_an_error_that_says_so(tmp_path: Path) -> None:
+    with meshing(tmp_path, FINE, 1) as (process, workers):
+        os.kill(workers[0], signal.SIGKILL)
+        _, errors = process.communicate(timeout=60)
     assert process.returncode == 1
-    assert "signal SIGKILL" in errors.splitlines()[-1]
-    assert "key-frame" in errors.splitlines()[-1]
-    assert len(list((tmp_path / "cache").glob("*.safetensors"))) == 0
+    assert "signal SIGKILL" in errors.splitlines()[-1] and "key-frame" in errors.splitlines()[-1]
+    assert not list((tmp_path / "cache").glob("*.safetensors"))
 
 
-@POSIX
 def test_ctrl_c_ends_all_of_several_workers(tmp_path: Path) -> None:
-    if not Path("/proc/self/stat").exists():
-        pytest.skip("workers are found through /proc, which this system does not have")
-    process = start(tmp_path / "cache", EACH)
-    try:
-        end = time.monotonic() + 60
-        while len(workers := workers_of(process.pid)) < min(2, n_threads()):
-            assert process.poll() is None and time.monotonic() < end
-            time.sleep(0.01)
+    with meshing(tmp_path, EACH, min(2, n_threads())) as (process, _):
         process.send_signal(signal.SIGINT)
         _, errors = process.communicate(timeout=60)
-    finally:
-        process.kill()
-        process.communicate()
     assert errors.splitlines()[-1] == "KeyboardInterrupt"
-    assert not any(Path(f"/proc/{worker}").exists() for worker in workers)
-    assert len(list((tmp_path / "cache").glob("*.safetensors"))) <= 2, errors  # those of the first key-frame
+    assert not processes(str(tmp_path))
+    assert len(list((tmp_path / "cache").glob("*.safetensors"))) <= 2, errors  # of the first key-frame
 
 
 class Bars(Dataset):  # type: ignore[type-arg]
@@ -161,11 +128,6 @@ class Bars(Dataset):  # type: ignore[type-arg]
 def test_usable_from_dataloader_workers_and_threads() -> None:
     found = list(DataLoader(Bars(), batch_size=1, num_workers=2, timeout=200))
     assert all(torch.isfinite(values).all() for values in found)
-    results: dict[int, torch.Tensor] = {}
-    threads = [threading.Thread(target=lambda i=i: results.update({i: Bars()[i]})) for i in range(2)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    for index in range(2):
-        torch.testing.assert_close(results[index], found[index][0], rtol=0.2, atol=0)
+    with ThreadPoolExecutor(2) as pool:
+        for values, expected in zip(pool.map(Bars().__getitem__, range(2)), found, strict=True):
+            torch.testing.assert_close(values, expected[0], rtol=0.2, atol=0)

@@ -103,9 +103,7 @@ def run_command(block: Block, words: list[str]) -> None:
         assert set(",".join(extras).split(",")) <= {*known, "all", ""}, str(block)
     else:
         assert Path(program).name in {"python", "sh"}, f"{block}: {program}"
-        shared = [
-            ROOT / "tests" / "benchmarks" / name for name in ("methods.py", "results.py")
-        ]  # --peer-python, --keep
-        script = "".join(path.read_text() for path in (ROOT / arguments[0], *shared))
+        files = (arguments[0], "tests/benchmarks/methods.py", "tests/benchmarks/results.py")  # --peer-python, --keep
+        script = "".join((ROOT / file).read_text() for file in files)
         for option in (word for word in arguments[1:] if word.startswith("--")):
             assert f'"{option}"' in script or arguments[0].endswith(".sh"), f"{block}: {option}"
