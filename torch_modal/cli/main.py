@@ -21,16 +21,8 @@ DESCRIPTION = """\
 Fill key-frame meshes with physically plausible shapes in between.
 
 Key-frames are triangle meshes (OBJ, PLY, OFF, GLB, GLTF) with the same faces and
-the same vertex order, in any units. Results are in the same units and coordinates."""
-
-EXAMPLES = """\
-start here:
-  torch-modal demo                                        try it on the samples that come with it
-  torch-modal subdivide a.obj b.obj --out between.glb     from your meshes to an animation
-  torch-modal subdivide a.obj scan.ply --register --out between.glb   of different connectivity
-  torch-modal bake frames/*.obj --bones 40 --out x.glb                from a sequence to one file
-  torch-modal complete a.obj scans/*.ply --out motion.glb             from scans and a template
-  torch-modal subdivide --help                            all that can be set"""
+the same vertex order, in any units. Results are in the same units and coordinates.
+Start with `torch-modal demo`; the help of each command has examples."""
 
 COMMANDS: dict[str, tuple[Callable[[Any], None], Callable[[Any], int | None]]] = {
     "subdivide": (subdivide.add_arguments, subdivide.run),
@@ -56,7 +48,7 @@ EXPECTED_NAMES = ("TetrahedralizationError", "ModalAnalysisError")
 def build_parser() -> argparse.ArgumentParser:
     """All commands and their options."""
     formatter = functools.partial(argparse.RawDescriptionHelpFormatter, max_help_position=30, width=100)
-    parser = argparse.ArgumentParser(prog=PROGRAM, description=DESCRIPTION, epilog=EXAMPLES, formatter_class=formatter)
+    parser = argparse.ArgumentParser(prog=PROGRAM, description=DESCRIPTION, formatter_class=formatter)
     parser.add_argument("--version", action="version", version=f"{PROGRAM} {__version__}")
     subparsers = parser.add_subparsers(title="commands", required=True, metavar="COMMAND ...")
     for name, (add_arguments, run) in COMMANDS.items():

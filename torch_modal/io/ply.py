@@ -8,7 +8,6 @@ with ten digits.
 import re
 from collections.abc import Mapping
 from functools import cached_property
-from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -66,29 +65,17 @@ class PlyFile:
     @cached_property
     def _content(self) -> tuple[bytes, NDArray[Any], bytes]:
         """The vertices with all their properties (words, if the file is text), and the bytes before and after them."""
-        if any(len(types) > 1 for types in self.properties.values()):
-            raise ValueError("vertices with properties that are lists")
-        before = [*takewhile(lambda element: element[1] is not self.properties, self.elements.values())]
+        if next(iter(self.elements)) != "vertex" or any(len(types) > 1 for types in self.properties.values()):
+            raise ValueError("vertices are not its first element, or have properties that are lists")
+        header, body = self.data[: self._start], self.data[self._start :]
         if not self._order:
-            lines = self.data[self._start :].splitlines(keepends=True)
-            first = sum(length for length, _ in before)
-            last = first + self.n_vertices
+            lines = body.splitlines(keepends=True)
             row = np.dtype([(name, object) for name in self.properties])
-            words = np.array([tuple(line.split()) for line in lines[first:last]], row)
-            return self.data[: self._start] + b"".join(lines[:first]), words, b"".join(lines[last:])
-        place = self._start
-        for length, properties in before:
-            for _ in range(length):
-                for *of_list, kind in properties.values():
-                    repeat = 1
-                    if of_list:
-                        count = np.dtype(self._order + of_list[0])
-                        repeat = int(np.frombuffer(self.data, count, 1, place)[0])
-                        place += count.itemsize
-                    place += repeat * np.dtype(kind).itemsize
+            words = np.array([tuple(line.split()) for line in lines[: self.n_vertices]], row)
+            return header, words, b"".join(lines[self.n_vertices :])
         row = np.dtype([(name, self._order + kind) for name, (kind,) in self.properties.items()])
-        rows = np.frombuffer(self.data, row, self.n_vertices, place)
-        return self.data[:place], rows, self.data[place + rows.nbytes :]
+        rows = np.frombuffer(body, row, self.n_vertices)
+        return header, rows, body[rows.nbytes :]
 
     def columns(self, *names: str) -> FloatArray:
         """Properties of the vertices. *Shape:* ``(V, n)``."""
