@@ -8,6 +8,7 @@ import numpy as np
 import pygltflib
 import pytest
 import torch
+from test_cli import fails
 from textured import bend, textured_obj, triangles_of_tube
 
 import torch_modal as tm
@@ -112,18 +113,15 @@ def test_nothing_is_overwritten_and_one_shape_is_no_motion(
 ) -> None:
     out = tmp_path / "a.glb"
     out.write_text("mine")
-    assert main(["bake", str(folder), "--out", str(out)]) == 1 and out.read_text() == "mine"
-    assert "exists; pass overwrite=True (--overwrite)" in capsys.readouterr().err
+    bake = ["bake", str(folder), "--out"]
+    assert "exists; pass overwrite=True (--overwrite)" in fails(capsys, *bake, str(out))
+    assert out.read_text() == "mine"
     tm.save_animation(FRAMES, FACES, out, overwrite=True)
-    assert main(["bake", str(out), "--bones", "3", "--out", str(out), "--overwrite"]) == 1
-    assert "is one of the meshes that are read" in capsys.readouterr().err
-    assert main(["bake", str(folder / "frame-000.obj"), "--out", str(tmp_path / "b.glb")]) == 1
-    assert "is one shape; a motion has two frames or more" in capsys.readouterr().err
-    assert main(["bake", str(folder), "--out", str(tmp_path / "b.obj")]) == 1
-    assert "must end in" in capsys.readouterr().err
-    assert main(["bake", str(folder), "--bones", "3", "--out", str(tmp_path / "b.usda")]) == 1
-    assert "bones are for .glb files" in capsys.readouterr().err
-    assert main(["bake", str(folder), "--smooth", "0", "--out", str(tmp_path / "b.glb")]) == 1
-    assert "smooth must be a positive number of frames, got 0.0" in capsys.readouterr().err
-    assert main(["bake", str(folder), "--across", "--out", str(tmp_path / "b.glb")]) == 1
-    assert "pass register=True (--register)" in capsys.readouterr().err
+    own = ["bake", str(out), "--bones", "3", "--out", str(out), "--overwrite"]
+    assert "is one of the meshes that are read" in fails(capsys, *own)
+    alone = ["bake", str(folder / "frame-000.obj"), "--out", str(tmp_path / "b.glb")]
+    assert "is one shape; a motion has two frames or more" in fails(capsys, *alone)
+    assert "must end in" in fails(capsys, *bake, str(tmp_path / "b.obj"))
+    assert "bones are for .glb files" in fails(capsys, *bake, "b.usda", "--bones", "3")
+    assert "smooth must be a positive number of frames, got 0.0" in fails(capsys, *bake, "b.glb", "--smooth", "0")
+    assert "pass register=True (--register)" in fails(capsys, *bake, "b.glb", "--across")

@@ -54,30 +54,6 @@ def test_write_errors_name_the_users_path(tmp_path: Path, monkeypatch: pytest.Mo
     assert other.value.filename == "/elsewhere"
 
 
-def test_the_command_names_the_path_in_one_line(
-    tmp_path: Path,
-    capsule: tuple[np.ndarray, np.ndarray],
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    x, faces = capsule
-    files = tm.save_frames(np.stack([x, 1.1 * x]), faces, tmp_path / "in", "obj")
-    monkeypatch.setattr(tm, "subdivide", lambda keyframes, *_, **__: keyframes)
-    replace = os.replace
-
-    def refused(source: object, target: object) -> None:
-        if str(target).endswith("a.glb"):
-            raise PermissionError(errno.EACCES, "Permission denied", str(source), None, str(target))
-        replace(source, target)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(os, "replace", refused)
-    out = tmp_path / "a.glb"
-    argv = ["subdivide", *map(str, files), "--levels", "0", "--modes", "4", "--mesher", "lattice", "--out", str(out)]
-    assert cli.main([*argv, "--quiet"]) == 1
-    assert capsys.readouterr().err == f"torch-modal: error: {out}: Permission denied\n"
-    assert not out.exists()
-
-
 @pytest.fixture
 def unready() -> Iterator[None]:
     """A handler of SIGTERM that fails, instead of the default that ends the tests."""

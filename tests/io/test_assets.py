@@ -89,19 +89,6 @@ def test_obj_normals_turn_with_the_surface(tmp_path):
         np.testing.assert_allclose([n for _, _, n in new], wanted, atol=1e-12)
 
 
-def test_obj_with_its_textures_loads_in_trimesh(tmp_path):
-    source = textured_obj(tmp_path / "in", "bar.obj", blanks=False)
-    asset = tm.open_asset(source)
-    out = write(asset, tmp_path / "elsewhere" / "bar.obj", bend(asset.positions))
-    assert {p.name for p in out.parent.rglob("*") if p.is_file()} == {"bar.obj", "bar.mtl", "red.png", "blue.png"}
-    colors = set()
-    for old, new in zip(*(trimesh.load_scene(p, process=False).geometry.values() for p in (source, out)), strict=True):
-        np.testing.assert_array_equal(old.visual.uv, new.visual.uv)
-        np.testing.assert_array_equal(old.faces, new.faces)
-        colors.add(new.visual.material.image.convert("RGB").getpixel((4, 4)))
-    assert colors == {RED, BLUE}
-
-
 def files_of(folder: Path) -> set[str]:
     return {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
 
@@ -525,17 +512,6 @@ def test_what_a_format_cannot_hold_is_said(tmp_path):
     assert [p.name for p in paths] == ["frame-000.obj"]
     with pytest.raises(ValueError, match="98 vertices, the frames have 99"):
         tm.save_frames(np.zeros((1, 99, 3)), asset.faces, tmp_path / "no", asset=asset)
-
-
-def test_frames_as_glb(tmp_path):
-    asset = tm.open_asset(textured_glb(tmp_path / "in.glb"))
-    frames = np.stack([bend(asset.positions, turn) for turn in (0.1, 0.9)])
-    paths = tm.save_frames(frames, asset.faces, tmp_path / "out", asset=asset)
-    paths += tm.save_frames(frames, asset.faces, tmp_path / "bare", "glb")
-    assert [p.name for p in paths] == 2 * ["frame-000.glb", "frame-001.glb"]
-    for path, frame in zip(paths, [*frames, *frames], strict=True):
-        assert not gltf_validator.issues(path)
-        np.testing.assert_allclose(tm.open_asset(path).positions, frame, atol=5e-6)
 
 
 def test_pictures_of_other_formats_become_png():

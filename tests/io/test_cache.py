@@ -4,9 +4,7 @@ import os
 import subprocess
 import sys
 import threading
-import warnings
 from collections import OrderedDict
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +15,7 @@ import torch
 import torch_modal as tm
 from torch_modal.elastic.stretch import Stretch
 from torch_modal.io import cache as cache_module
-from torch_modal.io.cache import (
-    Cache,
-    CacheWarning,
-    ContentError,
-    content_digest,
-    entry_name,
-)
+from torch_modal.io.cache import Cache, CacheWarning, ContentError, content_digest, entry_name
 
 POINTS = np.arange(6.0).reshape(2, 3)
 RESULT = {
@@ -117,15 +109,6 @@ def test_folder_that_cannot_be_made(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("in the way")
     with pytest.warns(CacheWarning, match="TORCH_MODAL_CACHE or cache_dir"):
         assert_right(get(tmp_path / "file" / "folder", Counted()))
-
-
-def test_many_at_once(tmp_path: Path) -> None:
-    compute = Counted()
-    with ThreadPoolExecutor(8) as pool, warnings.catch_warnings():
-        warnings.simplefilter("error")
-        for found in pool.map(lambda i: get(tmp_path, compute, k=i % 2), range(64)):
-            assert_right(found)
-    assert len(list(tmp_path.iterdir())) == 2
 
 
 def test_default_folder(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -47,18 +47,13 @@ def played(gltf, time):
 def test_frames_read_back(tmp_path, fmt, tolerance):
     frames = tetrahedra()
     paths = save_frames(frames, FACES, tmp_path / "new" / "folder", fmt=fmt, stem="shape")
+    assert sorted(paths[0].parent.iterdir()) == paths
     assert [path.name for path in paths] == [f"shape-{n:03d}.{fmt}" for n in range(5)]
     for path, frame in zip(paths, frames, strict=True):
         mesh = trimesh.load_mesh(path, process=False, maintain_order=True)
         expected = frame.astype(np.float32) if tolerance is None else frame
         np.testing.assert_array_equal(mesh.vertices, expected)
         np.testing.assert_array_equal(mesh.faces, FACES)
-
-
-def test_numbers_grow_with_the_sequence(tmp_path):
-    paths = save_frames(np.repeat(tetrahedra(1), 1001, axis=0), FACES, tmp_path)
-    assert (paths[0].name, paths[-1].name) == ("frame-0000.ply", "frame-1000.ply")
-    assert sorted(tmp_path.iterdir()) == paths
 
 
 def test_torch_and_numpy_give_the_same_files(tmp_path):
@@ -93,21 +88,6 @@ def test_existing_files_stay_unless_asked(tmp_path):
     assert animation.read_text() == "mine"
     save_animation(frames, FACES, animation, overwrite=True)
     assert animation.read_bytes().startswith(b"glTF")
-
-
-def test_a_failing_move_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch):
-    old = tmp_path / "frame-000.ply"
-    old.write_text("old")
-
-    def refused(*_):
-        raise PermissionError("held by another program")
-
-    monkeypatch.setattr(os, "replace", refused)
-    with pytest.raises(OSError):
-        save_frames(tetrahedra(), FACES, tmp_path, overwrite=True)
-    with pytest.raises(OSError):
-        save_animation(tetrahedra(), FACES, tmp_path / "a.glb")
-    assert list(tmp_path.iterdir()) == [old] and old.read_text() == "old"
 
 
 @pytest.mark.parametrize("with_asset", [False, True])
@@ -165,27 +145,16 @@ def test_wrong_input_is_refused_before_anything_is_written(tmp_path, frames, fac
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"out": "a.gltf"}, r"\.glb"),
-        ({"keyframe_indices": [0, 5]}, r"0 to 4.*\[0, 5\]"),
-        ({"keyframe_indices": [-1]}, r"0 to 4"),
-    ],
-)
-def test_wrong_animation_options(tmp_path, options, message):
-    out = tmp_path / options.pop("out", "a.glb")
-    with pytest.raises(ValueError, match=message):
-        save_animation(tetrahedra(), FACES, out, **options)
-
-
-def test_wrong_frame_options(tmp_path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(FileExistsError, match="file"):
-        save_frames(tetrahedra(), FACES, tmp_path / "file")
+def test_wrong_animation_options(tmp_path):
+    for wrong in ([0, 5], [-1]):
+        with pytest.raises(ValueError, match=rf"0 to 4.*{re.escape(str(wrong))}"):
+            save_animation(tetrahedra(), FACES, tmp_path / "a.glb", keyframe_indices=wrong)
     (tmp_path / "a.glb").mkdir()
     with pytest.raises(IsADirectoryError, match="is a folder"):
         save_animation(tetrahedra(), FACES, tmp_path / "a.glb", overwrite=True)
+    with pytest.raises(OSError, match="file"):
+        (tmp_path / "file").write_text("")
+        save_frames(tetrahedra(), FACES, tmp_path / "file")
 
 
 def test_animation_plays_the_frames(tmp_path):

@@ -1,8 +1,5 @@
 """Skins in GLB files: by the letter of glTF, and in other programs where these are installed."""
 
-import json
-import shutil
-import subprocess
 import tracemalloc
 from pathlib import Path
 
@@ -177,45 +174,6 @@ def test_subdivide_command_writes_bones(tmp_path, capsys):
     assert main([*common, str(tmp_path / "c.gif"), "--bones", "6"]) == 1
     assert "bones are for .glb files" in capsys.readouterr().err
     assert main(["view", str(tmp_path / "a.glb"), "--page", str(tmp_path / "a.html"), "--quiet"]) == 0
-
-
-def node(script: str, *arguments: object) -> str:
-    """What a script prints."""
-    command = ["node", "-e", script, *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, check=True, timeout=120).stdout
-
-
-THREE = """
-const path = require("path"), fs = require("fs");
-const base = path.join(path.dirname(require.resolve("three")), "..");
-(async () => {
-  const THREE = await import(path.join(base, "build/three.module.js"));
-  const { GLTFLoader } = await import(path.join(base, "examples/jsm/loaders/GLTFLoader.js"));
-  const bytes = new Uint8Array(fs.readFileSync(process.argv[1])).buffer;
-  const gltf = await new GLTFLoader().parseAsync(bytes, "");
-  const mixer = new THREE.AnimationMixer(gltf.scene), shapes = [];
-  mixer.clipAction(gltf.animations[0]).setLoop(THREE.LoopOnce).play().clampWhenFinished = true;
-  const meshes = [];
-  gltf.scene.traverse((object) => object.isSkinnedMesh && meshes.push(object));
-  for (const time of JSON.parse(process.argv[2])) {
-    mixer.setTime(time);
-    gltf.scene.updateMatrixWorld(true);
-    const point = new THREE.Vector3(), n = meshes[0].geometry.attributes.position.count;
-    shapes.push([...Array(n).keys()].map((v) => meshes[0].getVertexPosition(v, point).toArray()));
-  }
-  console.log(JSON.stringify(shapes));
-})();"""
-
-
-def test_three_plays_the_frames(tmp_path):
-    if (
-        shutil.which("node") is None
-        or subprocess.run(["node", "-e", 'require.resolve("three")'], capture_output=True).returncode
-    ):
-        pytest.skip("node or its package three is not installed (NODE_PATH names the folder)")
-    path = tm.save_animation(FRAMES, FACES, tmp_path / "a.glb", bones=6, duration=2)
-    found = np.array(json.loads(node(THREE, path, json.dumps(np.linspace(0, 2, 9).tolist()))))
-    assert np.abs(found - tm.bake(FRAMES, FACES, 6).shapes().numpy()).max() < TOLERANCE * DIAGONAL
 
 
 def test_blender_plays_the_frames(tmp_path):

@@ -118,13 +118,11 @@ def test_columns_and_keyframes_are_chosen(tmp_path):
 
 def test_titles_stand_above_the_columns(tmp_path):
     rows, faces = {"a": growing(3)}, np.asarray(BALL.faces)
-    given = [["t = 0", "t = 0.5", "t = 1"], ["t = 0", "mode 2", "t = 1"]]
     sheets = []
-    for titles in (None, *given):
+    for titles in (None, ["t = 0", "mode 2", "t = 1"]):
         render_sequence(rows, faces, tmp_path / "a.png", titles=titles, overwrite=True)
         sheets.append(np.asarray(Image.open(tmp_path / "a.png").convert("RGB")).astype(int))
-    np.testing.assert_array_equal(sheets[0], sheets[1], "times are the default")
-    changed = np.argwhere(np.abs(sheets[0] - sheets[2]).sum(2) > 0)
+    changed = np.argwhere(np.abs(sheets[0] - sheets[1]).sum(2) > 0)
     height, width = sheets[0].shape[:2]
     assert len(changed) and changed[:, 0].max() < height / 4, "only what is above the shapes"
     assert width / 3 < changed[:, 1].min() and changed[:, 1].max() < 5 * width / 6, "only the one in the middle"
@@ -220,27 +218,15 @@ def test_what_rests_stays_and_what_travels_is_followed():
     assert np.abs(moved).max() <= 1.0 + 1e-12
 
 
-def test_existing_pictures_stay_unless_asked_and_nothing_is_left_behind(tmp_path, monkeypatch):
+def test_existing_pictures_stay_unless_asked(tmp_path):
     rows, faces, out = {"a": growing(2)}, np.asarray(BALL.faces), tmp_path / "a.png"
     out.write_text("mine")
     with pytest.raises(FileExistsError, match=r"a\.png exists.*--overwrite"):
         render_sequence(rows, faces, out)
-
-    def refused(*_):
-        raise PermissionError("held by another program")
-
-    with monkeypatch.context() as patch:
-        patch.setattr("os.replace", refused)
-        with pytest.raises(PermissionError):
-            render_sequence(rows, faces, out, overwrite=True)
     assert out.read_text() == "mine" and list(tmp_path.iterdir()) == [out]
     render_sequence(rows, faces, out, overwrite=True)
     assert Image.open(out).format == "PNG"
-
-
-def test_a_picture_is_written_as_pdf(tmp_path):
-    path = render_sequence({"": growing(2)}, np.asarray(BALL.faces), tmp_path / "a.pdf")
-    assert path.read_bytes().startswith(b"%PDF")
+    assert render_sequence(rows, faces, tmp_path / "a.pdf").read_bytes().startswith(b"%PDF")
 
 
 @pytest.mark.parametrize(
@@ -266,11 +252,7 @@ def test_a_picture_is_written_as_pdf(tmp_path):
     ],
 )
 def test_wrong_input_is_refused(tmp_path, options, message):
-    arguments = {
-        "frames_by_row": {"a": growing(3)},
-        "faces": np.asarray(BALL.faces),
-        "out": "a.png",
-    } | options
+    arguments = {"frames_by_row": {"a": growing(3)}, "faces": BALL.faces, "out": "a.png"} | options
     arguments["out"] = tmp_path / arguments["out"]
     with pytest.raises(ValueError, match=message):
         render_sequence(**arguments)

@@ -67,8 +67,7 @@ ANIMATION_FORMATS: dict[str, OutputFormat] = {
     ".mp4": OutputFormat("torch_modal.view.animation:write_mp4", FEATURES, ("imageio", "imageio_ffmpeg"), "video"),
     ".gif": OutputFormat("torch_modal.view.animation:write_gif", FEATURES),
     **dict.fromkeys(
-        (".usd", ".usda", ".usdc"),
-        OutputFormat("torch_modal.io.animations:write_usd", ("polygons", "texcoords", "colors"), ("pxr",), "usd"),
+        (".usd", ".usda", ".usdc"), OutputFormat("torch_modal.io.animations:write_usd", (), ("pxr",), "usd")
     ),
     **dict.fromkeys((".mdd", ".pc2"), OutputFormat("torch_modal.io.animations:write_point_cache", FEATURES)),
     ".npz": OutputFormat("torch_modal.io.animations:write_npz", FEATURES),

@@ -67,7 +67,7 @@ def save_animation(
         times: Times of the frames, in any unit (:func:`torch_modal.frame_times`); of a cycle, also the time when it
             begins again. Default: evenly spaced. The duration does not change.
         asset: The mesh file that the frames come from (:func:`torch_modal.open_asset`). GLB gets its materials,
-            textures, texture coordinates, colours and normals, USD its polygons, texture coordinates and colours.
+            textures, texture coordinates, colours and normals.
         bones: Most bones of a skin, or a skin of these frames. GLB alone.
         progress: A bar while a video is drawn: see :data:`torch_modal.progress.Progress`.
 
