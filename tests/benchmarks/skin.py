@@ -1,4 +1,4 @@
-"""Motions as morph targets and as bones: sizes and errors of GLB files.
+"""Motions as morph targets, as bones and as principal shapes: sizes and errors of GLB files.
 
     python tests/benchmarks/skin.py [--only hand]
     python tests/benchmarks/skin.py --peer
@@ -32,8 +32,8 @@ from torch_modal.data.samples import load_sample
 from torch_modal.data.sequence import read_shapes
 from torch_modal.geometry.inspect import diagonals
 
-BONES = 40
-COLUMNS = ["", "a morph target for each frame", f"`bones={BONES}`"]
+BONES, TARGETS = 40, 8
+COLUMNS = ["", "a morph target for each frame", f"`bones={BONES}`", f"`targets={TARGETS}`"]
 PEER_COLUMNS = ["", "bones"]
 PEER_COLUMNS += [f"{who}, {what}" for what in ("at frames", "between", "time") for who in ("Dem Bones", "`bake`")]
 MOTIONS = {"hand": np.linspace(0, 1, 33), "creature": np.arange(48) / 8}
@@ -51,7 +51,7 @@ def measure(name: str, folder: Path) -> list[str]:
     """A line of the table."""
     frames, faces = frames_of(name)
     cells = [f"{name}, {len(frames)} frames"]
-    for i, form in enumerate([{}, {"bones": BONES}]):
+    for i, form in enumerate([{}, {"bones": BONES}, {"targets": TARGETS}]):
         path = folder / f"{name}-{i}.glb"
         tm.save_animation(frames, faces, path, cyclic=name == "creature", **form)
         off = np.linalg.norm(read_shapes([path])[0] - frames, axis=-1)
@@ -105,10 +105,15 @@ def measure_long(folder: Path) -> None:
     print(f"{time.process_time() - started:.1f} s of processor time")
 
 
-def draw(out: Path) -> None:
-    """Draw the gallop as morph targets and as bones."""
+def draw(out: Path, folder: Path) -> None:
+    """Draw the gallop as morph targets, as bones, and as principal shapes."""
     frames, faces = frames_of("creature")
-    rows = {"morph targets": frames, f"{BONES} bones": tm.bake(frames, faces, BONES).shapes().numpy()}
+    few = read_shapes([tm.save_animation(frames, faces, folder / "few.glb", targets=TARGETS)])[0]
+    rows = {
+        "morph targets": frames,
+        f"{BONES} bones": tm.bake(frames, faces, BONES).shapes().numpy(),
+        f"{TARGETS} targets": few,
+    }
     shown = {name: torch.tensor(row[4::8][:5]) for name, row in rows.items()}
     view = load_sample("creature").view
     tm.render_sequence(shown, faces, out, columns=5, keyframe_indices=[], view=view, overwrite=True)
@@ -127,7 +132,7 @@ def main() -> None:
     torch.set_num_threads(1)
     with tempfile.TemporaryDirectory() as folder:
         if given.picture:
-            draw(given.picture)
+            draw(given.picture, Path(folder))
         elif given.long:
             measure_long(Path(folder))
         elif given.peer:

@@ -116,12 +116,16 @@ def test_nothing_is_overwritten_and_one_shape_is_no_motion(
     bake = ["bake", str(folder), "--out"]
     assert "exists; pass overwrite=True (--overwrite)" in fails(capsys, *bake, str(out))
     assert out.read_text() == "mine"
-    tm.save_animation(FRAMES, FACES, out, overwrite=True)
+    np.savez(tmp_path / "a.npz", frames=FRAMES, faces=FACES)
+    assert main(["bake", str(tmp_path / "a.npz"), "--targets", "2", "--out", str(out), "--overwrite", "--quiet"]) == 0
+    assert 1e-5 < rms(tm.load_sequence(out).frames, FRAMES) < 0.05
     own = ["bake", str(out), "--bones", "3", "--out", str(out), "--overwrite"]
     assert "is one of the meshes that are read" in fails(capsys, *own)
     alone = ["bake", str(folder / "frame-000.obj"), "--out", str(tmp_path / "b.glb")]
     assert "is one shape; a motion has two frames or more" in fails(capsys, *alone)
     assert "must end in" in fails(capsys, *bake, str(tmp_path / "b.obj"))
-    assert "bones are for .glb files" in fails(capsys, *bake, "b.usda", "--bones", "3")
-    assert "smooth must be a positive number of frames, got 0.0" in fails(capsys, *bake, "b.glb", "--smooth", "0")
+    assert "two forms of a .glb file" in fails(capsys, *bake, "b.usda", "--bones", "3")
+    assert "smooth must be a positive number" in fails(capsys, *bake, "b.glb", "--smooth", "0", "--quiet")
+        capsys, *bake, "b.glb", "--smooth", "0", "--quiet"
+    )
     assert "pass register=True (--register)" in fails(capsys, *bake, "b.glb", "--across")

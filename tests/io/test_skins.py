@@ -1,4 +1,4 @@
-"""Skins in GLB files: by the letter of glTF, and in other programs where these are installed."""
+"""Skins and principal shapes in GLB files: by the letter of glTF, and in other programs where these are installed."""
 
 import tracemalloc
 from pathlib import Path
@@ -135,12 +135,36 @@ def test_materials_and_nodes_stay(tmp_path, suffix):
             assert np.abs(found - own).max() < TOLERANCE * np.linalg.norm(np.ptp(shapes[0], axis=0))
 
 
-def test_memory_does_not_grow_with_the_square_of_the_frames(tmp_path):
+def test_principal_shapes(tmp_path):
+    path = tm.save_animation(FRAMES, FACES, tmp_path / "a.glb", targets=3)
+    assert not gltf_validator.issues(path)
+    gltf = pygltflib.GLTF2().load(str(path))
+    primitive = gltf.meshes[0].primitives[0]
+    assert len(primitive.targets) == 3 and gltf.meshes[0].extras["targetNames"][0] == "principal-1"
+    # Blender clamps weights to this range.
+    weights = accessor(gltf, gltf.animations[0].samplers[0].output).reshape(9, 3)
+    np.testing.assert_allclose([weights.min(0), weights.max(0)], [[0] * 3, [1] * 3], atol=1e-6)
+    np.testing.assert_allclose(gltf.meshes[0].weights, weights[0], atol=1e-6)
+    # The error is the rest of the singular values.
+    values = np.linalg.svd((FRAMES - FRAMES.mean(0)).reshape(9, -1), compute_uv=False)
+    off = read_shapes([path])[0] - FRAMES
+    assert np.sum(off**2) == pytest.approx(np.sum(values[3:] ** 2), rel=1e-3)
+    exact = tm.save_animation(FRAMES[:4], FACES, tmp_path / "b.glb", targets=3)
+    np.testing.assert_allclose(read_shapes([exact])[0], FRAMES[:4], atol=1e-5)
+    still = tm.save_animation(FRAMES[[0, 0]], FACES, tmp_path / "c.glb", targets=1)
+    np.testing.assert_allclose(read_shapes([still])[0], FRAMES[[0, 0]], atol=1e-5)
+    few = FRAMES[:, ::40]  # more frames than coordinates
+    path = tm.save_animation(few[:, :2], [[0, 1, 1]], tmp_path / "d.glb", targets=6)
+    np.testing.assert_allclose(read_shapes([path])[0], few[:, :2], atol=1e-5)
+
+
+@pytest.mark.parametrize("form", [{"bones": 2}, {"targets": 2}])
+def test_memory_does_not_grow_with_the_square_of_the_frames(tmp_path, form):
     frames = np.stack(
         [turn.apply(X[::20]) for turn in Rotation.from_rotvec(np.linspace(0, 9, 4000)[:, None] * [0, 0, 1])]
     )
     tracemalloc.start()
-    tm.save_animation(frames, [[0, 1, 2], [2, 3, 4]], tmp_path / "a.glb", bones=2)
+    tm.save_animation(frames, [[0, 1, 2], [2, 3, 4]], tmp_path / "a.glb", **form)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 8 * 4000**2 / 4  # a quarter of such a matrix
@@ -154,7 +178,10 @@ def test_memory_does_not_grow_with_the_square_of_the_frames(tmp_path):
         ({"frames": FRAMES * np.nan}, "finite numbers"),
         ({"bones": 99}, "bones must be a whole number from 1 to"),
         ({"bones": "40"}, "bones must be a whole number"),
-        *(({"name": name}, "bones are for .glb files") for name in ("a.obj", "a.stl", "a.mp4", "a.usdc")),
+        *(({"name": name}, "two forms of a .glb file") for name in ("a.obj", "a.stl", "a.mp4", "a.usdc")),
+        ({"targets": 3}, "two forms of a .glb file"),
+        ({"bones": None, "targets": 9}, "targets must be a whole number, 1 to 8 of these frames; got 9"),
+        ({"bones": None, "targets": 0}, "targets must be"),
         ({"bones": tm.bake(FRAMES[:5], FACES, 2)}, "a skin of 5 other frames than these 9"),
         ({"bones": tm.bake(FRAMES[:, :90], FACES[(FACES < 90).all(1)], 2)}, "other frames than these 9"),
     ],
@@ -166,13 +193,14 @@ def test_what_cannot_be_written(tmp_path, options, message):
     assert not list(tmp_path.iterdir())
 
 
-def test_subdivide_command_writes_bones(tmp_path, capsys):
+def test_subdivide_command_writes_bones_and_targets(tmp_path, capsys):
     keys = tm.save_frames(FRAMES[:3], FACES, tmp_path / "keys", fmt="obj")
     common = ["subdivide", *map(str, keys), "--levels", "2", "--quiet", "--out"]
     assert main([*common, str(tmp_path / "a.glb"), "--bones", "6"]) == 0
+    assert main([*common, str(tmp_path / "b.glb"), "--targets", "4"]) == 0
     assert (tmp_path / "a.glb").stat().st_size > 0 and len(skinned(tmp_path / "a.glb", 0.3)) == 1
     assert main([*common, str(tmp_path / "c.gif"), "--bones", "6"]) == 1
-    assert "bones are for .glb files" in capsys.readouterr().err
+    assert "two forms of a .glb file" in capsys.readouterr().err
     assert main(["view", str(tmp_path / "a.glb"), "--page", str(tmp_path / "a.html"), "--quiet"]) == 0
 
 

@@ -7,10 +7,10 @@ import numpy as np
 import pygltflib
 import pytest
 from PIL import Image
-from textured import bend, triangles_of_tube
+from textured import bend, textured_obj, triangles_of_tube
 
 import torch_modal as tm
-from torch_modal.errors import MissingPackageError
+from torch_modal.errors import MeshWarning, MissingPackageError
 from torch_modal.io.formats import ANIMATION_FORMATS, Timing
 from torch_modal.view import animation
 
@@ -106,14 +106,20 @@ def test_usd_read_back(tmp_path, suffix):
     usd = pytest.importorskip("pxr.Usd", reason="usd-core is not installed")
     from pxr import UsdGeom
 
-    path = tm.save_animation(FRAMES[:3], FACES, tmp_path / f"a.{suffix}", duration=3, fps=24)
+    asset = tm.open_asset(textured_obj(tmp_path, "bar.obj"))
+    frames = np.stack([bend(asset.positions, turn) for turn in (0.01, 0.5, 0.9)])
+    with pytest.warns(MeshWarning, match="without the normals, 2 materials and groups"):
+        path = tm.save_animation(frames, asset.faces, tmp_path / f"a.{suffix}", duration=3, fps=24, asset=asset)
     stage = usd.Stage.Open(str(path))
     assert (stage.GetTimeCodesPerSecond(), stage.GetEndTimeCode()) == (24, 72)
     mesh = UsdGeom.Mesh(stage.GetDefaultPrim().GetChild("mesh"))
     assert mesh.GetSubdivisionSchemeAttr().Get() == "none"
-    np.testing.assert_array_equal(np.reshape(mesh.GetFaceVertexIndicesAttr().Get(), (-1, 3)), FACES)
-    for time, frame in ((0, FRAMES[0]), (36, FRAMES[1]), (72, FRAMES[2]), (18, (FRAMES[0] + FRAMES[1]) / 2)):
+    assert list(mesh.GetFaceVertexCountsAttr().Get()) == [4] * 84 + [3] * 24
+    for time, frame in ((0, frames[0]), (36, frames[1]), (72, frames[2]), (18, (frames[0] + frames[1]) / 2)):
         np.testing.assert_allclose(mesh.GetPointsAttr().Get(time), frame, atol=1e-6)
+    st = UsdGeom.PrimvarsAPI(mesh).GetPrimvar("st")
+    assert st.GetInterpolation() == "faceVarying" and len(st.Get()) == 84 * 4 + 24 * 3
+    assert np.allclose(next(iter(mesh.GetDisplayColorPrimvar().Get())), [0.2140, 0.0509, 1.0], atol=1e-3)
     assert [p.name for p in tmp_path.iterdir() if p.name.startswith(".")] == []
 
 

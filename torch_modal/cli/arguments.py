@@ -1,9 +1,10 @@
 """Types of arguments, options that several commands share, and checks of output paths."""
 
 import argparse
+import inspect
 import os
 import re
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,36 +17,70 @@ REGISTRATION = ("landmarks", "same_subject", "cache", "progress")
 """Options of `register`, as `add_registration` and `add_cache` name them."""
 
 
+def adder(sub: argparse._ActionsContainer, function: Callable[..., object]) -> Callable[..., argparse.Action]:
+    """``sub.add_argument``, with the help of each argument from the lines below ``Options:`` in a docstring."""
+    text = inspect.cleandoc(function.__doc__ or "").partition("Options:\n")[2]
+    helps = {name: " ".join(words.split()) for name, words in re.findall(r"^    (\S+): (.*(?:\n {5,}.*)*)", text, re.M)}
+    return lambda name, **options: sub.add_argument(name, **{"help": helps.get(name), **options})
+
+
 def add_levels(sub: argparse.ArgumentParser) -> None:
-    """Add ``--levels`` of subdivision."""
-    sub.add_argument("--levels", type=int, metavar="L", default=3, help="each interval becomes 2**L (default: 3)")
+    """Add an option of subdivision.
+
+    Options:
+        --levels: how often the number of intervals doubles (default: %(default)s, 8 frames an interval)
+    """
+    adder(sub, add_levels)("--levels", type=int, metavar="L", default=3)
 
 
 def add_modes(sub: argparse.ArgumentParser) -> None:
-    """Add options of `extract_bases`."""
-    add = sub.add_argument
-    add("--modes", dest="n_modes", type=int, default=30, metavar="N", help="modes of each key-frame (default: 30)")
-    add("--method", choices=("auto", "solid", "shell"), default="auto", help="modes of the inside or of the surface")
-    add("--mesher", choices=("auto", "lattice", "tetwild"), default="auto", help="what fills solids with tetrahedra")
+    """Add options of `extract_bases`.
+
+    Options:
+        --modes: elastic modes of each key-frame; 20 to 100 are usual (default: %(default)s)
+        --method: modes of the solid inside, of the surface itself (sheets, thin and open bodies), or what fits
+            (default: %(default)s)
+        --mesher: what fills solids: a lattice of cubes (deterministic), fTetWild, or what fits (default: %(default)s)
+    """
+    add = adder(sub, add_modes)
+    add("--modes", dest="n_modes", type=int, default=30, metavar="N")
+    add("--method", choices=("auto", "solid", "shell"), default="auto")
+    add("--mesher", choices=("auto", "lattice", "tetwild"), default="auto")
 
 
-def add_bones(sub: argparse._ActionsContainer) -> None:
-    """Add ``--bones`` of an animation as GLB."""
-    sub.add_argument("--bones", type=int, metavar="N", help="GLB: a skin of at most N bones (40 are usual)")
+def add_forms(sub: argparse._ActionsContainer) -> None:
+    """Add forms of an animation as GLB.
+
+    Options:
+        --bones: GLB: a skin of at most N bones, a tenth of the size, for engines (40 are usual)
+        --targets: GLB: N principal shapes as morph targets
+    """
+    for name in ("--bones", "--targets"):
+        adder(sub, add_forms)(name, type=int, metavar="N")
 
 
 def add_registration(sub: argparse.ArgumentParser, optional: bool = False) -> None:
-    """Add options of the registration of meshes of different connectivity, with ``--register`` if it is optional."""
+    """Add options of the registration of meshes of different connectivity; ``--register`` if it is optional.
+
+    Options:
+        --register: the meshes have different connectivity: lay the first onto the others
+        --landmarks: lines of vertex numbers, counted from 0, or of coordinates: a column for each mesh
+        --across: the meshes are different subjects
+    """
+    add = adder(sub, add_registration)
     if optional:
-        sub.add_argument("--register", action="store_true", help="the meshes have different connectivity")
-    text = "lines of vertex numbers, counted from 0, or of coordinates: a column for each mesh"
-    sub.add_argument("--landmarks", type=Path, metavar="FILE", help=text)
-    sub.add_argument("--across", dest="same_subject", action="store_false", help="the meshes are different subjects")
+        add("--register", action="store_true")
+    add("--landmarks", type=Path, metavar="FILE")
+    add("--across", dest="same_subject", action="store_false")
 
 
 def add_cache(sub: argparse.ArgumentParser) -> None:
-    """Add ``--no-cache``, for tetrahedra, modes and registrations."""
-    sub.add_argument("--no-cache", dest="cache", action="store_false", help="neither read nor write the cache")
+    """Add an option for tetrahedra, modes and registrations.
+
+    Options:
+        --no-cache: neither read the cache (the folder TORCH_MODAL_CACHE, or the user's cache folder) nor write to it
+    """
+    adder(sub, add_cache)("--no-cache", dest="cache", action="store_false")
 
 
 def pick_options(args: argparse.Namespace, *names: str) -> dict[str, Any]:

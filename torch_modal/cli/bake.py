@@ -5,20 +5,28 @@ from pathlib import Path
 
 from torch_modal.cli import arguments
 from torch_modal.cli.arguments import pick_options
-from torch_modal.io.formats import ANIMATION_FORMATS, check_bones
+from torch_modal.io.formats import ANIMATION_FORMATS, check_forms
 from torch_modal.io.write import check_suffix
 
 
 def add_arguments(sub: argparse.ArgumentParser) -> None:
-    """Add the arguments of ``bake``."""
-    add = sub.add_argument
-    add("meshes", nargs="+", type=Path, metavar="MESH", help="meshes in order, a folder, an animated GLB, or an NPZ")
+    """Add the arguments of ``bake``.
+
+    Options:
+        meshes: meshes in their order, a folder or a quoted pattern of them, an animated GLB, or an NPZ file
+        --fps: frames a second (default: as in the file, or 24)
+        --cyclic: the last frame leads on to the first
+        --smooth: take out trembling: what has a period of X frames is halved, what is slower hardly changes
+        --every: keep each N-th frame and the last as key-frames, and fill in a smooth path through them
+    """
+    add = arguments.adder(sub, add_arguments)
+    add("meshes", nargs="+", type=Path, metavar="MESH")
     add("--out", type=Path, required=True, metavar="FILE", help=f"the file: {', '.join(ANIMATION_FORMATS)}")
-    arguments.add_bones(sub)
-    add("--fps", type=float, metavar="X", help="frames a second (default: as in the file, or 24)")
-    add("--cyclic", action="store_true", help="the last frame leads on to the first")
-    add("--smooth", type=float, metavar="X", help="halve what trembles with a period of X frames")
-    add("--every", type=int, metavar="N", help="keep each N-th frame and the last, and a smooth path through them")
+    arguments.add_forms(sub)
+    add("--fps", type=float, metavar="X")
+    add("--cyclic", action="store_true")
+    add("--smooth", type=float, metavar="X")
+    add("--every", type=int, metavar="N")
     arguments.add_registration(sub, optional=True)
     arguments.add_cache(sub)
 
@@ -26,8 +34,8 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> None:
     """Make one animated or skinned file of a sequence of meshes.
 
-    Write the frames of a motion as one file that plays: as a skin of bones, as a morph target
-    for each frame, as USD, a point cache or a video.
+    Write the frames of a motion as one file that plays: as a skin of bones, as principal
+    shapes, as a morph target for each frame, as USD, a point cache or a video.
 
     Errors are root mean square distances from the frames, in % of the diagonal of the first;
     half-way, from the mean of both after their turns. Materials and textures come from the first mesh.
@@ -43,7 +51,7 @@ def run(args: argparse.Namespace) -> None:
     if args.every is not None and args.every < 2:
         args.fail(f"--every must be 2 or more; got {args.every}")
     check_suffix(args.out, ANIMATION_FORMATS)
-    check_bones(args.out, args.bones)
+    check_forms(args.out, args.bones, args.targets)
 
     import torch
 
@@ -80,7 +88,7 @@ def run(args: argparse.Namespace) -> None:
     asset = None if files[0].suffix.lower() == ".npz" else tm.open_asset(files[0])
     if asset is not None:
         asset.carries.pop("posing", None)  # it is what is written
-    options = pick_options(args, "cyclic", "overwrite", "progress")
+    options = pick_options(args, "cyclic", "overwrite", "targets", "progress")
     tm.save_animation(frames, faces, args.out, fps, bones=skin, asset=asset, **options)
     bones = f", {skin.weights.shape[1]} bones" if skin else ""
     args.report(f"animation: {args.out}, {args.out.stat().st_size / 1e6:.2f} MB{bones}")

@@ -6,7 +6,7 @@ import warnings
 from pathlib import Path
 
 from torch_modal.cli import arguments, subdivide
-from torch_modal.cli.arguments import check_output, pick_options
+from torch_modal.cli.arguments import adder, check_output, pick_options
 from torch_modal.io.formats import MESH_FORMATS, PICTURES
 from torch_modal.io.write import check_suffix
 
@@ -16,10 +16,17 @@ CROSSES = 3  # exit status of `check` when parts newly pass through each other
 
 
 def add_register(sub: argparse.ArgumentParser) -> None:
-    """Add the arguments of ``register``."""
-    sub.add_argument("meshes", nargs=2, type=Path, metavar="MESH", help="the template, and the target")
-    sub.add_argument("--out", type=Path, required=True, metavar="FILE", help=f"the result: {', '.join(MESH_FORMATS)}")
-    sub.add_argument("--keep-doubtful", action="store_true", help="write a doubtful result too, with a warning")
+    """Add the arguments of ``register``.
+
+    Options:
+        meshes: the template, and the target
+        --keep-doubtful: write a doubtful result too, with a warning
+    """
+    add = adder(sub, add_register)
+    add("meshes", nargs=2, type=Path, metavar="MESH")
+    text = f"the template laid onto the target, {', '.join(MESH_FORMATS)}"
+    add("--out", type=Path, required=True, metavar="FILE", help=text)
+    add("--keep-doubtful", action="store_true")
     arguments.add_registration(sub)
     arguments.add_cache(sub)
 
@@ -60,13 +67,21 @@ def register(args: argparse.Namespace) -> None:
 
 
 def add_check(sub: argparse.ArgumentParser) -> None:
-    """Add the arguments of ``check``."""
-    add = sub.add_argument
-    add("meshes", nargs="+", type=Path, metavar="MESH", help="meshes of one connectivity")
-    add("--keyframes", nargs="+", type=Path, default=[], metavar="FILE", help="meshes whose own crossings are known")
-    add("--between", action="store_true", help="check seven shapes between any two, and the energy of the motion")
-    add("--contact", action="store_true", help="with --between: keep parts from passing through each other")
-    add("--picture", type=Path, metavar="FILE", help="draw the meshes with crossings in colour, as .png or .pdf")
+    """Add the arguments of ``check``.
+
+    Options:
+        meshes: meshes of one connectivity
+        --keyframes: meshes whose own crossings are known
+        --between: check the motion through the meshes: seven shapes between any two, with its shell energy and seconds
+        --contact: with --between: keep parts from passing through each other
+        --picture: draw the meshes with crossings in colour, as .png or .pdf
+    """
+    add = adder(sub, add_check)
+    add("meshes", nargs="+", type=Path, metavar="MESH")
+    add("--keyframes", nargs="+", type=Path, default=[], metavar="FILE")
+    add("--between", action="store_true")
+    add("--contact", action="store_true")
+    add("--picture", type=Path, metavar="FILE")
 
 
 def check(args: argparse.Namespace) -> int:
@@ -141,11 +156,17 @@ def check(args: argparse.Namespace) -> int:
 
 
 def add_carry(sub: argparse.ArgumentParser) -> None:
-    """Add the arguments of ``carry``."""
-    add = sub.add_argument
-    add("meshes", nargs="+", type=Path, metavar="MESH", help="meshes of one connectivity; the points lie on the first")
-    add("--points", type=Path, required=True, metavar="FILE.ply", help="points, or splats")
-    add("--out", type=Path, required=True, metavar="FOLDER", help="for a PLY file for each mesh")
+    """Add the arguments of ``carry``.
+
+    Options:
+        meshes: meshes of one connectivity; the points lie on the first
+        --points: points, or splats
+        --out: for a PLY file for each mesh
+    """
+    add = adder(sub, add_carry)
+    add("meshes", nargs="+", type=Path, metavar="MESH")
+    add("--points", type=Path, required=True, metavar="FILE.ply")
+    add("--out", type=Path, required=True, metavar="FOLDER")
 
 
 def carry(args: argparse.Namespace) -> None:
@@ -181,9 +202,15 @@ def carry(args: argparse.Namespace) -> None:
 
 
 def add_modes(sub: argparse.ArgumentParser) -> None:
-    """Add the arguments of ``modes``."""
-    sub.add_argument("meshes", nargs="+", type=Path, metavar="MESH", help="key-frames of one connectivity")
-    sub.add_argument("--out", type=Path, required=True, metavar="FILE_OR_FOLDER", help="FILE.safetensors, or a folder")
+    """Add the arguments of ``modes``.
+
+    Options:
+        meshes: key-frames of one connectivity
+        --out: FILE.safetensors for one mesh, or a folder for a file of each mesh's name
+    """
+    add = adder(sub, add_modes)
+    add("meshes", nargs="+", type=Path, metavar="MESH")
+    add("--out", type=Path, required=True, metavar="FILE_OR_FOLDER")
     arguments.add_modes(sub)
     arguments.add_cache(sub)
 
@@ -223,14 +250,23 @@ def modes(args: argparse.Namespace) -> None:
 
 
 def add_precompute(sub: argparse.ArgumentParser) -> None:
-    """Add the arguments of ``precompute``."""
-    add = sub.add_argument
-    add("root", type=Path, metavar="DIR", help="the folder tree with the key-frames")
-    add("--out", type=Path, required=True, metavar="DIR", help="where the bases go")
-    add("--workers", type=int, metavar="N", help="sets at a time (default: one for each processor)")
-    add("--scheduler", metavar="ADDRESS", help="run on the Dask cluster with this scheduler instead")
-    add("--timeout", type=float, metavar="S", default=600.0, help="for a set (default: 600)")
-    add("--sequence", action="store_true", help="meshes of a folder are a motion, perhaps with a file times.txt")
+    """Add the arguments of ``precompute``.
+
+    Options:
+        root: the folder tree with the key-frames
+        --out: where the bases go
+        --workers: sets at a time, each in a process with one thread (default: one for each processor)
+        --scheduler: run on the Dask cluster with this scheduler instead
+        --timeout: for a set (default: 600)
+        --sequence: the meshes of a folder are a motion, in the order of their names, perhaps with a file times.txt
+    """
+    add = adder(sub, add_precompute)
+    add("root", type=Path, metavar="DIR")
+    add("--out", type=Path, required=True, metavar="DIR")
+    add("--workers", type=int, metavar="N")
+    add("--scheduler", metavar="ADDRESS")
+    add("--timeout", type=float, metavar="S", default=600.0)
+    add("--sequence", action="store_true")
     arguments.add_modes(sub)
 
 
@@ -266,10 +302,15 @@ def precompute(args: argparse.Namespace) -> int:
 
 
 def add_demo(sub: argparse.ArgumentParser) -> None:
-    """Add the arguments of ``demo``."""
-    add, folder = sub.add_argument, Path("torch-modal-demo")
-    add("--out", type=Path, default=folder, metavar="FOLDER", help="where the files go (default: %(default)s)")
-    add("--sample", choices=DEMO_SAMPLES, help="only this one (default: both)")
+    """Add the arguments of ``demo``.
+
+    Options:
+        --out: where the files go (default: %(default)s)
+        --sample: only this one (default: both)
+    """
+    add = adder(sub, add_demo)
+    add("--out", type=Path, default=Path("torch-modal-demo"), metavar="FOLDER")
+    add("--sample", choices=DEMO_SAMPLES)
     arguments.add_levels(sub)
 
 

@@ -8,18 +8,22 @@ from typing import Any
 
 from torch_modal.cli import arguments
 from torch_modal.cli.arguments import pick_options
-from torch_modal.io.formats import ANIMATION_FORMATS, MESH_FORMATS, PICTURES, Timing, check_bones
+from torch_modal.io.formats import ANIMATION_FORMATS, MESH_FORMATS, PICTURES, Timing, check_forms
 from torch_modal.io.write import check_suffix
 
 ANIMATION = ("cyclic", "duration", "fps", "ping_pong", "ease")
 
 
 def add_output(sub: argparse.ArgumentParser, picture: str) -> None:
-    """Add ``--out``, ``--format`` and ``--picture`` of a sequence."""
-    add = sub.add_argument
+    """Add ``--out``, ``--format`` and ``--picture`` of a sequence.
+
+    Options:
+        --format: format of the numbered frames (default: as the first mesh, with everything else in its file)
+    """
+    add = arguments.adder(sub, add_output)
     text = f"the animation alone: {', '.join(ANIMATION_FORMATS)}; a folder: numbered frames and animation.glb"
     add("--out", type=Path, required=True, metavar="FILE_OR_FOLDER", help=text)
-    add("--format", choices=[suffix[1:] for suffix in MESH_FORMATS], help="of the frames (default: the first mesh's)")
+    add("--format", choices=[suffix[1:] for suffix in MESH_FORMATS])
     add("--picture", type=Path, metavar="FILE", help=f"also draw {picture}, .png or .pdf")
 
 
@@ -54,24 +58,40 @@ def write_sequence(
 
 
 def add_arguments(sub: argparse.ArgumentParser) -> None:
-    """Add the arguments of ``subdivide``."""
-    add = sub.add_argument
-    add("meshes", nargs="+", type=Path, metavar="MESH", help="key-frames, two or more, in their order")
+    """Add the arguments of ``subdivide``.
+
+    Options:
+        meshes: key-frames, two or more, in their order
+        --frames: of the result (default: by the levels)
+        --cyclic: the last key-frame leads on to the first
+        --times: times of the key-frames, ascending, in any unit; of a cycle, also the time when it begins again
+        --no-smooth: interpolate each pair of key-frames alone, without its neighbours in time
+        --contact: keep parts from passing through each other (extra contact)
+        --proxy: a coarser mesh of N vertices moves and carries the detail; 0: none (default: 20000 for large meshes)
+        --preset: accurate; fast, without steps on the fine mesh; paper, its method whole (default: %(default)s)
+        --duration: of the sequence once (default: 1 for a cycle, 2 for two key-frames, 1 an interval of more)
+        --fps: frames a second; with --duration, pictures or samples a second of videos and point caches (default: 24)
+        --ping-pong: there and back again
+        --ease: slow at both ends
+    """
+    add = arguments.adder(sub, add_arguments)
+    add("meshes", nargs="+", type=Path, metavar="MESH")
     add_output(sub, "the sequence next to linear interpolation")
     arguments.add_levels(sub)
-    add("--frames", dest="n_frames", type=int, metavar="N", help="of the result (default: by the levels)")
-    add("--cyclic", action="store_true", help="the last key-frame leads on to the first")
-    add("--times", nargs="+", type=float, metavar="T", help="of the key-frames; of a cycle, also when it begins again")
-    add("--no-smooth", dest="smooth", action="store_const", const=False, help="interpolate each pair alone")
-    add("--contact", action="store_true", help="keep parts from passing through each other (extra contact)")
-    add("--proxy", type=int, metavar="N", help="vertices of a coarser mesh that moves large ones; 0: none")
-    add("--preset", choices=("accurate", "fast", "paper"), default="accurate", help="(default: accurate)")
+    add("--frames", dest="n_frames", type=int, metavar="N")
+    add("--cyclic", action="store_true")
+    add("--times", nargs="+", type=float, metavar="T")
+    add("--no-smooth", dest="smooth", action="store_const", const=False)
+    add("--contact", action="store_true")
+    add("--proxy", type=int, metavar="N")
+    add("--preset", choices=("accurate", "fast", "paper"), default="accurate")
     group = sub.add_argument_group("animation")
-    group.add_argument("--duration", type=float, metavar="SECONDS", help="of the sequence once")
-    group.add_argument("--fps", type=float, metavar="X", help="frames, or samples of videos and caches, a second")
-    group.add_argument("--ping-pong", action="store_true", help="there and back again")
-    group.add_argument("--ease", action="store_true", help="slow at both ends")
-    arguments.add_bones(group)
+    add = arguments.adder(group, add_arguments)
+    add("--duration", type=float, metavar="SECONDS")
+    add("--fps", type=float, metavar="X")
+    add("--ping-pong", action="store_true")
+    add("--ease", action="store_true")
+    arguments.add_forms(group)
     arguments.add_registration(sub, optional=True)
     arguments.add_modes(sub)
     arguments.add_cache(sub)
@@ -98,7 +118,7 @@ def run(args: argparse.Namespace) -> None:
     if len(args.meshes) < 2:
         args.fail("subdivide needs two key-frames or more")
     animation = check_files(args, args.meshes)
-    check_bones(animation, args.bones)
+    check_forms(animation, args.bones, args.targets)
     Timing(len(args.meshes), **pick_options(args, *ANIMATION))
 
     import torch_modal as tm
@@ -121,7 +141,7 @@ def run(args: argparse.Namespace) -> None:
     frames[keys] = keyframes
     seams = f", {welded.n_merged} of them copies along seams" if welded.n_merged else ""
     args.report(f"{n} key-frames of {keyframes.shape[1]} vertices{seams} -> {len(frames)} frames")
-    options = pick_options(args, "cyclic", "duration", "ping_pong", "ease", "bones")
+    options = pick_options(args, "cyclic", "duration", "ping_pong", "ease", "bones", "targets")
     write_sequence(args, animation, frames, faces, asset, keyframe_indices=keys, times=when, **options)
     if args.picture:
         rows = {"torch_modal": frames, "linear": tm.linear_sequence(keyframes, places)}

@@ -36,11 +36,14 @@ def write_npz(animation: Animation, path: Path) -> None:
 def write_usd(animation: Animation, path: Path) -> None:
     """Write USD by ``usd-core``: one mesh with positions at the times of the frames, linear between them.
 
-    A time code is one frame of the timing. The suffix ``.usda`` is text, the others are binary.
+    A time code is one frame of the timing. Polygons, texture coordinates and colours come from the asset. The suffix
+    ``.usda`` is text, the others are binary.
     """
-    from pxr import Gf, Usd, UsdGeom, Vt
+    from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 
-    faces, timing = animation.faces, animation.timing
+    shapes, faces, timing, asset = animation.shapes, animation.faces, animation.timing, animation.asset
+    triangles = np.full(len(faces), 3), faces.reshape(-1), None
+    sizes, corners, texcoords = triangles if asset is None else asset.polygons()
     times, shown = timing.knots()
     codes = times * timing.fps
     stage: Any = Usd.Stage.CreateNew(str(path))
@@ -49,16 +52,29 @@ def write_usd(animation: Animation, path: Path) -> None:
     stage.SetFramesPerSecond(timing.fps)
     stage.SetStartTimeCode(0.0)
     stage.SetEndTimeCode(float(codes[-1]))
-    stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, "/sequence").GetPrim())
+    root = UsdGeom.Xform.Define(stage, "/sequence")
+    stage.SetDefaultPrim(root.GetPrim())
     mesh = UsdGeom.Mesh.Define(stage, "/sequence/mesh")
     mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
-    mesh.CreateFaceVertexCountsAttr([3] * len(faces))
-    mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(faces.reshape(-1).astype(np.int32)))
-    mesh.CreateDisplayColorPrimvar(UsdGeom.Tokens.constant).Set([Gf.Vec3f(*CLAY[:3])])
+    mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(sizes.astype(np.int32)))
+    mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(corners.astype(np.int32)))
+    single = shapes.astype(np.float32)
     points, extent = mesh.CreatePointsAttr(), mesh.CreateExtentAttr()
     for code, number in zip(codes.tolist(), shown.tolist(), strict=True):
         at = Usd.TimeCode(code) if len(codes) > 1 else Usd.TimeCode.Default()
-        place = Vt.Vec3fArray.FromNumpy(animation.shapes[number].astype(np.float32))
+        place = Vt.Vec3fArray.FromNumpy(single[number])
         points.Set(place, at)
         extent.Set(UsdGeom.PointBased.ComputeExtent(place), at)
+    primvars = UsdGeom.PrimvarsAPI(mesh)
+    if texcoords is not None:
+        st = primvars.CreatePrimvar("st", Sdf.ValueTypeNames.TexCoord2fArray, UsdGeom.Tokens.faceVarying)
+        st.Set(Vt.Vec2fArray.FromNumpy(texcoords.astype(np.float32)))
+    colors = None
+    if asset is not None and "colors" in asset.carries:
+        colors = np.ones((shapes.shape[1], 3), np.float32)
+        for part in asset.parts():
+            if part.colors is not None:
+                colors[part.vertices] = part.colors[:, :3]
+    shade = mesh.CreateDisplayColorPrimvar(UsdGeom.Tokens.constant if colors is None else UsdGeom.Tokens.vertex)
+    shade.Set([Gf.Vec3f(*CLAY[:3])] if colors is None else Vt.Vec3fArray.FromNumpy(colors))
     stage.GetRootLayer().Save()

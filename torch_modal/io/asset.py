@@ -96,6 +96,15 @@ class Asset(ABC):
         """The surface with its materials, for other formats."""
         return [Part(np.arange(len(self.positions)), self.faces, Material())]
 
+    def polygons(self) -> tuple[IntArray, IntArray, FloatArray | None]:
+        """Polygons for formats that hold them; triangles, if the file's polygons are not known.
+
+        Returns:
+            Number of corners of each; vertices of the corners, one polygon after the other; their texture coordinates,
+            origin at the lower left, where all have them. *Shape:* ``(P,), (n,), (n, 2)``.
+        """
+        return np.full(len(self.faces), 3), self.faces.reshape(-1), None
+
     @property
     def companions(self) -> dict[str, bytes]:
         """Files that a copy needs in its folder, by their names there: material libraries, textures."""

@@ -67,7 +67,8 @@ ANIMATION_FORMATS: dict[str, OutputFormat] = {
     ".mp4": OutputFormat("torch_modal.view.animation:write_mp4", FEATURES, ("imageio", "imageio_ffmpeg"), "video"),
     ".gif": OutputFormat("torch_modal.view.animation:write_gif", FEATURES),
     **dict.fromkeys(
-        (".usd", ".usda", ".usdc"), OutputFormat("torch_modal.io.animations:write_usd", (), ("pxr",), "usd")
+        (".usd", ".usda", ".usdc"),
+        OutputFormat("torch_modal.io.animations:write_usd", ("polygons", "texcoords", "colors"), ("pxr",), "usd"),
     ),
     **dict.fromkeys((".mdd", ".pc2"), OutputFormat("torch_modal.io.animations:write_point_cache", FEATURES)),
     ".npz": OutputFormat("torch_modal.io.animations:write_npz", FEATURES),
@@ -77,10 +78,10 @@ PICTURES = (".png", ".pdf")
 PAGES = (".html", ".htm")
 
 
-def check_bones(path: Path, bones: object) -> None:
-    """Raise a ValueError for bones in another format than GLB."""
-    if bones is not None and path.suffix.lower() != ".glb":
-        raise ValueError(f"bones are for .glb files, got {path.name!r}")
+def check_forms(path: Path, bones: object, targets: object) -> None:
+    """Raise a ValueError for two forms of a GLB, or for a form of another format."""
+    if (bones, targets) != (None, None) and (path.suffix.lower() != ".glb" or None not in (bones, targets)):
+        raise ValueError(f"{path.name!r}: bones and targets are two forms of a .glb file; other formats hold neither")
 
 
 class Timing:
@@ -176,3 +177,5 @@ class Animation(NamedTuple):
     progress: Progress
     skin: Skin | None = None
     """The motion as bones, instead of morph targets."""
+    targets: int | None = None
+    """Number of principal shapes, instead of a morph target for each frame."""

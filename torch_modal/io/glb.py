@@ -17,6 +17,7 @@ from torch_modal.io.gltf_asset import GltfAsset
 from torch_modal.io.normals import carry_together
 
 MANY_TARGETS = 64
+SMALLEST_EXTENT = 1e-30  # instead of zero, where shapes do not move
 
 
 def glb_bytes(vertices: FloatArray, faces: IntArray, asset: Asset | None) -> bytes:
@@ -25,16 +26,21 @@ def glb_bytes(vertices: FloatArray, faces: IntArray, asset: Asset | None) -> byt
 
 
 def write_glb(animation: Animation, path: Path) -> None:
-    """Write an animation as frame 0 and a morph target for each further frame, or as a skin.
+    """Write an animation as frame 0 and a morph target for each further frame, as a skin, or as principal shapes.
 
     An asset that is a GLB or GLTF file also contributes its nodes and everything else.
     """
     shapes, asset, timing, keyframes = animation.shapes, animation.asset, animation.timing, animation.keyframes
-    skin, name = animation.skin, animation.name
-    if skin is None and len(shapes) > MANY_TARGETS:
-        message = f"{name} has {len(shapes) - 1} morph targets, which players hold in memory; bones are smaller"
-        warnings.warn(message, stacklevel=3)
-    drawn = shapes if skin is None else skin.rest[None].double().cpu().numpy()
+    skin, n_targets, name = animation.skin, animation.targets, animation.name
+    if skin is not None:
+        drawn, weights = skin.rest[None].double().cpu().numpy(), np.empty((len(shapes), 0))
+    elif n_targets:
+        drawn, weights = _principal(shapes, n_targets)
+    else:
+        drawn, weights = shapes, np.eye(len(shapes))[:, 1:]  # frame n is the target n - 1 alone
+        if len(shapes) > MANY_TARGETS:
+            count = f"{len(shapes) - 1} morph targets, which players hold in memory"
+            warnings.warn(f"{name} has {count}; bones or targets are smaller", stacklevel=3)
     if isinstance(asset, GltfAsset):
         document = asset.rebuild(drawn)
     else:
@@ -49,10 +55,10 @@ def write_glb(animation: Animation, path: Path) -> None:
         if skin is not None:
             samplers, channels = _add_skin(document, skin, asset, inputs, shown)
         else:
-            rows = np.eye(len(shapes))[shown, 1:]  # frame n is the target n - 1 alone
+            rows = weights[shown]
             outputs = document.add(rows.astype(np.float32).reshape(-1), "SCALAR")
             samplers = [{"input": inputs, "output": outputs, "interpolation": "LINEAR"}]
-            names = [f"frame-{n:03d}" for n in range(1, len(drawn))]
+            names = [f"principal-{n}" if n_targets else f"frame-{n:03d}" for n in range(1, len(drawn))]
             for mesh in document.get("meshes"):
                 mesh["weights"] = rows[0].tolist()
                 mesh["extras"] = {**mesh.get("extras", {}), "targetNames": names}
@@ -61,6 +67,21 @@ def write_glb(animation: Animation, path: Path) -> None:
         played = {"name": "sequence", "samplers": samplers, "channels": channels, "extras": extras}
         document.append("animations", played)
     path.write_bytes(document.to_glb())
+
+
+def _principal(shapes: FloatArray, n: int) -> tuple[FloatArray, FloatArray]:
+    """A base shape, the base plus each of the first n principal shapes, and their weights in the frames, from 0 to 1.
+
+    Blender clamps weights to this range, so the base is the mean plus the least part of each shape. *Shape:*
+    ``(N, V, 3) -> (1 + n, V, 3), (N, n)``; n is smaller where fewer give the frames exactly.
+    """
+    mean = shapes.mean(0)
+    vectors, sizes, components = np.linalg.svd((shapes - mean).reshape(len(shapes), -1), full_matrices=False)
+    n = min(n, int((sizes >= 1e-7 * sizes[0]).sum()))
+    vectors, parts = vectors[:, :n], (sizes[:n, None] * components[:n]).reshape(n, *mean.shape)
+    low, extent = vectors.min(0), np.maximum(np.ptp(vectors, axis=0), SMALLEST_EXTENT)
+    base = mean + np.tensordot(low, parts, 1)
+    return np.concatenate([base[None], base + extent[:, None, None] * parts]), (vectors - low) / extent
 
 
 def _add_skin(

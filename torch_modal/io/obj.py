@@ -137,6 +137,12 @@ class ObjAsset(Asset):
         return self._library_content[1]
 
     # --------------------------------------------------------------------------------------------- for other formats
+    def polygons(self) -> tuple[IntArray, IntArray, FloatArray | None]:
+        """The faces with their texture coordinates."""
+        texcoords = self._corners[:, 1]
+        known = (texcoords >= 0).all()
+        return self._sizes, self._corners[:, 0], self._texcoords[texcoords] if known else None
+
     def parts(self) -> list[Part]:
         """A part for each material that faces use."""
         colors = None if self._colors is None else linear_rgba(self._colors)

@@ -11,7 +11,7 @@ from torch_modal.arrays import Array
 from torch_modal.geometry.skin import Skin
 from torch_modal.io.asset import Asset
 from torch_modal.io.files import atomic_write
-from torch_modal.io.formats import ANIMATION_FORMATS, Animation, Timing, check_bones, resample
+from torch_modal.io.formats import ANIMATION_FORMATS, Animation, Timing, check_forms, resample
 from torch_modal.io.write import check_frames, check_indices, check_suffix, refuse_existing
 from torch_modal.motion.skin import bake
 from torch_modal.progress import Progress, ProgressReport
@@ -36,6 +36,7 @@ def save_animation(
     times: Sequence[float] | None = None,
     asset: Asset | None = None,
     bones: int | Skin | None = None,
+    targets: int | None = None,
     progress: Progress = None,
 ) -> Path:
     """Write the sequence as one file that plays.
@@ -44,7 +45,8 @@ def save_animation(
     neighbouring frames. glTF calls Y up and metres the unit; the caller's coordinates are written as they are
     (float32), so a Z-up sequence lies on its back there. Normals move with the shape. ``.usd``, ``.usda`` and ``.usdc``
     (extra ``usd``) hold the points over time in the same manner. A GLB with ``bones`` holds a skin instead
-    (:func:`torch_modal.bake`), a tenth of the size, with which every engine plays.
+    (:func:`torch_modal.bake`), a tenth of the size, with which every engine plays; with ``targets``, the mean and a few
+    principal shapes.
 
     ``.mp4`` (extra ``video``) and ``.gif`` are drawn. ``.mdd`` and ``.pc2`` are point caches, for a mesh that is
     already in Blender, Maya or Houdini. ``.npz`` holds ``frames``, ``faces``, ``times`` and ``keyframes`` as arrays.
@@ -67,8 +69,9 @@ def save_animation(
         times: Times of the frames, in any unit (:func:`torch_modal.frame_times`); of a cycle, also the time when it
             begins again. Default: evenly spaced. The duration does not change.
         asset: The mesh file that the frames come from (:func:`torch_modal.open_asset`). GLB gets its materials,
-            textures, texture coordinates, colours and normals.
+            textures, texture coordinates, colours and normals, USD its polygons, texture coordinates and colours.
         bones: Most bones of a skin, or a skin of these frames. GLB alone.
+        targets: Principal shapes, as the only morph targets; they give the frames approximately. GLB alone.
         progress: A bar while a video is drawn: see :data:`torch_modal.progress.Progress`.
 
     Returns:
@@ -84,7 +87,9 @@ def save_animation(
     """
     shapes, triangles = check_frames(frames, faces)
     path = Path(out)
-    check_bones(path, bones)
+    check_forms(path, bones, targets)
+    if targets is not None and not (isinstance(targets, int) and 1 <= targets < len(shapes)):
+        raise ValueError(f"targets must be a whole number, 1 to {len(shapes) - 1} of these frames; got {targets!r}")
     suffix = check_suffix(path, ANIMATION_FORMATS)
     if asset is not None:
         asset.check(shapes, path, ANIMATION_FORMATS[suffix].holds)
@@ -105,7 +110,7 @@ def save_animation(
             raise ValueError(f"bones is a skin of {n} other frames than these {len(shapes)}; bake these")
         skin = replace(skin, transforms=skin.transforms[: len(shapes)])
     path.parent.mkdir(parents=True, exist_ok=True)
-    animation = Animation(shapes, triangles, timing, path.name, keyframes, asset, progress, skin)
+    animation = Animation(shapes, triangles, timing, path.name, keyframes, asset, progress, skin, targets)
     with atomic_write(path, suffix) as temporary:
         ANIMATION_FORMATS[suffix].write(animation, temporary)
     return path
