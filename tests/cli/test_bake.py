@@ -126,6 +126,4 @@ def test_nothing_is_overwritten_and_one_shape_is_no_motion(
     assert "must end in" in fails(capsys, *bake, str(tmp_path / "b.obj"))
     assert "two forms of a .glb file" in fails(capsys, *bake, "b.usda", "--bones", "3")
     assert "smooth must be a positive number" in fails(capsys, *bake, "b.glb", "--smooth", "0", "--quiet")
-        capsys, *bake, "b.glb", "--smooth", "0", "--quiet"
-    )
     assert "pass register=True (--register)" in fails(capsys, *bake, "b.glb", "--across")
