@@ -243,6 +243,12 @@ def kernel_functions() -> KernelFunctions:
             result = wp.matrix_from_rows(to_e, wp.cross(to_n1, e) + to_part_a * e, wp.cross(e, to_n2) + to_part_b * e)
         return result
 
+    @wp.func_grad(linearise)
+    def linearise_adjoint(x: mat33, to_phase: vec2, to_gradient: mat33):
+        q, g = linearise(x)
+        along = q[0] * to_phase[1] - q[1] * to_phase[0]
+        wp.adjoint[x] += hessian_product(x, to_gradient) + along * g
+
     @wp.func
     def weight(x: mat33, q: vec2, mean: real):
         e = x[0]  # without hinge_of(), whose adjoint would be computed, too

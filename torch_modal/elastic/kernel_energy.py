@@ -210,11 +210,16 @@ class Pass(nn.Module):
         self.register_buffer("elements", elements, persistent=False)
         self.register_buffer("own", None if own is None else own.int(), persistent=False)
 
-    def launch(self, name: str, dim: int, *arguments: Any) -> None:
-        """Run a kernel over the elements of so many samples."""
-        kernels = of_elements("convex", self.term.functions, self.rider and self.rider.functions)
-        first = self.elements, self.own, self.n_own
-        launch(getattr(kernels, name), (dim, self.n_elements), [*first, *arguments])
+    def launch(self, name: str, dim: int, *arguments: Any, adjoints: Sequence[Tensor | None] = ()) -> None:
+        """Run a kernel over the elements of so many samples, or its adjoint."""
+        functions = self.term.functions, self.rider and self.rider.functions
+        kernel = getattr(of_elements("convex_adjoint" if adjoints else "convex", *functions), name)
+        arguments = self.elements, self.own, self.n_own, *arguments
+        launch(kernel, (dim, self.n_elements), arguments, adjoints and [None] * 3 + [*adjoints])
+
+    def records(self, records: Sequence[Tensor]) -> tuple[Tensor, Tensor | None]:
+        """The records of the term and the rider."""
+        return records[self.number], None if self.other is None else records[self.other]
 
 
 def _passes(parts: Sequence[KernelTerm], n_vertices: int) -> list[Pass]:
@@ -285,8 +290,9 @@ class KernelEnergy(nn.Module):
         diagonal = x.new_zeros(*x.shape[:2], 6) if order > 1 else None
         for one in self.passes:
             pass_factors = [x.new_empty(len(x), *size) if order > 1 and size else None for size in one.sizes]
-            records = to.records[one.number], None if one.other is None else to.records[one.other]
-            one.launch("linearise", len(x), x.shape[1], x, *records, energy, gradient, diagonal, *pass_factors)
+            one.launch(
+                "linearise", len(x), x.shape[1], x, *one.records(to.records), energy, gradient, diagonal, *pass_factors
+            )
             factors.append(pass_factors)
         if not self.volumes:
             zeros = torch.zeros_like(energy)
@@ -321,7 +327,8 @@ class KernelEnergy(nn.Module):
         to_gradient: Tensor,
         to_x: Tensor,
         to_records: Sequence[Tensor],
-        products: tuple[Tensor, Tensor, Tensor] | None = None,
+        to_diagonal: Tensor | None = None,
+        to_factors: Sequence[Any] | None = None,
         to_normal: Tensor | None = None,
         to_stiffness: Tensor | None = None,
         to_energy: Tensor | None = None,
@@ -330,22 +337,22 @@ class KernelEnergy(nn.Module):
 
         Args:
             x: The shapes. *Shape:* ``(B, V, 3)``.
-            at: The energy there; its diagonal and factors are not read.
+            at: The energy there.
             to: The references.
             to_gradient: In the gradient. *Shape:* ``(B, V, 3)``.
             to_x: Is added to. *Shape:* ``(B, V, 3)``.
             to_records: Are added to.
-            products: What the diagonal receives, the fields of conjugate gradients, and what their products receive.
+            to_diagonal: In the blocks of the diagonal. *Shape:* ``(B, V, 6)``.
+            to_factors: In the factors of products.
             to_normal: In the volume's gradient beyond that. *Shape:* ``(B, V, 3)``.
             to_stiffness: In the volume's stiffness. *Shape:* ``(B,)``.
             to_energy: In the energy. *Shape:* ``(B,)``.
         """
         b, n = x.shape[:2]
-        to_diagonal, fields, pushed = products or (None, None, None)
-        n_products = 0 if pushed is None else len(pushed)
-        for i in self.terms:
-            arguments = n, x, to.records[i], to_energy, to_gradient, to_diagonal, fields, pushed, b, n_products
-            self.parts[i].launch("linearise", b, *arguments, to_x, to_records[i], back=True)
+        for one, factors, received in zip(self.passes, at.factors, to_factors or at.factors, strict=True):
+            values = n, x, *one.records(to.records), at.value, at.gradient, at.diagonal, *factors
+            adjoints = None, to_x, *one.records(to_records), to_energy, to_gradient, to_diagonal, *received
+            one.launch("linearise", b, *values, adjoints=adjoints)
         if not self.volumes:
             return
         i = self.volumes[0]

@@ -163,6 +163,7 @@ class _Relaxation(Operation):
         module, (b, n), n_products = kernels("steps_adjoint"), x.shape[:2], fields.shape[1]
         values = at.normal, inverse, at.stiffness, fields, scalars
         to_normal, to_inverse, to_stiffness, to_fields, to_scalars = map(torch.zeros_like, values)
+        to_factors = [[x if x is None else torch.zeros_like(x) for x in factors] for factors in at.factors]
         for k in reversed(range(n_products)):
             common, received = (k, n_products, n, fields, scalars), (None, None, None, to_fields, to_scalars)
             if k < n_products - 1:
@@ -170,19 +171,18 @@ class _Relaxation(Operation):
                 launch(module.turn, (b, n), turned, [to_normal, to_inverse, None, *received])
             moved = at.normal, inverse, at.stiffness, *common, solution
             launch(module.advance, (b, n), moved, [to_normal, to_inverse, to_stiffness, *received, to_solution])
-            # The product with the Hessian, which is its own adjoint, and its product with the direction.
-            to_form = to_scalars[k, :, 2, None, None]
-            to_fields[1, k].addcmul_(to_form, fields[2, k])
-            to_fields[2, k].addcmul_(to_form, fields[1, k])
-            first = k * b * n, (n_products + k) * b * n, (2 * n_products + k) * b * n
-            self.kernels.product(at.factors, (b, n), to_fields, first[2], to_fields, first[1])
+            first, out = ((kind * n_products + k) * b * n for kind in (1, 2))
+            for one, factors, to_own in zip(self.kernels.passes, at.factors, to_factors, strict=True):
+                values = n, fields, first, *factors, fields, out, scalars, k * b
+                adjoints = None, to_fields, None, *to_own, to_fields, None, to_scalars
+                one.launch("product", b, *values, adjoints=adjoints)
         to_gradient = torch.zeros_like(x) if to_slope is None else to_slope[:, None, None] * solution
         to_diagonal = torch.zeros_like(at.diagonal)
         begun = at.gradient, at.normal, at.diagonal, b, n_products, n, inverse, fields, scalars
         to_begun = to_gradient, to_normal, to_diagonal, None, None, None, to_inverse, to_fields, to_scalars
         launch(module.begin, (b, n), begun, to_begun)
-        products = to_diagonal, fields, to_fields[2]
-        self.kernels.back(x, at, to, to_gradient, to_x, to_records, products, to_normal, to_stiffness, to_energy)
+        further = to_diagonal, to_factors, to_normal, to_stiffness, to_energy
+        self.kernels.back(x, at, to, to_gradient, to_x, to_records, *further)
         return to_x
 
     def _length_back(

@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from torch_modal.elastic.bend import LEAST_FULLNESS
-from torch_modal.elastic.kernels.types import HALF, block, from_square, place, real, symmetric, vec3, wide
+from torch_modal.elastic.kernels.types import block, place, real, symmetric, vec3, wide
 from torch_modal.elastic.term import KernelFunctions
 
 
@@ -44,6 +44,10 @@ def _common(f: KernelFunctions) -> SimpleNamespace:
             wp.atomic_add(out, place(at, q[c + 1]), received[c])
             whole += received[c]
         wp.atomic_add(out, place(at, q[0]), -whole)
+
+    @wp.func_replay(add)
+    def add_nothing(out: wp.array[vec3], at: int, q: corners, received: vectors):
+        """Adjoints of kernels do not add once more."""
 
     @wp.func
     def inner(a: vectors, b: vectors):
@@ -188,7 +192,7 @@ def convex(f: KernelFunctions, rider: KernelFunctions | None) -> SimpleNamespace
     c, potential, other, n, rides = _common(f), f.potential, _rider(rider), f.n, rider is not None
     vectors, corners, edge_vectors, add = c.vectors, c.corners, c.edge_vectors, c.add
     Factors, record = c.Factors, potential.record
-    module = _module(f, "convex" if rider is None else f"convex.{rider.name}")
+    module = _module(f, f"convex.{rider.name if rider else None}")
     kernel = _kernel(f, module) if rider is None or rider.exact else _kernel(rider, module)
 
     @kernel
@@ -233,7 +237,7 @@ def convex(f: KernelFunctions, rider: KernelFunctions | None) -> SimpleNamespace
                     if diagonal:
                         along, across = c.stiffness(m, slope, real(2.0) * to[0])
                         factors[place(s * n_own, at)] = c.factors_of(g, along, across)
-                received[0] = received[0] + ridden
+                received[0] += ridden
                 add(gradient, v, q, received)
                 if diagonal:
                     whole = g[0]
@@ -277,12 +281,22 @@ def convex(f: KernelFunctions, rider: KernelFunctions | None) -> SimpleNamespace
             if at >= 0:
                 received, form = c.product(factors[place(s * n_own, at)], e)
                 total += form
-            received[0] = received[0] + ridden
+            received[0] += ridden
             add(out, out_start + s * n_vertices, q, received)
         if scalars:
             wp.atomic_add(scalars, first + s, vec3(real(0.0), real(0.0), total))
 
     return SimpleNamespace(linearise=linearise, product=product)
+
+
+@cache
+def convex_adjoint(f: KernelFunctions, rider: KernelFunctions | None) -> SimpleNamespace:
+    """Adjoints of :func:`convex`, which Warp generates."""
+    kernels, module = (
+        convex(f, rider),
+        _module(f, "convex_adjoint" if rider is None else f"convex_adjoint.{rider.name}"),
+    )
+    return SimpleNamespace(**{name: wp.kernel(kernel.func, module=module) for name, kernel in vars(kernels).items()})
 
 
 @cache
@@ -400,18 +414,10 @@ def _merge_kernel(f: KernelFunctions, module: "wp.Module") -> dict[str, "wp.Kern
 
 @cache
 def backward(f: KernelFunctions) -> SimpleNamespace:
-    """Adjoints, and second derivatives."""
+    """The adjoint of ``merge``, and second derivatives."""
     c, potential, module, n = _common(f), f.potential, _module(f, "backward"), f.n
-    vectors, corners, edge_vectors, add, inner = c.vectors, c.corners, c.edge_vectors, c.add, c.inner
-    stiffness, record = c.stiffness, potential.record
-    kind, slope_of = potential.kind, potential.slope
-
-    @wp.func
-    def of_measure(m: kind, to: record, to_energy: real, to_slope: real, to_along: real, to_across: real):
-        """Results that follow from the measure, times what each of them receives."""
-        slope = potential.slope(m, to)
-        along, across = stiffness(m, slope, real(2.0) * to[0])
-        return to_energy * potential.energy(m, to) + to_slope * slope + to_along * along + to_across * across
+    vectors, corners, edge_vectors, inner = c.vectors, c.corners, c.edge_vectors, c.inner
+    record, slope_of, hessian_product = potential.record, potential.slope, f.hessian_product
 
     @wp.func
     def of_gradient(e: vectors, received: vectors):
@@ -419,71 +425,12 @@ def backward(f: KernelFunctions) -> SimpleNamespace:
         _m, g = f.linearise(e)
         return inner(g, received)
 
-    hessian_product = f.hessian_product
     if hessian_product is None:
 
         @wp.func
         def hessian_product(e: vectors, received: vectors):
             product, _unused = wp.grad(of_gradient)(e, received)
             return product
-
-    @wp.kernel(module=module)
-    def linearise(
-        elements: wp.array[corners], n_vertices: int, x: wp.array[vec3], rests: wp.array[record],
-        to_total: wp.array[real], to_gradient: wp.array[vec3], to_diagonal: wp.array[symmetric],
-        fields: wp.array[vec3], pushed: wp.array[vec3], n_samples: int, n_products: int, to_x: wp.array[vec3],
-        to_rests: wp.array[record], threads: int,
-    ):  # fmt: skip
-        """Adjoint of ``linearise``, from what energy, gradient and blocks receive, and of the products with factors.
-
-        Those are with directions, the second of three kinds of fields, and each is received by a pushed field.
-        """
-        i = wp.tid()
-        s = i // threads
-        v = s * n_vertices
-        for k in range(i - s * threads, elements.shape[0], threads):
-            q = elements[place(k, 0)]
-            at = place(s * elements.shape[0], k)
-            to = rests[at]
-            e = edge_vectors(x, v, q)
-            d = edge_vectors(to_gradient, v, q)
-            m, g = f.linearise(e)
-            slope = potential.slope(m, to)
-            to_g = slope * d
-            to_along = real(0.0)
-            to_across = real(0.0)
-            if to_diagonal:
-                along, _across = stiffness(m, slope, real(2.0) * to[0])
-                first = vec3()
-                for j in range(wp.static(n)):
-                    first += g[j]
-                received_diagonal = to_diagonal[place(v, q[0])]
-                of_first = from_square(received_diagonal, first)
-                to_along += HALF * wp.dot(of_first, first)
-                to_across += received_diagonal[0] + received_diagonal[3] + received_diagonal[5]
-                for j in range(wp.static(n)):
-                    received_diagonal = to_diagonal[place(v, q[j + 1])]
-                    of_own = from_square(received_diagonal, g[j])
-                    to_along += HALF * wp.dot(of_own, g[j])
-                    to_across += received_diagonal[0] + received_diagonal[3] + received_diagonal[5]
-                    to_g[j] = to_g[j] + along * (of_first + of_own)
-                both = vectors()
-                for p in range(n_products):
-                    direction = edge_vectors(fields, ((n_products + p) * n_samples + s) * n_vertices, q)
-                    push = edge_vectors(pushed, (p * n_samples + s) * n_vertices, q)
-                    rate = inner(g, direction)
-                    rate_of_push = inner(g, push)
-                    to_along += rate * rate_of_push
-                    to_across += inner(direction, push)
-                    both += rate_of_push * direction + rate * push
-                to_g += along * both
-            to_energy = real(0.0)
-            if to_total:
-                to_energy = to_total[s]
-            to_m, received, _0, _1, _2, _3 = wp.grad(of_measure)(m, to, to_energy, inner(g, d), to_along, to_across)
-            to_e = hessian_product(e, to_g) + potential.rate(m, to_m) * g
-            add(to_x, v, q, to_e)
-            to_rests[at] = to_rests[at] + received
 
     @wp.kernel(module=module)
     def hessians(
@@ -508,7 +455,7 @@ def backward(f: KernelFunctions) -> SimpleNamespace:
                 out[place(3 * n * at, j)] = hessian_product(e, unit) + (beyond * g[j // 3, j % 3]) * g
 
     merge = None if f.weight is None else wp.kernel(forward(f).merge.func, module=module)
-    return SimpleNamespace(linearise=linearise, hessians=hessians, merge=merge)
+    return SimpleNamespace(hessians=hessians, merge=merge)
 
 
 @cache

@@ -33,7 +33,7 @@ def make_once(make: Callable[..., Any], *arguments: Any) -> Any:
         return make(*arguments)
 
 
-def of_elements(kind: Literal["convex", "forward", "backward", "curving"], *arguments: Any) -> Any:
+def of_elements(kind: Literal["convex", "convex_adjoint", "forward", "backward", "curving"], *arguments: Any) -> Any:
     """Kernels of a module that one or two terms have, or elements of so many edge vectors."""
     return make_once(getattr(kernels("elements"), kind), *arguments)
 

@@ -43,14 +43,3 @@ def multiply(m: symmetric, g: vec3):
         m[1] * g[0] + m[3] * g[1] + m[4] * g[2],
         m[2] * g[0] + m[4] * g[1] + m[5] * g[2],
     )
-
-
-@wp.func
-def from_square(d: symmetric, g: vec3):
-    """Gradient in a vector of the entries of its square."""
-    two = real(2.0)
-    return vec3(
-        two * d[0] * g[0] + d[1] * g[1] + d[2] * g[2],
-        d[1] * g[0] + two * d[3] * g[1] + d[4] * g[2],
-        d[2] * g[0] + d[4] * g[1] + two * d[5] * g[2],
-    )
