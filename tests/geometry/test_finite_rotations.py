@@ -119,15 +119,4 @@ def test_exp_and_log_have_both_derivatives(function: Callable[[Tensor], Tensor],
     assert gradgradcheck(function, start)
 
 
-@pytest.mark.parametrize("w", [[0.0, 0, 0], [1e-5, -2e-5, 0], [BORDER, 1e-3, 0], [0.2, 1.0, -0.4]])
-def test_third_derivatives_are_those_of_the_matrix_exponential(w: list[float]) -> None:
-    def third(function: Callable[[Tensor], Tensor]) -> Tensor:
-        for _ in range(3):
-            function = torch.func.jacfwd(function)
-        return function(torch.tensor(w, dtype=F64))
-
-    torch.testing.assert_close(third(exp), third(lambda w: torch.linalg.matrix_exp(skew(w))), rtol=0, atol=1e-8)
-    assert float(third(lambda w: log(exp(w))).abs().max()) < 1e-7  # the identity has none
-
-
 # ------------------------------------------------------------------------------------------------------- transforms

@@ -82,16 +82,6 @@ def test_plates_turn_at_constant_speed(degrees: int) -> None:
         torch.testing.assert_close(half_scale, 1.5 * edges(ribbon(0.5 * turn)[0], mesh), rtol=0, atol=1e-12)
 
 
-def test_pieces_have_a_sense_of_their_own() -> None:
-    (x_a, faces), (x_b, _), (x_c, _) = ribbon(0.0), ribbon(math.radians(250)), ribbon(math.radians(-250))
-    both, twice = torch.cat([x_a, x_a + 5]), torch.cat([faces, faces + len(x_a)])
-    moved = torch.cat([x_b, x_c + 5])
-    rotations, mesh = rotations_of(both, moved, twice)
-    found = rotations(*pair(both[None], moved[None], T[2:3]))[:, 0].mT
-    wanted = torch.cat([ribbon(math.radians(125))[0], ribbon(math.radians(-125))[0]])
-    torch.testing.assert_close(found, edges(wanted, mesh), rtol=0, atol=1e-12)
-
-
 @pytest.mark.parametrize("kind", [LocalRotations, WarpRotations])
 @pytest.mark.parametrize(
     ("degrees", "weights", "wanted"),
@@ -254,11 +244,6 @@ def test_derivatives_of_local_rotations_where_little_turns(degrees: float, gener
 @pytest.fixture(scope="module")
 def strip_mesh() -> Connectivity:
     return Connectivity(rectangle(6.0, 1.0, 0.25)[1])
-
-
-def test_below_a_turn_there_are_none(strip_mesh: Connectivity) -> None:
-    assert not LocalRotations(strip_mesh, torch.stack([strip(0), strip(1)])).beyond_a_turn
-    assert LocalRotations(strip_mesh, torch.stack([strip(0), strip(TURNS)])).beyond_a_turn
 
 
 @pytest.mark.parametrize("turns, torn", [(0, False), (1, True)])

@@ -2,7 +2,6 @@
 
 import json
 import re
-import time
 import warnings
 from pathlib import Path
 
@@ -614,14 +613,6 @@ def test_real_data(data_dir, name, n_files, n_vertices, warning):
     else:
         checked = check_keyframes(*loaded)
     assert torch.equal(checked.faces, loaded.faces)
-
-
-def test_large_meshes_are_checked_quickly():
-    ball = trimesh.creation.icosphere(subdivisions=6)
-    keyframes = np.stack([ball.vertices * (1 + 0.1 * k) for k in range(6)])
-    start = time.perf_counter()
-    check_keyframes(keyframes, ball.faces)
-    assert time.perf_counter() - start < 3  # 0.4 s; generous, as machines are shared
 
 
 @pytest.mark.parametrize(

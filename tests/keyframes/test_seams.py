@@ -75,28 +75,6 @@ def test_bad_input_is_refused(keyframes):
         tm.weld_seams(keyframes, [[0, 1, 2]])
 
 
-def test_meshes_of_thousands_come_together_again(data_dir: Path, tmp_path: Path) -> None:
-    """Real shapes with hard edges on every tenth face and a seam, through GLB: the surface that they were made from."""
-    paths = [data_dir / "mh-woman" / f"{name}.obj" for name in ("00-rest", "02-walk-a")]
-    keyframes, faces = (array.numpy() for array in tm.load_keyframes(paths))
-    apart = np.arange(len(faces)) % 10 == 0
-    corner = np.where(apart[:, None], np.arange(3 * len(faces)).reshape(-1, 3), -1)
-    keys, split = np.unique(np.stack([faces.ravel(), corner.ravel()], axis=1), axis=0, return_inverse=True)
-    split, original = split.reshape(-1, 3), keys[:, 0]
-    files = []
-    for number, shape in enumerate(keyframes):
-        files.append(tmp_path / f"{number}.glb")
-        uv = np.random.default_rng(0).random((len(original), 2))
-        visual = trimesh.visual.TextureVisuals(uv=uv)
-        trimesh.Trimesh(shape[original], split, process=False, visual=visual).export(files[-1])
-    welded = tm.weld_seams(*tm.load_keyframes(files))
-    used = np.unique(faces)
-    # Vertices whose copies are all alike again; a few corners of the model lie on each other by themselves.
-    assert welded.n_merged == pytest.approx(len(original) - len(used), abs=0.002 * len(used))
-    assert len(original) - len(used) > 5000
-    assert gap(welded.scatter(welded.keyframes).numpy(), original) == 0
-
-
 @pytest.mark.parametrize("suffix", ["obj", "ply", "glb"])
 def test_no_gap_after_subdivide(tmp_path: Path, suffix: str) -> None:
     """A bar as exporters write it, through the command line and back."""

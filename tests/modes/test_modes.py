@@ -167,14 +167,6 @@ def test_modes_at_the_surface_in_the_callers_units(boxed: Mesh) -> None:
         np.testing.assert_allclose(scaled.modes * factor**1.5, basis.modes, atol=1e-7)
 
 
-def test_unreferenced_vertices_do_not_move(boxed: Mesh) -> None:
-    vertices, faces = boxed
-    with pytest.warns(MeshWarning, match="belong to no face"):
-        basis = extract_modes(np.concatenate([[[7.0, 7, 7]], vertices]), faces + 1, 4, cache=False)
-    assert (basis.modes[:, 0] == 0).all()
-    np.testing.assert_allclose(basis.modes[:, 1:], extract_modes(vertices, faces, 4, cache=False).modes)
-
-
 def test_tensors_arrays_and_single_precision(boxed: Mesh) -> None:
     vertices, faces = boxed
     wanted = extract_modes(vertices, faces, 4, cache=False)
