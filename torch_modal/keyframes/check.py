@@ -59,26 +59,24 @@ def check_keyframes(keyframes: Any, faces: Any, *, min_keyframes: int = 1, warn:
     Warns:
         MeshWarning: At most once per kind of flaw, with the number of places and the first one.
     """
-    flaws: list[str] = []
-    positions, mesh = check_surface(keyframes, faces, min_keyframes, flaws if warn else None)
-    for message in flaws:
-        warnings.warn(message, MeshWarning, stacklevel=2)
+    positions, mesh = check_surface(keyframes, faces, min_keyframes, warn)
     return Keyframes(positions, torch.tensor(mesh.faces, device=positions.device))
 
 
 def check_surface(
-    keyframes: Any, faces: Any, min_keyframes: int = 1, flaws: list[str] | None = None
+    keyframes: Any, faces: Any, min_keyframes: int = 1, warn: bool = False
 ) -> tuple[torch.Tensor, Connectivity]:
-    """`check_keyframes` that returns the connectivity instead of the faces, and appends flaws to a list, if given."""
+    """`check_keyframes` that returns the connectivity instead of the faces."""
     positions, shapes, indices = check_arrays(keyframes, faces, min_keyframes)
     mesh, orientable, repairs = _repair(indices, shapes.shape[1])
     scaled, far = _check_sizes(shapes, mesh, positions.dtype)
     if orientable and not (mesh.counts % 2).any():
         _refuse_mirrored(scaled, mesh.faces)
-    if flaws is not None:
+    if warn:
         same = np.argwhere((shapes[1:] == shapes[:-1]).all(axis=(1, 2))) + 1
         equal = _count(same, "key-frames are equal to the one before", lambda k: f"key-frame {k}")
-        flaws.extend(filter(None, [*repairs, far, equal, *_flaws(scaled, mesh, _RESOLUTION[positions.dtype])]))
+        for message in filter(None, [*repairs, far, equal, *_flaws(scaled, mesh, _RESOLUTION[positions.dtype])]):
+            warnings.warn(message, MeshWarning, stacklevel=3)
     return positions, mesh
 
 
@@ -217,7 +215,7 @@ def _flaws(scaled: FloatArray, mesh: Connectivity, resolution: float) -> list[st
             lambda k, e: f"edge {edges[e].tolist()} in key-frame {k}",
         ),
         _count(
-            np.argwhere([inspect.flat_faces(shape, mesh.faces, resolution) for shape in scaled]),
+            np.argwhere([inspect.fatness(shape[mesh.faces]) <= resolution for shape in scaled]),
             "faces have no area in some key-frame, so their dihedral angles are noise",
             lambda k, f: f"face {mesh.faces[f].tolist()} in key-frame {k}",
         ),

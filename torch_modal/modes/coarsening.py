@@ -10,11 +10,10 @@ from scipy import sparse
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.geometry.connectivity import Connectivity, double_areas, label_pieces
 from torch_modal.geometry.decimation import decimate
-from torch_modal.geometry.inspect import degenerate_faces, find_repeated_faces
+from torch_modal.geometry.inspect import degenerate_faces, fatness, find_repeated_faces
 
-# Ratio of area to squared longest edge below which a triangle is a needle; an equilateral one has 0.43. With needles,
-# other numbers of faces are tried.
-NEEDLE = 3e-3
+# Altitude over longest side below which a triangle is a needle. With needles, other numbers of faces are tried.
+NEEDLE = 6e-3
 MORE_FACES = (1.0, 1.1, 1.25, 1.4, 1.6)
 
 # Closed pieces with fewer faces vanish or bend without stretching.
@@ -90,20 +89,12 @@ def coarsen(
         for i in set(sources) - set(known) if n < len(faces) else ():
             known[i] = decimate(keyframes[i], faces, n)[2]
         each = [collapse(keyframes[i], faces, n, known.get(i)) for i in sources]
-        tried = [(*_fatness(keyframes, one), one) for one in each]
-        # Those without needles first, then by the 1st percentile.
-        least, _, best = max(tried, key=lambda one: (min(one[0], NEEDLE), one[1]))
-        attempts.append((least, best))
-    return max(attempts, key=lambda one: min(one[0], NEEDLE))[1]
-
-
-def _fatness(keyframes: FloatArray, coarsening: Coarsening) -> tuple[float, float]:
-    """Ratio of area to squared longest edge in the worst key-frame: the minimum and the 1st percentile of triangles."""
-    corners = coarsening.restrict(keyframes)[:, coarsening.faces]
-    sides = corners - np.roll(corners, 1, axis=2)
-    area = 0.5 * np.linalg.norm(np.cross(sides[..., 0, :], sides[..., 1, :]), axis=-1)
-    fatness = area / np.maximum((sides**2).sum(-1).max(-1), np.finfo(np.float64).tiny)
-    return float(fatness.min()), float(np.percentile(fatness, 1, axis=-1).min())
+        shares = [fatness(one.restrict(keyframes)[:, one.faces]) for one in each]
+        # In the worst key-frame: those without needles first, then by the 1st percentile.
+        ranks = [(min(float(x.min()), NEEDLE), float(np.percentile(x, 1, axis=-1).min())) for x in shares]
+        best = max(range(len(each)), key=ranks.__getitem__)
+        attempts.append((ranks[best][0], each[best]))
+    return max(attempts, key=lambda one: one[0])[1]
 
 
 def collapse(points: FloatArray, faces: IntArray, n_faces: int, known: IntArray | None = None) -> Coarsening:

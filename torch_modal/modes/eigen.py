@@ -9,7 +9,7 @@ import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import LinearOperator, eigsh
 
-from torch_modal.arrays import BoolArray, FloatArray, IntArray
+from torch_modal.arrays import BoolArray, FloatArray
 from torch_modal.geometry.sparse import factorize
 
 N_RIGID = 6
@@ -83,9 +83,7 @@ def lowest_modes(body: ElasticBody, n_modes: int) -> ElasticModes:
         shift = 1 / float((np.ptp(positions, axis=0) ** 2).sum())
     inertia = sp.kron(mass, sp.identity(3), format="csr")
     n_pieces, piece = connected_components(_vertex_graph(k), directed=False)
-    rigid = np.zeros((k.shape[0], N_RIGID * n_pieces))
-    for index in range(n_pieces):
-        rigid[:, N_RIGID * index : N_RIGID * (index + 1)] = rigid_motions(positions, inertia, piece == index)
+    rigid = np.hstack([rigid_motions(positions, inertia, piece == index) for index in range(n_pieces)])
     if n_modes > k.shape[0] - rigid.shape[1]:
         raise ModalAnalysisError(
             f"only {k.shape[0] - rigid.shape[1]} modes deform the {n_pieces} loose pieces, {n_modes} are requested; "
@@ -157,7 +155,7 @@ def _lanczos(
     laplacian = sp.csc_matrix((np.full(graph.nnz, -1.0), graph.indices, graph.indptr), shape=graph.shape)
     degrees = np.diff(graph.indptr)
     by_vertex = factorize(laplacian + sp.identity(len(degrees)) * (1.0 + degrees.max()))
-    order = _unknowns(np.argsort(by_vertex.perm_c))
+    order = (3 * np.argsort(by_vertex.perm_c)[:, None] + np.arange(3)).reshape(-1)
     # The transpose of the symmetric matrix has sorted indices, in a fraction of the time of sorting.
     factors = factorize(shifted[order][:, order].tocsr().T, "NATURAL")
 
@@ -174,11 +172,6 @@ def _lanczos(
     n_vectors = min(n_modes + MORE_VECTORS, n)
     vectors: FloatArray = eigsh(k, n_modes, inertia, sigma=-shift, OPinv=inverse, v0=start, ncv=n_vectors, tol=0)[1]
     return vectors
-
-
-def _unknowns(vertices: IntArray) -> IntArray:
-    """Indices of the unknowns of vertices. *Shape:* ``(N,) -> (3N,)``."""
-    return (3 * vertices[:, None] + np.arange(3)).reshape(-1)
 
 
 def _vertex_graph(k: sp.csc_matrix) -> sp.csc_matrix:
