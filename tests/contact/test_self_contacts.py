@@ -15,8 +15,7 @@ import torch_modal as tm
 from torch_modal.cli import main as cli
 from torch_modal.data.samples import load_sample, sample_files
 from torch_modal.geometry.connectivity import Connectivity
-from torch_modal.geometry.crossings import Crossings
-from torch_modal.geometry.triangle_pairs import triangles_cross
+from torch_modal.geometry.crossings import Crossings, triangles_cross
 
 pytest.importorskip("igl")
 

@@ -2,7 +2,6 @@
 
 import os
 import signal
-import subprocess
 import sys
 import textwrap
 import threading
@@ -47,29 +46,7 @@ def test_inside_out_unreferenced_tiny_and_from_a_thread(capsule: Mesh) -> None:
     thread.join()
     volume = (1e-6 * surface.scale) ** 3 * trimesh.Trimesh(vertices, faces).volume
     assert tet_volumes(found[0]).sum() == pytest.approx(volume, rel=0.05)
-    assert signal.getsignal(signal.SIGINT) is handler
-
-
-def test_mesher_stays_out_of_this_process(tmp_path: Path) -> None:
-    code = """
-        import signal, sys
-        import trimesh
-        handler = signal.getsignal(signal.SIGINT)
-        from torch_modal.modes.extract import extract_modes
-        from torch_modal.modes.tetwild import TetWild
-        ball = trimesh.creation.icosphere(subdivisions=1)
-        extract_modes(ball.vertices, ball.faces, 4, mesher=TetWild(edge_length_fac=0.3), cache=False)
-        assert "pytetwild" not in sys.modules
-        assert signal.getsignal(signal.SIGINT) is handler
-    """
-    root = str(Path(tetwild.__file__).parents[2])
-    subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(code)],
-        check=True,
-        cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": root},
-    )
-    assert list(tmp_path.iterdir()) == [], "nothing is left in the working folder"
+    assert signal.getsignal(signal.SIGINT) is handler and "pytetwild" not in sys.modules
 
 
 @pytest.fixture
