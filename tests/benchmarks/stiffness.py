@@ -19,13 +19,19 @@ import torch_modal as tm
 from torch_modal.geometry.surface import Surface
 from torch_modal.modes.extract import MESHERS
 from torch_modal.modes.solid import without_small_pieces
-from torch_modal.modes.stiffness import arap_hessian, mass_matrix
+from torch_modal.modes.stiffness import HessianForm, arap_hessian, mass_matrix
 from torch_modal.modes.surface import CanonicalSurface
 from torch_modal.modes.tetrahedra import Mesher, Tetrahedra
 
 N = 3
 FINE = tm.TetWild(0.03, 2e-3, stop_energy=10.0, max_surface_faces=10**8, timeout=3600.0)
-COLUMNS = ["", "`mesher`", "tetrahedra's vertices", "first", "second", "third"]
+WAYS: tuple[tuple[str, HessianForm], ...] = (
+    ("auto", "edge"),
+    ("lattice", "edge"),
+    ("tetwild", "edge"),
+    ("lattice", "vertex"),
+)
+COLUMNS = ["", "`mesher`", "`form`", "tetrahedra's vertices", "first", "second", "third"]
 
 
 def bodies() -> Iterator[tuple[str, CanonicalSurface]]:
@@ -50,16 +56,16 @@ def main() -> None:
     add_keep(parser)
     given = parser.parse_args()
     limit_threads()
-    with Table("stiffness", COLUMNS, given.keep, labels=2) as table:
+    with Table("stiffness", COLUMNS, given.keep, labels=3) as table:
         for name, surface in bodies():
             if wanted(name, given.only):
                 truth = quadratic_modes(filled(FINE, surface), N).eigenvalues
-                for mesher in MESHERS:
+                for mesher, form in WAYS:
                     tetrahedra = filled(MESHERS[mesher](), surface)
-                    k, mass = arap_hessian(tetrahedra), mass_matrix(tetrahedra)
+                    k, mass = arap_hessian(tetrahedra, form), mass_matrix(tetrahedra)
                     ratios = eigenmodes(k, mass, tetrahedra.vertices, N).eigenvalues[-N:] / np.asarray(truth)
                     size = f"{len(tetrahedra.vertices):,}"
-                    table.add(name, f"`{mesher}`", size, *(f"{ratio:.2f}" for ratio in ratios))
+                    table.add(name, f"`{mesher}`", f"`{form}`", size, *(f"{ratio:.2f}" for ratio in ratios))
 
 
 if __name__ == "__main__":

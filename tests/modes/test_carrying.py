@@ -87,8 +87,10 @@ def test_clearances_of_a_plate_and_of_a_gap() -> None:
     above = one + np.array([0, 0, 0.7])
     whole = CanonicalSurface(np.concatenate([one, above]), np.concatenate([faces, faces + len(one)]))
     thickness, gap = clearances(whole)
-    middle = whole.points[whole.faces].mean(axis=1)
-    flat = (np.ptp(whole.points[whole.faces][..., 2], axis=1) == 0) & (np.abs(middle[:, :2]) < [30.0, 12.0]).all(axis=1)
+    middle = whole.vertices[whole.faces].mean(axis=1)
+    flat = (np.ptp(whole.vertices[whole.faces][..., 2], axis=1) == 0) & (np.abs(middle[:, :2]) < [30.0, 12.0]).all(
+        axis=1
+    )
     np.testing.assert_allclose(thickness[flat], 0.4 * whole.scale, rtol=0.02)
     facing = flat & (np.abs(middle[:, 2]) < 0.2 * whole.scale)
     np.testing.assert_allclose(gap[facing], 0.3 * whole.scale, rtol=0.02)
@@ -153,7 +155,7 @@ def test_a_keyframe_that_cannot_be_carried_to_has_its_own(
 
     def fails_if_carried(solid: Solid, form: str) -> object:
         if solid.meshed is not None:
-            raise ModalAnalysisError("the stiffness is indefinite")
+            raise ModalAnalysisError("the mesh is degenerate")
         return body(solid, form)
 
     body, counted = Solid.body, []

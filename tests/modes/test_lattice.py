@@ -4,26 +4,21 @@ import os
 import subprocess
 import sys
 import threading
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-import torch
 import trimesh
 from bodies import body
 from scipy.spatial import cKDTree
 from solids import as_mesh, box, eigenmodes, lumped_mass, surface
 
-from torch_modal.geometry.surface import Surface
 from torch_modal.modes import lattice as lattice_module
 from torch_modal.modes.extract import extract_modes
 from torch_modal.modes.lattice import Lattice, lattice
 from torch_modal.modes.stiffness import arap_hessian, mass_matrix
 from torch_modal.modes.surface import CanonicalSurface, clearances
 from torch_modal.modes.tetrahedra import (
-    Tetrahedra,
     face_connected_pieces,
     solid_volumes,
     tet_volumes,
@@ -37,21 +32,21 @@ def test_volume_and_place(capsule: Mesh, cell: float) -> None:
     whole = CanonicalSurface(*capsule)
     filled = lattice(whole, cell)
     assert (tet_volumes(filled) > 0).all()
-    exact = trimesh.Trimesh(whole.points, whole.faces)
+    exact = trimesh.Trimesh(whole.vertices, whole.faces)
     assert solid_volumes(filled).sum() == pytest.approx(exact.volume, rel=cell)
     mass = lumped_mass(filled)
     center = (mass[:, None] * filled.vertices).sum(axis=0) / mass.sum()
     np.testing.assert_allclose(center, exact.center_mass, atol=0.3)  # of a diagonal of 100
     low, high = filled.vertices.min(axis=0), filled.vertices.max(axis=0)
-    np.testing.assert_allclose(low, whole.points.min(axis=0), atol=50 * cell)
-    np.testing.assert_allclose(high, whole.points.max(axis=0), atol=50 * cell)
+    np.testing.assert_allclose(low, whole.vertices.min(axis=0), atol=50 * cell)
+    np.testing.assert_allclose(high, whole.vertices.max(axis=0), atol=50 * cell)
 
 
 def test_outer_vertices_lie_on_the_surface(capsule: Mesh) -> None:
     whole = CanonicalSurface(*capsule)
     filled = lattice(whole, 0.05)
     outer = filled.vertices[np.unique(surface(filled))]
-    corners = whole.points[whole.faces]
+    corners = whole.vertices[whole.faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     # Of a convex body: the distance to the plane that a point is most outside of.
@@ -92,7 +87,7 @@ def test_thin_plates_are_filled(thickness: float) -> None:
     whole = CanonicalSurface(vertices, faces)
     filled = Lattice().fill(whole, threading.Event())
     assert face_connected_pieces(filled.tets).max() == 0
-    assert cKDTree(filled.vertices).query(whole.points)[0].max() < 4.0
+    assert cKDTree(filled.vertices).query(whole.vertices)[0].max() < 4.0
     basis = extract_modes(vertices, faces, 6, cache=False)
     across = (basis.modes[0, :, 2] ** 2).sum() / (basis.modes[0] ** 2).sum()
     assert across > 0.9
@@ -104,7 +99,7 @@ def test_too_fine_cubes_become_larger(capsule: Mesh) -> None:
     whole = CanonicalSurface(ball.vertices, ball.faces)
     filled = lattice(whole, 0.009)
     assert len(filled.tets) < 40 * lattice_module.MOST_CUBES
-    assert solid_volumes(filled).sum() == pytest.approx(trimesh.Trimesh(whole.points, whole.faces).volume, rel=0.02)
+    assert solid_volumes(filled).sum() == pytest.approx(trimesh.Trimesh(whole.vertices, whole.faces).volume, rel=0.02)
 
 
 def of_body(name: str) -> CanonicalSurface:
@@ -119,7 +114,7 @@ def test_thin_limbs_have_small_tetrahedra(name: str) -> None:
     filled = lattice(whole, 0.03)
     assert face_connected_pieces(filled.tets).max() == 0
     assert len(filled.tets) < 1.2 * lattice_module.MOST_TETRAHEDRA
-    exact = trimesh.Trimesh(whole.points, whole.faces)
+    exact = trimesh.Trimesh(whole.vertices, whole.faces)
     assert solid_volumes(filled).sum() == pytest.approx(exact.volume, rel=0.15)
     thickness, _ = clearances(whole)
     sizes = np.cbrt(6 * tet_volumes(filled))
@@ -152,28 +147,3 @@ def test_open_and_half_flipped_surfaces(capsule: Mesh) -> None:
     whole, opened = CanonicalSurface(vertices, faces), CanonicalSurface(vertices, faces[~far])
     share = solid_volumes(lattice(opened, 0.05)).sum() / opened.scale**3
     assert share == pytest.approx(solid_volumes(lattice(whole, 0.05)).sum() / whole.scale**3, rel=0.25)
-
-
-@dataclass(frozen=True)
-class Cubes:
-    """A mesher of a user's own."""
-
-    edge: float
-    filled: list[int] = field(default_factory=list)
-
-    def key(self) -> dict[str, Any]:
-        return {"mesher": "cubes", "edge": self.edge}
-
-    def fill(self, surface: Surface, stop: threading.Event) -> Tetrahedra:
-        self.filled.append(len(surface.vertices))
-        return lattice(surface, self.edge)
-
-
-def test_a_mesher_of_ones_own(capsule: Mesh, tmp_path: Path) -> None:
-    coarse, fine = Cubes(0.06), Cubes(0.04)
-    first, second, again = (
-        extract_modes(*capsule, 5, mesher=mesher, cache_dir=str(tmp_path)) for mesher in (coarse, fine, coarse)
-    )
-    assert coarse.filled == fine.filled == [len(capsule[0])]
-    assert torch.equal(first.eigenvalues, again.eigenvalues)
-    assert not torch.equal(first.eigenvalues, second.eigenvalues)

@@ -20,7 +20,7 @@ from torch_modal.modes import eigen, extract
 from torch_modal.modes import lattice as lattice_module
 from torch_modal.modes.eigen import ElasticModes, ModalAnalysisError
 from torch_modal.modes.extract import extract_bases, extract_modes
-from torch_modal.modes.stiffness import arap_hessian, mass_matrix
+from torch_modal.modes.stiffness import HESSIAN_FORMS, arap_hessian, mass_matrix
 from torch_modal.modes.tetrahedra import Tetrahedra, TetrahedralizationError
 from torch_modal.modes.tetwild import TetWild
 
@@ -28,8 +28,8 @@ Mesh = tuple[np.ndarray, np.ndarray]
 BOX = box((6, 3, 2), (3.0, 1.5, 1.0), jitter=0.1)
 
 
-def solve(solid: Tetrahedra, n_modes: int) -> ElasticModes:
-    return eigenmodes(arap_hessian(solid), mass_matrix(solid), solid.vertices, n_modes)
+def solve(solid: Tetrahedra, n_modes: int, form: str = "edge") -> ElasticModes:
+    return eigenmodes(arap_hessian(solid, form), mass_matrix(solid), solid.vertices, n_modes)
 
 
 def inertia(solid: Tetrahedra) -> sp.csr_matrix:
@@ -39,10 +39,11 @@ def inertia(solid: Tetrahedra) -> sp.csr_matrix:
 # ------------------------------------------------------------------------------------------- the eigenproblem
 
 
-def test_modes_of_a_meshed_surface(capsule_tetrahedra: Tetrahedra) -> None:
+@pytest.mark.parametrize("form", HESSIAN_FORMS)
+def test_modes_of_a_meshed_surface(form: str, capsule_tetrahedra: Tetrahedra) -> None:
     """The numbers that everything later leans on, on the mesher's own tetrahedra."""
-    result = solve(capsule_tetrahedra, 20)
-    k, m = arap_hessian(capsule_tetrahedra), inertia(capsule_tetrahedra)
+    result = solve(capsule_tetrahedra, 20, form)
+    k, m = arap_hessian(capsule_tetrahedra, form), inertia(capsule_tetrahedra)
     assert m.shape[0] > eigen.DENSE_BELOW
     phi, lam = result.modes, result.eigenvalues
     assert np.abs(result.rigid_eigenvalues).max() < 1e-8 * lam[0]
@@ -293,6 +294,7 @@ def test_threads_change_nothing(boxed: Mesh, monkeypatch: pytest.MonkeyPatch) ->
     ("name", "value", "says"),
     [
         *(("n_modes", n, "n_modes is .*ways to deform; give .* 1 to 216") for n in (0, -1, 2.5, True, 10_000)),
+        ("form", "spokes", "the Hessian form is 'spokes'; give"),
         *((name, "spokes", f"the {what} is 'spokes'; give") for name, what in (("mesher",) * 2, ("method",) * 2)),
     ],
 )

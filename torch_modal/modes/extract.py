@@ -23,6 +23,7 @@ from torch_modal.modes.eigen import N_RIGID, ElasticBody, ModalAnalysisError, lo
 from torch_modal.modes.lattice import Lattice
 from torch_modal.modes.sheet import n_coarse_faces, sheet_body
 from torch_modal.modes.solid import Solid
+from torch_modal.modes.stiffness import HESSIAN_FORMS, HessianForm
 from torch_modal.modes.surface import CanonicalSurface, self_proximity
 from torch_modal.modes.tetrahedra import Mesher, TetrahedralizationError
 from torch_modal.modes.tetwild import Auto, TetWild
@@ -61,6 +62,7 @@ def extract_bases(
     n_modes: int = 30,
     *,
     method: Method = "auto",
+    form: HessianForm = "edge",
     mesher: Mesher | str = "auto",
     cache_dir: str | None = None,
     cache: bool = True,
@@ -83,6 +85,8 @@ def extract_bases(
         method: ``"solid"``; ``"shell"``, for the surface itself, which may be open, flat or not manifold; or
             ``"auto"``: the solid, but the shell where a key-frame is open or thin or the solid fails
             (:func:`why_shell`), which a line of the log says. All key-frames have the same.
+        form: Form of the solid's Hessian: ``"edge"``, or ``"vertex"``, the paper's
+            (:func:`~torch_modal.modes.stiffness.arap_hessian`).
         mesher: Fills the surface with tetrahedra: ``"lattice"``, which is deterministic, finer where the body is thin,
             and accepts every surface; ``"tetwild"``, fTetWild in a child process; ``"auto"``, the lattice unless parts
             of every key-frame touch, which it would fuse; or an object with settings,
@@ -105,7 +109,7 @@ def extract_bases(
         MeshWarning: The warnings of `check_keyframes`; a shape of several loose pieces.
     """
     store = Cache.at(cache_dir, enabled=cache)
-    return bases_of_checked(*check_keyframes(keyframes, faces), n_modes, method, mesher, store, progress)
+    return bases_of_checked(*check_keyframes(keyframes, faces), n_modes, method, form, mesher, store, progress)
 
 
 def bases_of_checked(
@@ -113,13 +117,15 @@ def bases_of_checked(
     faces: torch.Tensor,
     n_modes: int,
     method: Method = "auto",
+    form: HessianForm = "edge",
     mesher: Mesher | str = "auto",
     cache: Cache | None = None,
     progress: Progress = None,
 ) -> list[ModalBasis]:
     """`extract_bases` for the output of :func:`~torch_modal.keyframes.check.check_keyframes`."""
-    if method not in METHODS:
-        raise ValueError(f"the method is {method!r}; give one of {METHODS}")
+    for what, choice, choices in (("method", method, METHODS), ("Hessian form", form, HESSIAN_FORMS)):
+        if choice not in choices:
+            raise ValueError(f"the {what} is {choice!r}; give one of {choices}")
     if isinstance(mesher, str):
         if mesher not in MESHERS:
             raise ValueError(f"the mesher is {mesher!r}; give a Mesher or one of {tuple(MESHERS)}")
@@ -135,10 +141,10 @@ def bases_of_checked(
     several = bodies(shapes, mesh)
     if len(several) > 1:
         with contextlib.suppress(MeshError, ModalAnalysisError):  # the whole may have modes, nevertheless
-            return _bases_of_bodies(several, torch.from_numpy(shapes), n_modes, method, mesher, cache, progress)
+            return _bases_of_bodies(several, torch.from_numpy(shapes), n_modes, method, form, mesher, cache, progress)
     with one_blas_thread(), ProgressReport(len(shapes), "vibration modes", progress) as bar:
         extraction = _Extraction(shapes, triangles, int(n_modes), mesher, cache or Cache.at(None), bar)
-        results = extraction.by(method)
+        results = extraction.by(method, form)
     if n_pieces := [np.max(result["n_pieces"]) for result in results if np.max(result["n_zero"]) > N_RIGID]:
         warnings.warn(
             f"the shape has {max(n_pieces)} loose pieces, or parts hung on an edge or a vertex: modes deform each, and "
@@ -198,7 +204,7 @@ class _Extraction:
             with self.stage(index, "checks"):
                 self.surfaces.append(CanonicalSurface(shape, faces))
 
-    def by(self, method: Method) -> list[Arrays]:
+    def by(self, method: Method, form: HessianForm) -> list[Arrays]:
         """Modes by a method; ``"auto"`` takes the shell for shapes that are open or thin or whose solids fail."""
         if method == "auto" and (reason := why_shell(self.surfaces)):
             logger.info("modes of the surface itself, not of a solid: %s", reason)
@@ -206,7 +212,7 @@ class _Extraction:
         if method == "shell":
             return self.shells()
         try:
-            return self.solids()
+            return self.solids(form)
         except ModalAnalysisError as error:
             if method == "solid":
                 raise
@@ -223,7 +229,7 @@ class _Extraction:
 
         return self._all(compute, {}, {"form": "shell"}, n_coarse_faces(self.n_modes) // 2)
 
-    def solids(self) -> list[Arrays]:
+    def solids(self, form: HessianForm) -> list[Arrays]:
         """Modes of all solids inside.
 
         The key-frame of least self-proximity is meshed, as tetrahedra join parts in contact, and its tetrahedra are
@@ -238,18 +244,18 @@ class _Extraction:
 
         def compute(index: int) -> Arrays:
             if index == first:
-                return self._modes_of(index, solid.body)
+                return self._modes_of(index, lambda: solid.body(form))
             # A singular system, or modes of tetrahedra that are too distorted.
             with self.stage(index, "carrying tetrahedra"), contextlib.suppress(RuntimeError, np.linalg.LinAlgError):
                 carried = make_carrier().carry(self.surfaces[index])
                 if carried is not None:
-                    return self._modes_of(index, carried.body)
+                    return self._modes_of(index, lambda: carried.body(form))
             mesh = self._mesh(index)
-            return self._modes_of(index, mesh.body)
+            return self._modes_of(index, lambda: mesh.body(form))
 
         inputs = {"points": solid.surface.vertices, **solid.tetrahedra.arrays()}
         inputs = {f"rest_{name}": array for name, array in inputs.items()}
-        return self._all(compute, inputs, {"form": "edge", **self.mesher.key()}, len(solid.tetrahedra.vertices))
+        return self._all(compute, inputs, {"form": form, **self.mesher.key()}, len(solid.tetrahedra.vertices))
 
     def _all(
         self, compute: Callable[[int], Arrays], inputs: Arrays, parameters: dict[str, Any], n_vertices: int

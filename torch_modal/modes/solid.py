@@ -13,7 +13,7 @@ from torch_modal.geometry.surface import Surface
 from torch_modal.io.cache import Cache
 from torch_modal.modes.eigen import ElasticBody
 from torch_modal.modes.embedding import find_neighbours, fit_weights
-from torch_modal.modes.stiffness import arap_hessian, mass_matrix
+from torch_modal.modes.stiffness import HessianForm, arap_hessian, mass_matrix
 from torch_modal.modes.tetrahedra import Mesher, Tetrahedra, loose_pieces, small_pieces, solid_volumes, submesh
 
 
@@ -63,12 +63,12 @@ class Solid:
         """Displacements of the surface from displacements of the tetrahedra. *Shape:* ``(U, N)``."""
         return fit_weights(self.surface.vertices, self.tetrahedra.vertices, self.neighbours, self.kernel)
 
-    def body(self) -> ElasticBody:
+    def body(self, form: HessianForm) -> ElasticBody:
         """Stiffness, and mass at a density of 1."""
         weights, rest = self.weights(), (self.meshed or self).tetrahedra
         return ElasticBody(
             self.tetrahedra.vertices,
-            arap_hessian(self.tetrahedra),
+            arap_hessian(self.tetrahedra, form),
             mass_matrix(rest) * (solid_volumes(self.tetrahedra).sum() / solid_volumes(rest).sum()),
             lambda motions: (weights @ motions.reshape(len(motions), -1)).reshape(-1, *motions.shape[1:]),
         )
