@@ -14,7 +14,7 @@ from torch_modal.geometry.rigid import best_fit
 from torch_modal.geometry.rotations import exp
 from torch_modal.statistics.fit import fit
 from torch_modal.statistics.local_weights import LocalWeights, Observations
-from torch_modal.statistics.variation import LARGEST_EXTRAPOLATION, LocalMixtures, Patches, Variation, bound_weights
+from torch_modal.statistics.variation import LARGEST_EXTRAPOLATION, LocalMixtures, Variation, bound_weights
 
 DOUBLE = torch.float64
 
@@ -246,17 +246,6 @@ def test_weights_far_below_zero_come_nearer_to_even_ones() -> None:
     torch.testing.assert_close(found[:, 1:], weights[:, 1:])  # within the bound
 
 
-def test_what_no_mixture_meets_falls_back_to_a_keyframe(
-    space: tm.ShapeSpace, bars: Shapes, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    variation = space.variation()
-    monkeypatch.setattr(variation, "relax", lambda x, *_: 3 * x)
-    picked = markers(bars.keyframes[1])
-    found = space.fit(bars.keyframes[1][picked], picked)
-    assert far(found.shape, bars.keyframes[1]) < 1e-9
-    assert torch.equal(found.weights[1], torch.ones(space.n_vertices, dtype=DOUBLE))
-
-
 @pytest.mark.parametrize(
     "points, vertices, near, words",
     [
@@ -308,10 +297,8 @@ def test_points_in_other_units(space: tm.ShapeSpace, bars: Shapes, scale: float)
         space.fit(scale * bars.keyframes[1][picked], picked)
 
 
-class TestPatches:
-    def test_equal_shapes_share_a_patch(self, space: tm.ShapeSpace) -> None:
-        variation = space.variation()
-        twice = variation.shapes[[0, 0]]
-        patches = Patches(variation.coordinates.mean, variation.coordinates.reconstruction)
-        weights = LocalMixtures(patches, twice).weights(twice[0])
-        torch.testing.assert_close(weights, torch.full_like(weights, 0.5))
+def test_equal_shapes_share_a_patch(space: tm.ShapeSpace) -> None:
+    variation = space.variation()
+    twice = variation.shapes[[0, 0]]
+    weights = LocalMixtures(variation.coordinates, twice).weights(twice[0])
+    torch.testing.assert_close(weights, torch.full_like(weights, 0.5))

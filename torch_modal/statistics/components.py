@@ -18,8 +18,7 @@ class Components:
 
     @outside_inference_mode
     def __init__(self, variation: Variation, n: int) -> None:
-        self._coordinates, self._average, self._origin = variation.coordinates, variation.average, variation.origin
-        deviations = variation.deviations
+        self._variation, deviations = variation, variation.deviations
         off = (deviations * variation.coordinates.shares.sqrt()).flatten(1)
         left, values, _ = torch.linalg.svd(off, full_matrices=False)
         left, values = left[:, :n], values[:n]
@@ -38,9 +37,9 @@ class Components:
 
     def coordinates(self, shapes: Tensor) -> Tensor:
         """Coordinates of shapes along the components. *Shape:* ``(..., V, 3) -> (..., n)``."""
-        check_tensor("shapes", shapes, "...", *self._coordinates.mean.shape)
+        check_tensor("shapes", shapes, "...", *self._variation.coordinates.mean.shape)
         flat = shapes.reshape(shapes.shape[:-2].numel(), *shapes.shape[-2:]).to(self.directions)
-        off = (self._coordinates.of(flat) - self._average) * self._coordinates.shares
+        off = (self._variation.coordinates.of(flat) - self._variation.average) * self._variation.coordinates.shares
         values = torch.einsum("bjf,njf->bn", off, self.directions)
         return values.view(*shapes.shape[:-2], len(self)).to(shapes)
 
@@ -52,7 +51,8 @@ class Components:
         """
         check_tensor("coordinates", coordinates, "...", "n")
         flat = coordinates.reshape(coordinates.shape[:-1].numel(), coordinates.shape[-1]).to(self.directions)
-        bending = self._average + torch.einsum("bn,njf->bjf", flat, self.directions[: flat.shape[1]])
-        shapes = self._coordinates.shapes(bending) + self._origin
+        bending = self._variation.average + torch.einsum("bn,njf->bjf", flat, self.directions[: flat.shape[1]])
+        of = self._variation.coordinates
+        shapes = of.align(of.shapes(bending)) + self._variation.origin
         shapes = shapes.view(*coordinates.shape[:-1], *shapes.shape[1:])
         return (shapes if like is None else align(shapes, like.to(shapes))).to(coordinates)

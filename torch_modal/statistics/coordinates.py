@@ -87,11 +87,11 @@ class BendingCoordinates:
         return bend_sides(rows[:3], rows[3:], self.frames)
 
     def shapes(self, coordinates: Tensor) -> Tensor:
-        """The shapes of coordinates, in the pose of the mean. *Shape:* ``(B, 6, E) -> (B, V, 3)``."""
+        """The shapes of coordinates, in any pose. *Shape:* ``(B, 6, E) -> (B, V, 3)``."""
         rest = self.mean.expand(len(coordinates), -1, -1)
         shapes = self.reconstruction(self.sides(coordinates), rest)
         moves = (self.size * coordinates[:, :3, len(self.faces) :]).unbind(2)
         motions = self.reconstruction.follow(rest, shapes)
         for (piece, _), motion, move in zip(self.reconstruction.loose, motions, moves, strict=True):
             shapes = shapes.index_add(1, piece, (motion.rotation @ move[..., None]).mT.expand(-1, len(piece), -1))
-        return self.align(shapes)
+        return shapes

@@ -17,9 +17,9 @@ from torch_modal.statistics.variation import Variation
 # from the points there are other minima, which a more certain prior does not have.
 NOISE, COARSE_NOISE = 0.01, (10.0, 3.0)
 
-# Levenberg-Marquardt steps for the weights, with coarse noise or changing weights and at last, and the part of the
-# cost that ends them; rounds of weights of the observations; Newton steps that follow, and products in each.
-FEW_STEPS, MOST_STEPS, TOLERANCE, ROBUST_ROUNDS, LAST_STEPS, PRODUCTS = 5, 30, 1e-6, 8, 2, 20
+# Levenberg-Marquardt steps for the weights, with coarse noise or changing weights and at last, and the relative change
+# of the cost that ends them; rounds of weights of the observations; products with the Hessian for the gradient.
+FEW_STEPS, MOST_STEPS, TOLERANCE, ROBUST_ROUNDS, PRODUCTS = 5, 30, 1e-12, 8, 20
 
 # Rows of the Jacobian that are computed together.
 ROWS_AT_ONCE = 32
@@ -54,7 +54,7 @@ class LocalWeights:
 
     def __init__(self, variation: Variation, to: Observations, about: Tensor, noise: float = 0.0) -> None:
         self.variation, self.about, self.noise = variation, about, math.hypot(NOISE * variation.size, noise)
-        self.observations, self.to = to, to._replace(points=to.points.detach())
+        self.points, self.to = to.points, to._replace(points=to.points.detach())
         self.influence = self._influence()
 
     def shape(self, factors: Tensor) -> Tensor:
@@ -65,10 +65,6 @@ class LocalWeights:
         """Local weights, which add up to one at each vertex. *Shape:* ``(K n,) -> (K, V)``."""
         rows = factors.view(len(self.about), -1)
         return self.about[:, None] + (rows - rows.mean(0)) @ self.variation.fields
-
-    def cost(self, factors: Tensor, to: Observations, noise: float) -> Tensor:
-        """*Shape:* ``(K n,) -> ()``."""
-        return self.residuals(factors, to, noise).square().sum()
 
     def solve(self, robust: bool) -> tuple[Tensor, Observations]:
         """Factors of least cost as a function of the points, ``(K n,)``, and the observations with their weights."""
@@ -83,15 +79,9 @@ class LocalWeights:
                 to = to._replace(weights=self.to.weights / (1 + (missed / usual) ** 2) ** 2)
                 factors = self._descend(factors, to, self.noise, FEW_STEPS)
             factors = self._descend(factors, to, self.noise, MOST_STEPS)
-            for _ in range(LAST_STEPS):
-                slope = torch.func.grad(self.cost)(factors, to, self.noise)
-                moved = factors - self.newton(factors, to, 0.5 * slope)
-                if not self.cost(moved, to, self.noise) <= self.cost(factors, to, self.noise):  # an indefinite Hessian
-                    break
-                factors = moved
-        to = to._replace(points=self.observations.points)
-        if torch.is_grad_enabled() and to.points.requires_grad:
-            factors = _FactorsOfPoints.apply(factors, to.points, self, to)
+        to = to._replace(points=self.points)
+        if torch.is_grad_enabled() and self.points.requires_grad:
+            factors = _FactorsOfPoints.apply(factors, self.points, self, to)
         return factors, to
 
     def _descend(self, factors: Tensor, to: Observations, noise: float, n_steps: int) -> Tensor:
@@ -144,24 +134,6 @@ class LocalWeights:
             rows.append(torch.stack(parts, 2).flatten(2))
         return torch.cat(rows).flatten(0, 1)
 
-    def newton(self, factors: Tensor, to: Observations, right: Tensor) -> Tensor:
-        """Inverse of half the Hessian, times a vector, by conjugate gradients. *Shape:* ``(K n,)``."""
-        slopes = self.slopes(factors, to, self.noise)
-        matrix = slopes.mT @ slopes
-        matrix.diagonal().add_(len(matrix) * torch.finfo(matrix.dtype).eps * matrix.diagonal().max())  # its rounding
-        factor = torch.linalg.cholesky_ex(matrix).L
-        with torch.enable_grad():
-            leaf = factors.detach().requires_grad_()
-            slope = torch.autograd.grad(0.5 * self.cost(leaf, to, self.noise), leaf, create_graph=True)[0]
-
-        return conjugate_gradients(
-            lambda x: torch.autograd.grad(slope, leaf, x, retain_graph=True)[0],
-            lambda x: torch.cholesky_solve(x[:, None], factor)[:, 0],
-            torch.dot,
-            right,
-            PRODUCTS,
-        )
-
     def _influence(self) -> tuple[Tensor, Tensor]:
         """Part of both sides of each triangle in each observed place. *Shape:* ``(n, F)`` each."""
         variation, to = self.variation, self.to
@@ -190,10 +162,20 @@ class _FactorsOfPoints(torch.autograd.Function):
     @staticmethod
     @once_differentiable  # second derivatives lack the elastic steps, which are constants of the graph
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        factors, points = ctx.saved_tensors
-        adjoint = ctx.problem.newton(factors, ctx.to, grad)
+        (factors, points), problem = ctx.saved_tensors, ctx.problem
+        slopes = problem.slopes(factors, ctx.to, problem.noise)
+        matrix = slopes.mT @ slopes
+        matrix.diagonal().add_(len(matrix) * torch.finfo(matrix.dtype).eps * matrix.diagonal().max())  # its rounding
+        factor = torch.linalg.cholesky_ex(matrix).L
         with torch.enable_grad():
-            leaf, to_points = factors.detach().requires_grad_(), points.detach().requires_grad_()
-            cost = 0.5 * ctx.problem.cost(leaf, ctx.to._replace(points=to_points), ctx.problem.noise)
-            slope = torch.autograd.grad(cost, leaf, create_graph=True)[0]
-            return None, -torch.autograd.grad(slope, to_points, adjoint)[0], None, None
+            leaf, places = (x.detach().requires_grad_() for x in (factors, points))
+            cost = 0.5 * problem.residuals(leaf, ctx.to._replace(points=places), problem.noise).square().sum()
+            (slope,) = torch.autograd.grad(cost, leaf, create_graph=True)
+        adjoint = conjugate_gradients(
+            lambda x: torch.autograd.grad(slope, leaf, x, retain_graph=True)[0],
+            lambda x: torch.cholesky_solve(x[:, None], factor)[:, 0],
+            torch.dot,
+            grad,
+            PRODUCTS,
+        )
+        return None, -torch.autograd.grad(slope, places, adjoint)[0], None, None

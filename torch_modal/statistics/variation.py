@@ -73,11 +73,10 @@ class Variation:
         #: Mean of the coordinates of all shapes, and how each differs. *Shape:* ``(6, E)``, ``(K, 6, E)``.
         self.average = bending.mean(0)
         self.deviations = bending - self.average
-        patches = Patches(mean, self.coordinates.reconstruction)
+        self.mixtures = LocalMixtures(self.coordinates, self.shapes)
         #: Fields whose sums local weights are; the first is one everywhere. *Shape:* ``(n, V)``.
-        self.fields = patches.fields(LENGTH)
+        self.fields = self.mixtures.fields
         self.scale = CANONICAL_SIZE / self.size
-        self.mixtures = LocalMixtures(patches, self.shapes)
         mesh = Mesh(self.coordinates.mesh)
         self.fine = choose(backend).fine_energy(mesh, [Stretch(ALPHA), Bend(BETA), Volume(GAMMA)])
         closed = all(encloses(x, mesh.connectivity) for x in self.shapes)
@@ -97,14 +96,14 @@ class Variation:
         return self.average + torch.einsum("ke,kje->je", self.coordinates.spread(weights), self.deviations)
 
     def assemble(self, weights: Tensor) -> Tensor:
-        """Shape of local weights by rotations and strains, in the pose of the mean. *Shape:* ``(K, V) -> (V, 3)``."""
+        """Shape of local weights by rotations and strains. *Shape:* ``(K, V) -> (V, 3)``."""
         return self.coordinates.shapes(self.bending(weights)[None])[0]
 
     @torch.no_grad()
     def relax(self, x: Tensor, weights: Tensor, products: Sequence[int], springs: FreeEnergy | None = None) -> Tensor:
         """Newton steps of all vertices towards weighted means of the lengths and angles of the given shapes.
 
-        The shape is in the pose of the mean; the springs are an energy at a size of 100. *Shape:* ``(V, 3), (K, V)``.
+        The springs are an energy at a size of 100. *Shape:* ``(V, 3), (K, V)``.
         """
         energy = self.fine.energy
         rest = trees.map_leaves(energy.mix_rests(self.rest, weights), lambda measure: measure[None])
@@ -135,11 +134,11 @@ class Variation:
 
     def members(self, weights: Tensor, factors: Tensor) -> Tensor:
         """Members of the set, in the pose of the mean. *Shape:* ``(n, K), (n, K, n_fields - 1) -> (n, V, 3)``."""
-        shapes = [self.member(*each)[0] for each in zip(weights, factors, strict=True)]
-        return torch.stack(shapes) if shapes else self.shapes[:0]
+        shapes = [self.member(*each)[0][None] for each in zip(weights, factors, strict=True)]
+        return self.coordinates.align(torch.cat([self.shapes[:0], *shapes]))
 
     def member(self, weights: Tensor, factors: Tensor) -> tuple[Tensor, Tensor]:
-        """A member of the set, in the pose of the mean, and its local weights; less local, if it would fold.
+        """A member of the set and its local weights; less local, if it would fold.
 
         If it folds even then, it is the given shape of the largest weight. None of the local weights is below zero, and
         they add up to one. *Shape:* ``(K,), (K, n_fields - 1) -> (V, 3), (K, V)``, with weights and factors of
@@ -152,8 +151,8 @@ class Variation:
             x = self.relax(self.assemble(local), local, PRODUCTS)
             if self.folds(x) <= self.most_folds:
                 return x, local
-        first = int(weights.argmax())
-        return self.shapes[first].clone(), one_hot(weights.argmax(), len(self)).to(local)[:, None].expand_as(local)
+        likeliest = one_hot(weights.argmax(), len(self)).to(local)
+        return self.shapes[likeliest.argmax()], likeliest[:, None].expand_as(local)
 
     def folds(self, x: Tensor) -> int:
         """Number of pairs of neighbouring triangles that lie on each other. *Shape:* ``(V, 3)``."""
@@ -162,51 +161,37 @@ class Variation:
         return int(((pick(normals, one) * pick(normals, other)).sum(0) < FOLDED).sum())
 
 
-class Patches:
-    """Patches around vertices of a shape that are far apart along the surface, so that fingers do not mix."""
+class LocalMixtures:
+    """Mixtures of shapes in patches, whose centres are far apart along the surface, so that fingers do not mix.
 
-    def __init__(self, mean: Tensor, reconstruction: Reconstruction) -> None:
+    *Shape:* ``(K, V, 3)``.
+    """
+
+    def __init__(self, coordinates: BendingCoordinates, shapes: Tensor) -> None:
+        mean, reconstruction, k = coordinates.mean, coordinates.reconstruction, len(shapes)
         # Gaps between loose pieces and the largest count as edges.
         gaps = [torch.stack([piece[0], anchors[0]])[None] for piece, anchors in reconstruction.loose]
         graph = edge_graph(mean.numpy(), torch.cat([reconstruction.edges, *gaps]).numpy())
-        used = np.unique(reconstruction.faces.numpy())
+        used = np.unique(coordinates.faces.numpy())
         # A patch of one vertex would have no moments.
         centres, from_centres = farthest_apart(graph, used, min(N_PATCHES, len(used) // 2))
-        nearest, distances = from_centres.min(axis=0), torch.from_numpy(from_centres)
-        reach = OVERLAP * nearest[np.isfinite(nearest)].max()
-        bumps = torch.exp(-2 * (distances / max(reach, np.finfo(float).tiny)) ** 2)
-        #: Part of each vertex that belongs to each patch. *Shape:* ``(P, V)``.
-        self.shares = bumps / bumps.sum(0).clamp_min(torch.finfo(bumps.dtype).tiny)
+        distances, tiny = torch.from_numpy(from_centres), torch.finfo(mean.dtype).tiny
+        reach = OVERLAP * max(float(distances[:, used].amin(0).max()), tiny)
+        bumps = torch.exp(-2 * (distances / reach) ** 2)
+        #: Fraction of each vertex that belongs to each patch. *Shape:* ``(P, V)``.
+        self.shares = bumps / bumps.sum(0).clamp_min(tiny)
         #: Masses of the vertices in each patch, with sum one. *Shape:* ``(P, V)``.
         self.masses = bumps * reconstruction.areas
-        self.masses = self.masses / self.masses.sum(1, keepdim=True).clamp_min(torch.finfo(bumps.dtype).tiny)
-        #: Along the surface, between centres. *Shape:* ``(P, P)``.
-        self.distances = distances[:, centres]
-
-    def __len__(self) -> int:
-        return len(self.shares)
-
-    def fields(self, length: float) -> Tensor:
-        """Fields whose sums with normal factors vary over a length, relative to the largest distance of two centres.
-
-        *Shape:* ``(n, V)``; the first is one everywhere.
-        """
-        among = self.distances[self.distances.isfinite()]
-        scale = length * among.amax().clamp_min(torch.finfo(among.dtype).tiny)
-        values, vectors = torch.linalg.eigh(torch.exp(-0.5 * (self.distances / scale) ** 2))
-        kept = values > 1e-3 * values[-1]
-        root = vectors[:, kept] * values[kept].sqrt()
-        return torch.cat([torch.ones_like(self.shares[:1]), root.mT @ self.shares])
-
-
-class LocalMixtures:
-    """Weights with which shapes, each in its best rotation, make up the patches of another. *Shape:* ``(K, V, 3)``."""
-
-    def __init__(self, patches: Patches, shapes: Tensor) -> None:
-        self.patches, k = patches, len(shapes)
+        self.masses = self.masses / self.masses.sum(1, keepdim=True).clamp_min(tiny)
+        between = distances[:, centres]
+        values, vectors = torch.linalg.eigh(torch.exp(-0.5 * (between / (LENGTH * between.max()).clamp_min(tiny)) ** 2))
+        significant = values > 1e-3 * values[-1]
+        roots = vectors[:, significant] * values[significant].sqrt()
+        #: Fields whose sums with normal factors vary over a length; the first is one everywhere. *Shape:* ``(n, V)``.
+        self.fields = torch.cat([torch.ones_like(bumps[:1]), roots.mT @ self.shares])
         self.columns = shapes.movedim(0, 1).flatten(1)  # (V, 3K)
-        self.centres = (patches.masses @ self.columns).unflatten(1, (k, 3))
-        products = torch.stack([(self.columns * mass[:, None]).mT @ self.columns for mass in patches.masses])
+        self.centres = (self.masses @ self.columns).unflatten(1, (k, 3))
+        products = torch.stack([(self.columns * mass[:, None]).mT @ self.columns for mass in self.masses])
         products = products.unflatten(2, (k, 3)).unflatten(1, (k, 3)).transpose(2, 3)
         #: Second moments of all pairs of shapes in each patch. *Shape:* ``(P, K, K, 3, 3)``.
         self.moments = products - self.centres[:, :, None, :, None] * self.centres[:, None, :, None, :]
@@ -216,7 +201,7 @@ class LocalMixtures:
 
         In each patch they minimise :math:`|x - \sum_k w_k R_k x_k|^2`, with the rotations that fit best.
         """
-        masses, n = self.patches.masses, self.moments.shape[1]
+        masses, n = self.masses, self.moments.shape[1]
         products = torch.stack([(masses * row) @ self.columns for row in x.mT], 1).unflatten(2, (n, 3))
         cross = products.transpose(1, 2) - (masses @ x)[:, None, :, None] * self.centres[:, :, None, :]
         rotations = best_rotation(cross)  # (P, K, 3, 3)
@@ -228,7 +213,7 @@ class LocalMixtures:
         spread = torch.maximum(spread, torch.finfo(x.dtype).eps * whole)  # shapes may be equal
         system = centred + EVENNESS * spread[:, None, None] * torch.eye(n).to(x)
         solution = torch.linalg.solve(system, right)
-        return bound_weights((solution - solution.mean(-1, keepdim=True)).mT @ self.patches.shares + 1 / n)
+        return bound_weights((solution - solution.mean(-1, keepdim=True)).mT @ self.shares + 1 / n)
 
 
 def bound_weights(weights: Tensor) -> Tensor:
