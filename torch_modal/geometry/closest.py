@@ -11,6 +11,9 @@ FLAT_FACE = 1e-12
 # Groups of triangles of similar size.
 N_GROUPS = 8
 
+# Triangles of a group that are tested first for each point; four times as many follow where these are not all.
+FIRST_CANDIDATES = 4
+
 # Pairs of a point and a triangle that are tested together.
 PAIRS_AT_ONCE = 2**18
 
@@ -36,15 +39,23 @@ class ClosestFaces:
         face = np.asarray(self.centroids.query(points)[1], dtype=np.int64)
         nearest = closest_on_triangles(points, self.corners[face])[1]
         for faces, tree, radius in self._groups:
-            counts = tree.query_ball_point(points, nearest + radius, return_length=True)
-            bounds = np.flatnonzero(np.diff(np.cumsum(counts) // PAIRS_AT_ONCE)) + 1
-            for rows in np.split(np.arange(len(points)), bounds):
-                near = tree.query_ball_point(points[rows], nearest[rows] + radius)
-                row, candidates = np.repeat(rows, counts[rows]), faces[np.concatenate([*near, []]).astype(np.int64)]
-                distance = closest_on_triangles(points[row], self.corners[candidates])[1]
-                order = np.lexsort((-distance, row))  # of each point, the nearest comes last
-                order = order[distance[order] < nearest[row[order]]]
-                face[row[order]], nearest[row[order]] = candidates[order], distance[order]
+            rows, k = np.arange(len(points)), FIRST_CANDIDATES
+            while len(rows):
+                k, crowded = min(k, len(faces)), []
+                for some in np.array_split(rows, len(rows) * k // PAIRS_AT_ONCE + 1):
+                    reach = nearest[some] + radius
+                    apart, places = tree.query(points[some], np.arange(1, k + 1), distance_upper_bound=reach.max())
+                    row, column = np.nonzero(apart <= reach[:, None])
+                    candidates, distances = faces[places[row, column]], np.full(apart.shape, np.inf)
+                    distances[row, column] = closest_on_triangles(points[some[row]], self.corners[candidates])[1]
+                    best = distances.argmin(1)[:, None]
+                    least = np.take_along_axis(distances, best, 1)[:, 0]
+                    closer = np.flatnonzero(least < nearest[some])
+                    face[some[closer]] = faces[places[closer, best[closer, 0]]]
+                    nearest[some[closer]] = least[closer]
+                    crowded.append(some[apart[:, -1] <= reach])  # perhaps there are more
+                rows = np.concatenate(crowded) if k < len(faces) else rows[:0]
+                k *= 4
         return face
 
 

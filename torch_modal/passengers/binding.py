@@ -31,43 +31,39 @@ def bind_points(
     face = np.repeat(np.arange(len(faces)), 3)
     ones = np.ones(len(face), dtype=np.int32)
     of_vertex = sparse.csr_matrix((ones, (faces.reshape(-1), face)), (len(vertices), len(faces)))  # sums duplicates
-    # Pairs of triangles that meet at a vertex, or both meet a third, as sorted keys i F + j.
-    once = of_vertex.T @ of_vertex
-    twice = (once @ once).tocoo()
-    touching = np.sort(twice.row.astype(np.int64) * len(faces) + twice.col)
+    # Not zero for triangles that meet at a vertex, or both meet a third.
+    touching = (of_vertex.T @ of_vertex) ** 2
+    touching.sort_indices()
+    n = width = min(CANDIDATES, len(faces))
     if anchors is not None:
         # The faces at each vertex, and -1 after them; the last row, for points without an anchor, has none.
         counts = np.append(np.diff(of_vertex.indptr), 0)
-        at_vertex = np.full((len(vertices) + 1, max(counts.max(initial=1), CANDIDATES)), -1)
-        at_vertex[np.arange(at_vertex.shape[1]) < counts[:, None]] = of_vertex.indices
-    rows_of_weights = []
+        width = max(n, counts.max())
+        at_vertex = np.full((len(counts), width), -1)
+        at_vertex[np.arange(width) < counts[:, None]] = of_vertex.indices
+    rows_of_weights = [sparse.csr_matrix((0, len(vertices)))]
     for first in range(0, len(points), POINTS_AT_ONCE):
-        chunk = points[first : first + POINTS_AT_ONCE]
-        candidates = surface.centroids.query(chunk, k=np.arange(1, min(CANDIDATES, len(faces)) + 1))[1]
+        some = slice(first, first + POINTS_AT_ONCE)
+        chunk = points[some]
+        candidates = np.full((len(chunk), width), -1) if anchors is None else at_vertex[anchors[some]]
+        free = np.flatnonzero(candidates[:, 0] < 0)
+        near = surface.centroids.query(chunk[free], k=np.arange(1, n + 1))[1]
         # The centroid of a long triangle may be far from its closest point.
-        anchor = np.full(len(chunk), -1) if anchors is None else anchors[first : first + POINTS_AT_ONCE]
-        free = np.flatnonzero(anchor < 0)
         nearest = surface(chunk[free])
-        missed = ~(candidates[free] == nearest[:, None]).any(1)
-        candidates[free[missed], -1] = nearest[missed]
-        if anchors is not None:
-            around = at_vertex[anchor]
-            widened = np.pad(candidates, ((0, 0), (0, around.shape[1] - candidates.shape[1])), constant_values=-1)
-            candidates = np.where(around[:, :1] >= 0, around, widened)
+        missed = ~(near == nearest[:, None]).any(1)
+        near[missed, -1] = nearest[missed]
+        candidates[free, :n] = near
         barycentric, distance = closest_on_triangles(chunk[:, None], surface.corners[candidates])
         distance[candidates < 0] = np.inf
         best = distance.argmin(1)[:, None]
         least = np.take_along_axis(distance, best, 1)
         share = np.maximum(1 - (distance - least) / (FADE_WIDTH * least + ON_SURFACE * extent), 0) ** 2
         row, column = np.nonzero(share)
-        closest = np.take_along_axis(candidates, best, 1)
-        keys = closest[row, 0] * len(faces) + candidates[row, column]
-        apart = touching[np.searchsorted(touching, keys).clip(max=len(touching) - 1)] != keys
-        share[row[apart], column[apart]] = 0
+        closest = np.take_along_axis(candidates, best, 1)[row, 0]
+        share[row, column] *= np.asarray(touching[closest, candidates[row, column]])[0] > 0
         weights = barycentric * (share / share.sum(1, keepdims=True))[..., None]
         row, column = np.nonzero(share)
-        index = faces[candidates[row, column]].reshape(-1)
-        entries = (weights[row, column].reshape(-1), (np.repeat(row, 3), index))
+        entries = weights[row, column].reshape(-1), (np.repeat(row, 3), faces[candidates[row, column]].reshape(-1))
         rows_of_weights.append(sparse.csr_matrix(entries, shape=(len(chunk), len(vertices))))
         rows_of_weights[-1].eliminate_zeros()
-    return sparse.vstack(rows_of_weights, format="csr") if rows_of_weights else sparse.csr_matrix((0, len(vertices)))
+    return sparse.vstack(rows_of_weights, format="csr")
