@@ -17,7 +17,6 @@ from torch_modal.elastic.term import Mesh
 from torch_modal.elastic.volume import Volume, encloses
 from torch_modal.geometry.canonical import CANONICAL_SIZE
 from torch_modal.geometry.connectivity import edge_graph, farthest_apart
-from torch_modal.geometry.poisson import Reconstruction
 from torch_modal.geometry.rigid import best_rotation
 from torch_modal.geometry.triangle_frames import frames_of
 from torch_modal.geometry.vectors import pick
