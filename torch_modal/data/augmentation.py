@@ -138,7 +138,7 @@ class ShapeAugmentation(nn.Module):
         space = self._space(space)
         if self.uses_keyframes or torch.compiler.is_exporting():
             require_numbers(type(self).__name__, batch.shapes)
-        n, dtype, device = len(batch.shapes), batch.shapes.dtype, batch.shapes.device
+        n, dtype = len(batch.shapes), batch.shapes.dtype
         wrong = {name: tuple(value.shape) for name, value in params.items() if len(value) != n}
         if wrong:
             raise ValueError(f"{n} shapes need parameters with {n} rows; got {wrong}")
@@ -152,16 +152,9 @@ class ShapeAugmentation(nn.Module):
             partners = batch.partners(chosen, params["partner"].cpu()[chosen], space, pool)
             if partners is None:
                 return batch._replace(shapes=batch.shapes.to(dtype))
-        chosen_params = {}
-        for name, value in params.items():
-            kind = mine.shapes.dtype if value.is_floating_point() else None
-            chosen_params[name] = value[chosen.to(value.device)].to(device, kind)
-        result = self.apply_transform(mine, chosen_params, space, partners)
-        fields = (
-            before if before is None or after is None else before.index_copy(0, chosen.to(before.device), after)
-            for before, after in zip(batch, result, strict=True)
-        )
-        batch = ShapeBatch._make(fields)
+        mine_params = {name: value[chosen.to(value.device)].to(mine.shapes.device) for name, value in params.items()}
+        mine_params |= {name: value.to(mine.shapes) for name, value in mine_params.items() if value.is_floating_point()}
+        batch = batch.with_rows(chosen, self.apply_transform(mine, mine_params, space, partners))
         return batch._replace(shapes=batch.shapes.to(dtype))
 
     @disable_compile
@@ -222,11 +215,9 @@ class AugmentationSequential(ShapeAugmentation):
     """Random transforms in sequence; named after kornia's.
 
     Args:
-        transforms: The transforms, in order.
-        data_keys: As for :class:`ShapeAugmentation`; the transforms' own data keys have no effect.
-        keepdim: Likewise.
-        generator: Source of random numbers of all transforms; by default each has its own.
-        space: Key-frames and modes, for all transforms; by default each has its own.
+        transforms: The transforms, in order; their own ``data_keys`` and ``keepdim`` have no effect.
+        options: ``data_keys`` and ``keepdim`` as for :class:`ShapeAugmentation`; a ``generator`` and a ``space`` for all
+            transforms, which by default have their own.
 
     Raises:
         ValueError: A data key is unknown or doubled, there are no shapes, or an argument is no transform.
@@ -234,15 +225,8 @@ class AugmentationSequential(ShapeAugmentation):
 
     uses_keyframes = False
 
-    def __init__(
-        self,
-        *transforms: ShapeAugmentation,
-        data_keys: Sequence[str] = ("shapes",),
-        keepdim: bool = False,
-        generator: torch.Generator | None = None,
-        space: ShapeSpace | None = None,
-    ) -> None:
-        super().__init__(1.0, keepdim=keepdim, data_keys=data_keys, generator=generator, space=space)
+    def __init__(self, *transforms: ShapeAugmentation, **options: Any) -> None:
+        super().__init__(1.0, **options)
         others = [type(one).__name__ for one in transforms if not isinstance(one, ShapeAugmentation)]
         if others:
             raise ValueError(f"pass the transforms one by one, AugmentationSequential(*transforms); got {others}")

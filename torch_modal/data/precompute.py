@@ -18,9 +18,9 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Executor, Future, ThreadPoolExecutor, as_completed, wait
+from concurrent.futures import Executor, ThreadPoolExecutor, as_completed, wait
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -75,7 +75,7 @@ class Record:
     status: str = FAILED
     """``done`` or ``failed``."""
     reason: str = ""
-    """Why it failed, or why it was computed again."""
+    """Why it failed."""
     warnings: Sequence[str] = ()
     seconds: float = 0.0
     key: str = ""
@@ -146,11 +146,9 @@ def precompute_tree(
     records: dict[str, Record] = {}
     started, n_now = time.monotonic(), 0
     with _executor(workers, scheduler) as (executor, stop):
-        names: dict[Future[tuple[Record, bool]], str] = {}
+        paths = root.resolve(), out.resolve()
+        names = {executor.submit(run_set, *paths, name, options, stop): name for name in sets}
         try:
-            for name in sets:
-                arguments = root.resolve(), out.resolve(), name, options, stop
-                names[executor.submit(run_set, *arguments)] = name
             for future in as_completed(names):
                 name = names[future]
                 try:
@@ -166,8 +164,7 @@ def precompute_tree(
                 wait(names)
             raise
     records = {name: records[name] for name in sets}
-    n_done = sum(record.status == DONE for record in records.values())
-    seconds = time.monotonic() - started
+    n_done, seconds = sum(record.status == DONE for record in records.values()), time.monotonic() - started
     say(f"{n_done} of {len(sets)} sets have their bases; {n_now} were worked on now, in {seconds:.0f} s")
     notable = [_line(name, record) for name, record in records.items() if record.status != DONE or record.warnings]
     for line in notable + left_out:
@@ -222,27 +219,17 @@ def run_set(
         raise FileNotFoundError(f"{socket.gethostname()} has no folder {out}; all machines need the same folders")
     target = out / name
     try:
-        new = Record(key=options.key(mesh_files(source / name)))
+        key = options.key(mesh_files(source / name))
         before = read_record(target, options.overwrite)
-    except (OSError, ValueError) as error:
+        if before is not None and before.key == key:
+            return before, False
+        job = {"source": str(source / name), "target": str(target), "key": key, "options": asdict(options)}
+        with tempfile.TemporaryDirectory(prefix="torch_modal-set-", ignore_cleanup_errors=True) as scratch:
+            environment = {**os.environ, **ONE_THREAD, "TMPDIR": scratch}
+            run_child(COMMAND, Path(scratch), options.timeout, stop, json.dumps(job).encode() + b"\n", environment)
+        return read_record(target) or Record(), True
+    except (OSError, ValueError, ChildError) as error:
         return Record(reason=str(error)), True
-    if before is not None and before.key == new.key:
-        return before, False
-    if before is not None:
-        new = replace(new, reason="its files or options changed")
-    try:
-        _run_in_child(source / name, target, new, options, stop)
-        return read_record(target) or new, True
-    except ChildError as error:
-        return replace(new, reason=str(error)), True
-
-
-def _run_in_child(source: Path, target: Path, record: Record, options: Options, stop: threading.Event | None) -> None:
-    """Run :func:`main` on a set in a process of its own; raises ChildError if it refuses the set or fails."""
-    job = {"source": str(source), "target": str(target), "record": asdict(record), "options": asdict(options)}
-    with tempfile.TemporaryDirectory(prefix="torch_modal-set-", ignore_cleanup_errors=True) as scratch:
-        environment = {**os.environ, **ONE_THREAD, "TMPDIR": scratch}
-        run_child(COMMAND, Path(scratch), options.timeout, stop, json.dumps(job).encode() + b"\n", environment)
 
 
 # ------------------------------------------------------------------------------------------- in the set's process
@@ -251,13 +238,13 @@ def main() -> None:
     job = json.loads(sys.stdin.buffer.readline())
     threading.Thread(target=_end_with_parent, daemon=True).start()
     try:
-        compute(Path(job["source"]), Path(job["target"]), Record(**job["record"]), Options(**job["options"]))
+        compute(Path(job["source"]), Path(job["target"]), job["key"], Options(**job["options"]))
     except (ValueError, RuntimeError) as error:
         sys.exit(" ".join(str(error).split()))
 
 
-def compute(source: Path, target: Path, record: Record, options: Options) -> None:
-    """Compute the bases of a set, and write them with the record.
+def compute(source: Path, target: Path, key: str, options: Options) -> None:
+    """Compute the bases of a set, and write them with the record of this key.
 
     Raises:
         ValueError: The input cannot work.
@@ -272,31 +259,19 @@ def compute(source: Path, target: Path, record: Record, options: Options) -> Non
             raise MeshError("two files have the same name; a shape must be there in one format only")
         keyframes, faces = load_keyframes(files)
         times = _read_times(source / TIMES_FILE, len(files)) if options.sequence else None
-        bases = extract_bases(
-            keyframes,
-            faces,
-            options.n_modes,
-            method=options.method,
-            mesher=options.mesher,
-            cache=False,
-            progress=False,
-        )
-    texts = (" ".join(str(one.message).split()) for one in caught if issubclass(one.category, UserWarning))
-    seconds = round(time.monotonic() - started, 2)
-    done = replace(record, status=DONE, warnings=list(dict.fromkeys(texts)), seconds=seconds)
-    cyclic, note = times is not None and len(times) == len(files) + 1, json.dumps(asdict(done))
-    names = [file.name for file in files]
-    write_set(target, keyframes, faces, bases, names, times=times, cyclic=cyclic, note=note)
+        how: dict[str, Any] = {"method": options.method, "mesher": options.mesher, "cache": False, "progress": False}
+        bases = extract_bases(keyframes, faces, options.n_modes, **how)
+    texts = dict.fromkeys(" ".join(str(one.message).split()) for one in caught if issubclass(one.category, UserWarning))
+    record = Record(DONE, "", list(texts), round(time.monotonic() - started, 2), key)
+    cyclic, names = times is not None and len(times) == len(files) + 1, [file.name for file in files]
+    write_set(target, keyframes, faces, bases, names, times=times, cyclic=cyclic, note=json.dumps(asdict(record)))
 
 
 def _read_times(file: Path, n_keyframes: int) -> list[float]:
     """Times of the key-frames of a motion, of a cycle also its end: from a file, or even times without it."""
     try:
-        times = [float(word) for word in file.read_text().split()]
-        check_times(times, n_keyframes, None)
-        return times
-    except FileNotFoundError:
-        return [float(i) for i in range(n_keyframes)]
+        times = [float(word) for word in file.read_text().split()] if file.exists() else None
+        return check_times(times, n_keyframes, None).tolist()
     except ValueError as error:
         raise ValueError(f"{file.name}: {error}") from error
 

@@ -39,6 +39,14 @@ class ShapeBatch(NamedTuple):
         """Select shapes by their indices."""
         return ShapeBatch._make(None if tensor is None else tensor[index.to(tensor.device)] for tensor in self)
 
+    def with_rows(self, index: Tensor, others: "ShapeBatch") -> "ShapeBatch":
+        """Replace the shapes of these indices by others."""
+        fields = (
+            before if before is None or after is None else before.index_copy(0, index.to(before.device), after)
+            for before, after in zip(self, others, strict=True)
+        )
+        return ShapeBatch._make(fields)
+
     def locate(self, space: ShapeSpace, dtype: torch.dtype) -> "ShapeBatch":
         """Convert the batch to a dtype, and find the nearest key-frame of each shape."""
         shapes = self.shapes.to(dtype)
