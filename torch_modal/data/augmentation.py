@@ -216,8 +216,8 @@ class AugmentationSequential(ShapeAugmentation):
 
     Args:
         transforms: The transforms, in order; their own ``data_keys`` and ``keepdim`` have no effect.
-        options: ``data_keys`` and ``keepdim`` as for :class:`ShapeAugmentation`; a ``generator`` and a ``space`` for all
-            transforms, which by default have their own.
+        options: ``data_keys`` and ``keepdim`` as for :class:`ShapeAugmentation`; a ``generator`` and a ``space`` for
+            all transforms, which by default have their own.
 
     Raises:
         ValueError: A data key is unknown or doubled, there are no shapes, or an argument is no transform.
