@@ -85,11 +85,10 @@ class AccelerationLimit:
 
     def _clip(self, rows: Tensor) -> Tensor:
         """Vectors shortened to the bound where they are longer. *Shape:* ``(N, 3 V)``."""
-        factor = (self.most / _lengths(rows).clamp_min(torch.finfo(rows.dtype).tiny)).clamp_max(1)
+        factor = (self.most / _lengths(rows)).clamp_max(1)
         return (rows.unflatten(1, (3, -1)) * factor[:, None]).flatten(1)
 
 
 def _lengths(rows: Tensor) -> Tensor:
     """*Shape:* ``(N, 3 V) -> (N, V)``."""
-    x, y, z = rows.unflatten(1, (3, -1)).unbind(1)
-    return (x * x + y * y + z * z).sqrt()
+    return rows.unflatten(1, (3, -1)).square().sum(1).sqrt()

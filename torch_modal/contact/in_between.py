@@ -40,10 +40,8 @@ class ContactSolver(InBetweenSolver):
             return whole
         some = torch.nonzero(n_crossing).flatten()
         parts = [super(ContactSolver, self).forward(trees.rows(samples, slice(i, i + 1))) for i in some.tolist()]
-        each = zip(whole.solution, *(one.solution for one in parts), strict=True)
-        merged = (values[0].index_copy(0, some, torch.cat(values[1:])) for values in each)  # type: ignore[union-attr, arg-type]
-        shapes = whole.shapes.index_copy(0, some, torch.cat([one.shapes for one in parts]))
-        return InBetweenResult(shapes, Solution(*merged))
+        each = zip(*map(trees.leaves, (whole, *parts)), strict=True)
+        return trees.fill(whole, (values.index_copy(0, some, torch.cat(new)) for values, *new in each))  # type: ignore[no-any-return]
 
     def finish(self, x: Tensor, solution: Solution, rests: RestShapes) -> tuple[Tensor, Solution]:
         """Shapes and solutions with the numbers of far pairs; only one sample alone is separated."""

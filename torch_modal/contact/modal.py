@@ -50,25 +50,25 @@ def modal_displacement(
     bend = rate**3 * accelerations.T @ accelerations
     smooth = SMOOTHNESS * bend[:, None, :, None] * ((modes * masses[:, None]).flatten(1) @ flat.T)[:, None, :]
 
+    quadratic = 2 * smooth.reshape(slope.numel(), -1) + torch.block_diag(*stiffness)
+
     def displace(a: Tensor) -> Tensor:
-        return x + (a @ flat).view_as(x)
+        return x + (a.view_as(slope) @ flat).view_as(x)
 
     def value(a: Tensor) -> Tensor:
-        elastic = (slope * a).sum() + 0.5 * torch.einsum("si,sij,sj->", a, stiffness, a)
-        return elastic + SOFTNESS * contact.value(displace(a)).sum() + torch.einsum("ia,iajb,jb->", a, smooth, a)
+        return a @ (slope.flatten() + 0.5 * quadratic @ a) + SOFTNESS * contact.value(displace(a)).sum()
 
-    a = torch.zeros_like(slope)
+    a = torch.zeros_like(slope).flatten()
     for _ in range(NEWTON_STEPS):
         pushed, hardened = _in_modes(contact, displace(a), modes)
-        gradient = slope + torch.einsum("sij,sj->si", stiffness, a) + SOFTNESS * pushed
-        gradient = gradient + 2 * torch.einsum("iajb,jb->ia", smooth, a)
-        hessian = 2 * smooth.reshape(a.numel(), -1) + torch.block_diag(*(stiffness + SOFTNESS * hardened))
+        gradient = slope.flatten() + quadratic @ a + SOFTNESS * pushed.flatten()
+        hessian = quadratic + SOFTNESS * torch.block_diag(*hardened)
         ridge = 1e-9 * hessian.diagonal().mean()
         factor, info = torch.linalg.cholesky_ex(hessian + ridge * torch.eye(len(hessian)).to(hessian))
         if int(info):
             break
-        step = -torch.cholesky_solve(gradient.reshape(-1, 1), factor).view_as(a)
-        a = a + step_length(value(a), (gradient * step).sum(), value(a + step), step.abs().amax()) * step
+        step = -torch.cholesky_solve(gradient[:, None], factor)[:, 0]
+        a = a + step_length(value(a), gradient @ step, value(a + step), step.abs().amax()) * step
     return displace(a) - x
 
 

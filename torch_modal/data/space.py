@@ -13,7 +13,6 @@ from torch_modal.data.in_betweens import PairTables, read_or_compute
 from torch_modal.data.stored import StoredSet, motion_times
 from torch_modal.data.strain import mode_scales
 from torch_modal.geometry.canonical import size
-from torch_modal.geometry.crossings import require_contact
 from torch_modal.geometry.poisson import Reconstruction
 from torch_modal.geometry.rigid import best_fit
 from torch_modal.geometry.vectors import norm, pick
@@ -81,8 +80,6 @@ class ShapeSpace:
         # Checks and repairs the faces.
         self.faces = check_keyframes([self.bases[0].reference.double()], faces, warn=False).faces.cpu()
         self.settings = settings(preset, objective, solver, contact)
-        if self.settings.objective.contact:
-            require_contact()
         self.dtype = dtype
         #: Times of the key-frames, if they are a motion; if cyclic, with the time when the first comes again.
         self.motion, self.cyclic = motion_times(keyframe_times, len(self.bases), cyclic), cyclic

@@ -15,6 +15,7 @@ from torch_modal.elastic.shell import ALPHA, BETA, GAMMA
 from torch_modal.elastic.stretch import Stretch
 from torch_modal.elastic.term import Term
 from torch_modal.elastic.volume import Volume
+from torch_modal.geometry.crossings import require_contact
 
 
 def _choice(name: str, value: str, choices: tuple[str, ...]) -> None:
@@ -156,6 +157,7 @@ def settings(
 
     Raises:
         ValueError: There is no such preset, or ``mu`` or regions do not fit the space.
+        MissingPackageError: Contact without that extra.
     """
     _choice("preset", preset, tuple(PRESETS))
     chosen = PRESETS[preset]
@@ -167,6 +169,8 @@ def settings(
     if objective.space == "joint" and (mu is not None or solver.regions):
         what = "mu weighs the similarity" if mu is not None else f"regions={solver.regions} are interpolated"
         raise ValueError(f"{what} of the two shapes of Eq. 4; the joint space has one: preset='paper' has two")
+    if objective.contact:
+        require_contact()
     return Settings(objective, solver)
 
 

@@ -4,7 +4,6 @@ import torch
 from torch import Tensor
 
 from torch_modal.autograd import disable_compile, is_traced, outside_inference_mode, run_outside_transforms
-from torch_modal.geometry.crossings import require_contact
 from torch_modal.inbetween.results import InBetweenResult, report, with_exact_keyframes
 from torch_modal.inbetween.settings import Objective, Preset, Solver, settings
 from torch_modal.keyframes.arrays import broadcast_leading
@@ -59,8 +58,6 @@ class InBetween(InBetweenLayer):
                 "[basis_a, basis_b]"
             )
         chosen = settings(preset, objective, solver, contact)
-        if chosen.objective.contact:
-            require_contact()
         if chosen.objective.space == "paired" and not len(ends[0].modes):
             raise ValueError("the paired space (Eq. 4) is one of modes; pass bases, not key-frames")
         super().__init__(ends * 2 if len(ends) == 1 else ends, faces, chosen)

@@ -14,7 +14,6 @@ from torch_modal.elastic.energy import RestShapes
 from torch_modal.elastic.shell import ALPHA, BETA
 from torch_modal.elastic.term import Mesh
 from torch_modal.geometry.bodies import bodies
-from torch_modal.geometry.crossings import require_contact
 from torch_modal.inbetween.alignment import Pose
 from torch_modal.inbetween.comparison import SLACK_OF_PATHS, blend_towards_starts
 from torch_modal.inbetween.results import InBetweenResult, join_bodies, report, trivial_solution, with_exact_keyframes
@@ -95,9 +94,7 @@ class Path(PreciseModule):
             raise ValueError("the paired space (Eq. 4) knows the middle of a pair only; a path needs space='joint'")
         #: True where shapes are pushed apart: per interval, not per time as in a layer, to stay continuous.
         self.contact = objective.contact
-        if self.contact:
-            require_contact()
-        self.objective = replace(objective, contact=False) if self.contact else objective
+        self.objective = replace(objective, contact=False)
         self.register_buffer("times", check_times(times, n, cyclic).to(buffers[0].reference.device))
         self.bases = nn.ModuleList(buffers)
         #: Number of key-frames, K.

@@ -13,7 +13,7 @@ from torch import Tensor
 from torch_modal.elastic.backend import choose
 from torch_modal.errors import MeshWarning
 from torch_modal.geometry.connectivity import Connectivity
-from torch_modal.geometry.crossings import Crossings, require_contact
+from torch_modal.geometry.crossings import Crossings
 from torch_modal.inbetween.results import report
 from torch_modal.inbetween.settings import Objective, Preset, Settings, Solver, settings
 from torch_modal.keyframes.check import check_keyframes
@@ -112,8 +112,6 @@ def subdivide(
     if recursive and (smooth or n_frames is not None):
         raise ValueError("the paired space (Eq. 4) knows the middle of a pair only: leave out smooth and n_frames")
     smooth = not recursive and n_keys > 2 if smooth is None else smooth
-    if chosen.objective.contact:
-        require_contact()
     needs_modes = chosen.objective.contact or bool(chosen.objective.terms) or not (smooth and n_keys > 2)
     if made is None and n_modes and needs_modes:
         if callable(bases):
