@@ -18,7 +18,7 @@ import torch_modal as tm
 from torch_modal.data.samples import load_sample
 from torch_modal.geometry.rotations import exp
 from torch_modal.motion import subdivide as sequence
-from torch_modal.motion.cubics import Cubics, Squared, cubics, offset
+from torch_modal.motion.cubics import Cubics, Squared, cubics
 from torch_modal.motion.path import Path
 
 DOUBLE = torch.float64
@@ -46,13 +46,6 @@ def path(motion: Shapes) -> Path:
 # --------------------------------------------------------------------------------------------------- cubic motion
 
 
-def along(found: Cubics, i: int, u: Tensor) -> Tensor:
-    """The way along one interval. *Shape:* ``(T,) -> (T, ...)``."""
-    step, first, last = (part[i] for part in found)
-    u = u.view(-1, *[1] * step.dim())
-    return u * step + offset(first, last, u)
-
-
 @pytest.mark.parametrize("cyclic", [False, True])
 def test_where_nothing_is_limited_it_is_the_spline_of_scipy(cyclic: bool, generator: torch.Generator) -> None:
     knots, u = times(0.0, 0.7, 1.9, 2.4, 3.6, 4.1), torch.linspace(0, 1, 9, dtype=DOUBLE)
@@ -65,7 +58,8 @@ def test_where_nothing_is_limited_it_is_the_spline_of_scipy(cyclic: bool, genera
     truth = CubicSpline(knots.numpy(), x.numpy(), bc_type="periodic" if cyclic else "natural")
     for i in range(5):
         wanted = torch.from_numpy(truth(torch.lerp(knots[i], knots[i + 1], u).numpy()))
-        torch.testing.assert_close(x[i] + along(found, i, u), wanted, rtol=0, atol=1e-12)
+        way = Cubics(*(values[:, None] for values in found)).along(i, torch.zeros(9, dtype=torch.int64), u)
+        torch.testing.assert_close(x[i] + way, wanted, rtol=0, atol=1e-12)
 
 
 # ------------------------------------------------------------------------------------------------------------- laws

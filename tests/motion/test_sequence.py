@@ -210,13 +210,3 @@ def test_linear_sequence(scattered: Shapes) -> None:
 def test_what_subdivide_refuses(options: dict[str, Any], message: str, scattered: Shapes) -> None:
     with pytest.raises(ValueError, match=message):
         subdivide(scattered.keyframes, scattered.faces, **{"bases": scattered.bases, "levels": 1, **options})
-
-
-def test_exception_keyframes(scattered: Shapes) -> None:
-    one = scattered.pick(0)
-    with pytest.raises(ValueError, match="at least 2 are needed"):
-        subdivide(one.keyframes, one.faces, bases=one.bases)
-    broken = scattered.keyframes.clone()
-    broken[1, 5, 2] = torch.inf
-    with pytest.raises(ValueError, match="vertex 5 of key-frame 1"):
-        subdivide(broken, scattered.faces, bases=scattered.bases)

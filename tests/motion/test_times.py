@@ -57,11 +57,3 @@ def test_each_time_lies_in_one_interval(t: float, cyclic: bool, interval: int, f
 def test_a_time_outside_names_both_ends() -> None:
     with pytest.raises(ValueError, match=r"first and the last frame, 1 and 4; got 4\.5"):
         locate_times(torch.tensor([2, 4.5], dtype=F64), CYCLE, False, of="frame")
-
-
-def test_a_time_that_is_a_key_frames_up_to_rounding_is_its_own() -> None:
-    times = torch.tensor([0, 0.3, 1], dtype=F64)
-    t = torch.tensor([0.3], dtype=torch.float32)
-    eps = torch.finfo(t.dtype).eps
-    assert locate_times(t.double(), times, False, eps)[1].tolist() == [0]
-    assert 0 < abs(float(locate_times(t.double(), times, False)[1])) < 1e-7

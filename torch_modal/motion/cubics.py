@@ -46,6 +46,12 @@ class Cubics(NamedTuple):
     first: Tensor
     last: Tensor
 
+    def along(self, i: int, which: Tensor, u: Tensor) -> Tensor:
+        """The way from the start of an interval to times in it, 0 to 1. *Shape:* ``(B,), (B,) -> (B, ...)``."""
+        step, first, last = (values[i][which] for values in self)
+        wide = u.view(-1, *[1] * (step.dim() - 1))
+        return wide * step + offset(first, last, wide)
+
 
 def cubics(
     steps: Tensor, durations: Tensor, cyclic: bool, squared: Squared = torch.square, scheme: Scheme | None = None

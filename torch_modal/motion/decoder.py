@@ -17,7 +17,7 @@ from torch_modal.autograd import disable_compile, full_precision, outside_infere
 from torch_modal.elastic.backend import TorchBackend
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.rotations import exp
-from torch_modal.geometry.triangle_frames import Frames, bend, frames_of, sides
+from torch_modal.geometry.triangle_frames import bend, frames_of, sides
 from torch_modal.keyframes.arrays import broadcast_leading, check_tensor
 from torch_modal.keyframes.check import check_arrays
 from torch_modal.motion.cubics import evaluate_by_interval
@@ -190,15 +190,13 @@ def scale_modes(modes: Tensor, size: Tensor | float) -> Tensor:
 
 
 def bending_columns(reference: Tensor, faces: Tensor, displaced: Tensor) -> Tensor:
-    """Turns and strains of the triangles by displacements. *Shape:* ``(V, 3), (F, 3), (k, V, 3) -> (k, 6, F)``."""
+    """Turns and strains of the triangles by displacements, bounded in slivers; none of triangles without a size.
+
+    *Shape:* ``(V, 3), (F, 3), (k, V, 3) -> (k, 6, F)``.
+    """
     rest = frames_of(reference[None], faces)
     turn, strain = bend(sides(displaced.movedim(-1, 0).contiguous(), faces), rest)
-    return _limit_slivers(torch.cat([rest.coordinates(turn), strain]), rest)
-
-
-def _limit_slivers(columns: Tensor, rest: Frames) -> Tensor:
-    """Bound turns and strains of slivers; zero them for triangles without a size. *Shape:* ``(6, k, F)``."""
-    areas = rest.twice_areas
+    columns, areas = torch.cat([rest.coordinates(turn), strain]), rest.twice_areas
     columns = torch.where(areas / rest.size > SMALLEST_SIDE * rest.size.mean(), columns, 0)
     squared = columns.square().sum(0) + columns[4].square()  # the off-diagonal entry counts twice
     limit = LARGEST_RATIO * ((areas * squared).sum(1, keepdim=True) / areas.sum()).sqrt()

@@ -62,7 +62,7 @@ class PathEditor:
                 changed then.
         """
         if shape is None:
-            shape = outside_inference_mode(self.path)(self.keyframes, t)
+            shape = self.path(self.keyframes, t)
         shape = self._check_shape(shape)
         path = self.path.insert(t)
         i = int((path.times[:-1] == self.path.times).cumprod(0).sum())  # up to there, all times are as before
@@ -77,6 +77,7 @@ class PathEditor:
         at = fill_times(times, range(0, self.steps * len(times), self.steps))
         return at[:-1] if self.path.cyclic else at
 
+    @outside_inference_mode
     def shapes(self) -> Tensor:
         """All shapes; intervals that no change has touched are not computed again. *Shape:* ``(T, V, 3)``."""
         at, intervals = self.times(), []
@@ -84,12 +85,10 @@ class PathEditor:
             same = made is not None and torch.equal(made[1][0], needed[0])
             if made is None or not same or not bool(((made[1][1] - needed[1]).abs() <= UNSEEN_CHANGE).all()):
                 times = at[i * self.steps : (i + 1) * self.steps]
-                made = outside_inference_mode(self.path)(self.keyframes, times), needed
-                self._made[i] = made
+                self._made[i] = made = self.path(self.keyframes, times), needed
             intervals.append(made[0])
         return torch.cat(intervals if self.path.cyclic else [*intervals, self.keyframes[-1:]])
 
-    @outside_inference_mode
     def _dependencies(self) -> list[tuple[Tensor, Tensor]]:
         """Key-frames and velocities that each interval follows from, in visible units. *Shape:* ``(2, V, 3), (n,)``."""
         path, closed = self.path, torch.cat([self.keyframes, self.keyframes[:1]])

@@ -197,8 +197,7 @@ class Path(PreciseModule):
         result = evaluate_by_interval(
             segment, len(self.pairs), lambda i, rows: self.evaluate_interval(knots, flat, i, which[rows], u[rows])
         )
-        pairs = torch.tensor(self.pairs, device=segment.device)[segment]
-        ends = torch.stack([flat[which, k] for k in pairs.unbind(-1)], 1).to(keyframes.dtype)
+        ends = flat[which[:, None], torch.tensor(self.pairs, device=segment.device)[segment]].to(keyframes.dtype)
         exact = with_exact_keyframes(result.shapes, ends, torch.stack([1 - u, u], -1))
         return result._replace(shapes=exact).unflatten(lead)
 

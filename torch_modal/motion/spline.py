@@ -162,9 +162,7 @@ class Spline(nn.Module):
 
     def straight(self, knots: Knots, i: int, which: Tensor, u: Tensor) -> Tensor:
         """Shapes whose vertices move along cubics. Arguments as for :meth:`forward`."""
-        step, first, last = (cubic[i][which] for cubic in knots.vertices)
-        wide = u[:, None, None]
-        return knots.shapes[i][which] + wide * step + offset(first, last, wide)
+        return knots.shapes[i][which] + knots.vertices.along(i, which, u)
 
     def forward(
         self,
@@ -222,5 +220,4 @@ class Spline(nn.Module):
         end = (knots.turns.last[i][which] + knots.turns.step[i][which])[:, None] @ knots.rotations[i + 1][which]
         last = end.squeeze(1) - step
         rotation = start @ exp(wide * step) @ exp(offset(first, last, wide))
-        move, first, last = (cubic[i][which] for cubic in knots.moves)
-        return Pose(rotation, knots.centres[i][which] + wide * move + offset(first, last, wide))
+        return Pose(rotation, knots.centres[i][which] + knots.moves.along(i, which, u))
