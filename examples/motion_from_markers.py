@@ -22,6 +22,7 @@ from _sculpt import bind, place_bones, restore_volume, sculpt, skin
 from make_samples import SAMPLES
 from torch import Tensor
 from tqdm import tqdm
+from train_timing import farthest_points
 
 import torch_modal as tm
 from torch_modal.geometry.rigid import best_fit
@@ -77,14 +78,11 @@ def gallop(n_frames: int) -> tuple[Tensor, Tensor]:
 def problem(frames: Tensor, faces: Tensor, keys: list[int], cyclic: bool, generator: torch.Generator) -> Problem:
     """Markers far from each other."""
     diagonal = float((frames[0].amax(0) - frames[0].amin(0)).norm())
-    chosen = [0]
-    while len(chosen) < N_MARKERS:
-        apart = (frames[0][:, None] - frames[0][chosen]).norm(dim=-1).amin(1)
-        chosen.append(int(apart.argmax()))
+    chosen = farthest_points(frames[0], N_MARKERS, first=0)
     noise = torch.randn(len(frames), N_MARKERS, 3, generator=generator, dtype=torch.float64) / 3**0.5
     seen = torch.rand(len(frames), N_MARKERS, generator=generator) > LOST
     markers = frames[:, chosen] + NOISE * diagonal * noise
-    return Problem(frames, faces, keys, cyclic, torch.tensor(chosen), markers, seen, diagonal)
+    return Problem(frames, faces, keys, cyclic, chosen, markers, seen, diagonal)
 
 
 def by_amplitudes(known: Problem, steps: int) -> tuple[Tensor, Tensor]:

@@ -28,6 +28,7 @@ from _sculpt import bind, place_bones, sculpt, skin
 from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 from tqdm import tqdm
+from train_timing import edge_lengths
 
 import torch_modal as tm
 
@@ -249,12 +250,6 @@ def judged(data: Strides, space: Space, net: Next) -> Learned:
     lengths, true_lengths = edge_lengths(x, data.faces), edge_lengths(truth, data.faces)
     edges = 100 * float((lengths / true_lengths - 1).abs().mean())
     return Learned(reconstruction, one, off(x, truth), edges, x[0])
-
-
-def edge_lengths(x: Tensor, faces: Tensor) -> Tensor:
-    """Lengths of the sides of all faces. *Shape:* ``(..., V, 3) -> (..., F, 3)``."""
-    corners = x[..., faces, :]
-    return (corners - corners.roll(1, -2)).norm(dim=-1)
 
 
 def draw(data: Strides, results: dict[str, Learned], out: Path) -> None:

@@ -6,7 +6,7 @@ loss compares the decoded markers with the seen ones: all that the network learn
 network is trained with linear interpolation as its decoder, for comparison. Both are judged on frames that neither has
 seen: how far the time is off, how far all vertices are off, and how far the edges have lost their length.
 
-    python examples/train_timing.py [--steps 60] [--out out/timing.png]
+    python examples/train_timing.py [--steps 60]
 
 The motion is that of the sample's own frames at 0, 1/4, 1/2, 3/4 and 1, which come from bones and not from the layer;
 in training they are joined by straight lines. The fingers do not bend at the same time there, so that no path of one
@@ -14,10 +14,8 @@ parameter follows them exactly.
 """
 
 import argparse
-import tempfile
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import NamedTuple
 
 import torch
@@ -25,9 +23,7 @@ from torch import Tensor, nn
 
 import torch_modal as tm
 
-SAMPLE = Path(tm.__file__).parent / "samples" / "hand"
 TRUE_TIMES = torch.tensor([0.25, 0.5, 0.75], dtype=torch.float64)
-VIEW = (-55.0, 12.0)
 Decoder = Callable[[Tensor], Tensor]
 
 
@@ -49,12 +45,12 @@ class Data(NamedTuple):
 
 
 class Learned(NamedTuple):
-    """What one decoder has taught its encoder, on frames that were not trained on."""
+    """Results with one decoder, on frames that were not trained on."""
 
     losses: list[float]
     """Root mean square distance of the markers in each step, in percent of the bounding-box diagonal."""
     times: Tensor
-    """Told times of the true frames, for each draw of the noise. *Shape:* ``(R, 3)``."""
+    """Predicted times of the true frames, for each draw of the noise. *Shape:* ``(R, 3)``."""
     shapes: Tensor
     """The shapes decoded from the mean of those. *Shape:* ``(3, V, 3)``."""
     timing_error: float
@@ -82,10 +78,9 @@ def load_data(n_seen: int = 64, n_markers: int = 16, noise: float = 0.005, seed:
         seed: Of times and noise.
     """
     generator = torch.Generator().manual_seed(seed)
-    keyframes, faces = tm.load_keyframes([SAMPLE / f"key-{i}.ply" for i in (0, 1)])
-    truth, _ = tm.load_keyframes([SAMPLE / f"true-{i}.ply" for i in (1, 2, 3)])
-    diagonal = (keyframes[0].amax(0) - keyframes[0].amin(0)).norm()
-    keyframes, truth = keyframes / diagonal, truth / diagonal
+    sample = tm.load_sample("hand")
+    diagonal = (sample.keyframes[0].amax(0) - sample.keyframes[0].amin(0)).norm()
+    keyframes, truth = sample.keyframes / diagonal, sample.truth / diagonal
     markers = farthest_points(keyframes[0], n_markers)
 
     frames = torch.cat([keyframes[:1], truth, keyframes[1:]])[:, markers]
@@ -94,7 +89,7 @@ def load_data(n_seen: int = 64, n_markers: int = 16, noise: float = 0.005, seed:
     seen = torch.lerp(frames[left], frames[left + 1], (place - left)[:, None, None])
     unseen = truth[:, markers].expand(8, -1, -1, -1)
     seen, unseen = (x + noise * torch.randn(x.shape, generator=generator, dtype=x.dtype) for x in (seen, unseen))
-    return Data(keyframes, faces, markers, seen, unseen, truth)
+    return Data(keyframes, sample.faces, markers, seen, unseen, truth)
 
 
 def farthest_points(x: Tensor, n: int, first: int | None = None) -> Tensor:
@@ -177,62 +172,11 @@ def edge_lengths(x: Tensor, faces: Tensor) -> Tensor:
     return (corners - corners.roll(1, -2)).norm(dim=-1)
 
 
-def draw(data: Data, result: Result, out: Path) -> None:
-    """Losses, predicted times, and the decoded shapes, in one picture."""
-    from matplotlib.figure import Figure
-    from matplotlib.image import imread
-
-    names = {"layer": "in-between layer", "linear": "linear interpolation"}
-    colors = {"layer": "#2166ac", "linear": "#b2182b"}
-    inner = {"truth": data.truth} | {names[k]: v.shapes for k, v in result._asdict().items()}
-    rows = {name: torch.cat([data.keyframes[:1], x, data.keyframes[1:]]) for name, x in inner.items()}
-    errors = {name: 100 * (x - rows["truth"]).norm(dim=-1) for name, x in rows.items() if name != "truth"}
-    with tempfile.TemporaryDirectory() as folder:
-        sheet = tm.render_sequence(
-            rows,
-            data.faces,
-            Path(folder) / "sheet.png",
-            view=VIEW,
-            colors=errors,
-            color_label="distance from the truth in % of the bounding box",
-        )
-        shapes = imread(sheet)
-
-    figure = Figure(figsize=(13, 7.2), layout="constrained")
-    left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=(1, 1.45))[0]
-    falling, timing = left.subplots(2, 1)
-    for name, learned in result._asdict().items():
-        falling.plot(learned.losses, color=colors[name], label=names[name])
-        timing.plot(
-            TRUE_TIMES.expand_as(learned.times).flatten() + (0.008 if name == "layer" else -0.008),
-            learned.times.flatten(),
-            "o",
-            ms=4,
-            alpha=0.5,
-            color=colors[name],
-            label=f"{names[name]}: {learned.timing_error:.3f} off",
-        )
-    falling.set(xlabel="step of Adam", ylabel="distance of markers [%]", ylim=(0, None), title="what is trained on")
-    falling.legend(frameon=False)
-    timing.plot([0, 1], [0, 1], color="0.7", lw=1, zorder=0)
-    timing.set(
-        xlabel="true time", ylabel="predicted time", xlim=(0, 1), ylim=(0, 1), title="times, learned without labels"
-    )
-    timing.legend(frameon=False)
-    axes = right.subplots()
-    axes.imshow(shapes)
-    axes.axis("off")
-    axes.set_title("hands decoded from 16 noisy markers")
-    out.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(out, dpi=120)
-
-
-def main(steps: int = 60, out: Path | None = None, seed: int = 0) -> Result:
+def main(steps: int = 60, seed: int = 0) -> Result:
     """Train with both decoders.
 
     Args:
         steps: Steps of Adam.
-        out: Where the picture goes, if anywhere.
         seed: Of all that is random.
     """
     data = load_data(seed=seed)
@@ -246,23 +190,19 @@ def main(steps: int = 60, out: Path | None = None, seed: int = 0) -> Result:
     def straight(t: Tensor) -> Tensor:
         return torch.lerp(x_a, x_b, t[:, None, None])
 
-    result = Result(train(data, through_layer, steps, seed=seed), train(data, straight, steps, seed=seed))
-    if out is not None:
-        draw(data, result, out)
-    return result
+    return Result(train(data, through_layer, steps, seed=seed), train(data, straight, steps, seed=seed))
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--steps", type=int, default=60)
-    parser.add_argument("--out", type=Path, default=Path("out") / "timing.png")
     arguments = parser.parse_args()
     started = time.perf_counter()
-    results = main(arguments.steps, arguments.out)
+    results = main(arguments.steps)
     print("                       markers first -> last   time off   vertices off   edges off")
     for name, learned in results._asdict().items():
         print(
             f"{name:20s} {learned.losses[0]:12.2f} % -> {learned.losses[-1]:.2f} %   {learned.timing_error:8.3f}   "
             f"{learned.vertex_error:10.2f} %   {learned.edge_error:7.2f} %"
         )
-    print(f"{time.perf_counter() - started:.0f} s; picture: {arguments.out}")
+    print(f"{time.perf_counter() - started:.0f} s")

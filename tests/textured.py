@@ -98,19 +98,13 @@ def split_at_seams(faces: np.ndarray, n: int = 12) -> tuple[np.ndarray, np.ndarr
     Returns:
         The original vertex of each new one, the new faces, texture coordinates.
     """
-    n_body = 2 * n * 7
-    keys, rows = {}, []
-    for number, face in enumerate(faces.tolist()):
-        row = []
-        cap = number >= n_body
-        columns = [v % n for v in face]
-        for v, column in zip(face, columns, strict=True):
-            wraps = not cap and max(columns) - min(columns) > 1 and column == 0
-            u, w = (0.5, 0.5) if cap else (1.0 if wraps else column / n, v // n / 7)
-            row.append(keys.setdefault((v, u, w, cap), len(keys)))
-        rows.append(row)
-    original = np.array([key[0] for key in keys])
-    return original, np.array(rows), np.array([key[1:3] for key in keys], dtype=float)
+    cap = np.arange(len(faces))[:, None] >= 2 * n * 7
+    column = faces % n
+    wraps = (column == 0) & (np.ptp(column, axis=1, keepdims=True) > 1)
+    u, v = np.where(cap, 0.5, np.where(wraps, 1.0, column / n)), np.where(cap, 0.5, faces // n / 7)
+    corners = np.stack([faces, u, v, np.broadcast_to(cap, faces.shape)], -1).reshape(-1, 4)
+    split, rows = np.unique(corners, axis=0, return_inverse=True)
+    return split[:, 0].astype(int), rows.reshape(-1, 3), split[:, 1:3]
 
 
 def textured_glb(path: Path, shape: np.ndarray | None = None) -> Path:

@@ -29,9 +29,8 @@ def load_example(name: str) -> ModuleType:
     return module
 
 
-def test_train_timing_learns_times_without_labels(tmp_path: Path) -> None:
-    picture = tmp_path / "timing.png"
-    layer, linear = load_example("train_timing").main(steps=25, out=picture)
+def test_train_timing_learns_times_without_labels() -> None:
+    layer, linear = load_example("train_timing").main(steps=25)
     # An encoder that has learned nothing says 1/2 to everything: 0.167 off.
     assert layer.timing_error < 0.05
     assert layer.timing_error < 0.8 * linear.timing_error
@@ -42,7 +41,6 @@ def test_train_timing_learns_times_without_labels(tmp_path: Path) -> None:
     first, last = layer.losses[0], sum(layer.losses[-5:]) / 5
     assert last < 0.45 * first, (first, last)
     assert last < 0.65 * sum(linear.losses[-5:]) / 5
-    assert picture.stat().st_size > 50_000
 
 
 @pytest.mark.slow
@@ -103,9 +101,9 @@ def test_complete_is_nearer_than_the_path(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_new_shapes_are_drawn_and_poses_follow_their_markers(tmp_path: Path) -> None:
-    errors = load_example("new_shapes").main(tmp_path, n=20, n_modes=8)
+    errors = load_example("new_shapes").main(tmp_path, n_modes=8)
     assert max(errors["fitted"]) < 0.3 * min(errors["linear span"])
-    assert all((tmp_path / f"{name}.png").stat().st_size > 50_000 for name in ("shapes", "all", "markers"))
+    assert all((tmp_path / f"{name}.png").stat().st_size > 50_000 for name in ("shapes", "markers"))
 
 
 @pytest.mark.slow

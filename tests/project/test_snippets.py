@@ -21,6 +21,11 @@ from torch_modal.io.formats import ANIMATION_FORMATS, MESH_FORMATS
 
 QUICK = {"layer", "viewing"}
 """Pages that are tried in the default run; what others cost is not known beforehand."""
+WITH_CODE = [
+    pytest.param(page, id=page.stem, marks=[pytest.mark.slow] * (page.stem not in QUICK))
+    for page in PAGES
+    if any(block.language in {"python", "sh"} and block.is_run for block in blocks(page))
+]
 
 
 @pytest.fixture(scope="module")
@@ -41,12 +46,6 @@ def registered() -> Iterator[None]:
             del table[name]
 
 
-def pages_with(*languages: str) -> list[object]:
-    found = [page for page in PAGES if any(block.language in languages and block.is_run for block in blocks(page))]
-    assert len(found) > 6
-    return [pytest.param(page, id=page.stem, marks=[pytest.mark.slow] * (page.stem not in QUICK)) for page in found]
-
-
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_every_block_says_what_it_is(page: Path) -> None:
     """So that none is left out by its form."""
@@ -59,7 +58,7 @@ def test_every_block_says_what_it_is(page: Path) -> None:
     assert said == sum(not block.is_run for block in blocks(page)), "a mark that belongs to no block, or has no reason"
 
 
-@pytest.mark.parametrize("page", pages_with("python", "sh"))
+@pytest.mark.parametrize("page", WITH_CODE)
 def test_blocks_run_in_their_order(page: Path, meshes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(shutil.copytree(meshes, tmp_path / "work"))
     monkeypatch.setattr("webbrowser.open", lambda url: True)
@@ -72,7 +71,7 @@ def test_blocks_run_in_their_order(page: Path, meshes: Path, tmp_path: Path, mon
                 run_command(block, words)
 
 
-@pytest.mark.parametrize("page", pages_with("python", "sh"))
+@pytest.mark.parametrize("page", WITH_CODE)
 def test_the_first_block_runs_alone(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """In an empty folder: it needs no file that the page makes, or names, later."""
     monkeypatch.chdir(tmp_path)
