@@ -169,16 +169,7 @@ CASES: dict[str, Craft] = {
     "gltf: zero indices": gltf(("accessors", 1, {"componentType": 5125, "count": 2 * 10**9, "type": "SCALAR"})),
     "gltf: count": gltf(("accessors", 0, "count", MOST)),
     "gltf: sparse count": gltf(
-        (
-            "accessors",
-            0,
-            "sparse",
-            {
-                "count": 10**8,
-                "indices": {"componentType": 5125},
-                "values": {},
-            },
-        ),
+        ("accessors", 0, "sparse", {"count": 10**8, "indices": {"componentType": 5125}, "values": {}})
     ),
     "gltf: buffer": gltf(("buffers", 0, "byteLength", MOST), ("bufferViews", 0, "byteLength", MOST)),
     "gltf: NaN": gltf(("materials", 0, "pbrMetallicRoughness", "baseColorFactor", [float("nan")] * 4)),

@@ -213,20 +213,7 @@ def test_view_command_writes_a_page(
     assert Path(opened[0].removeprefix("file://")).is_file()
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--compare", "short"], r"\(3, "),
-        (["--compare", "cube.ply"], "vertices"),
-        (["--linear", "--keyframes", "0", "7"], "from 0 to 6"),
-        (["--keyframes", "7"], "from 0 to 6"),
-        (["--fps", "0"], "fps must be a positive"),
-        (["--compare", "missing.ply"], "no such file"),
-    ],
-)
 def test_command_says_what_is_wrong(
-    arguments: list[str],
-    message: str,
     tmp_path: Path,
     ball: Ball,
     growing: np.ndarray,
@@ -237,9 +224,16 @@ def test_command_says_what_is_wrong(
     tm.save_animation(growing, ball[1], "grow.glb", keyframe_indices=[0, 6])
     tm.save_frames(growing[:3], ball[1], "short")
     trimesh.creation.box().export("cube.ply")
-    assert main(["view", "grow.glb", *arguments, "--page", "page.html"]) == 1
-    assert re.search(message, capsys.readouterr().err)
-    assert not Path("page.html").exists()
+    for arguments, message in (
+        (["--compare", "short"], "(3, "),
+        (["--compare", "cube.ply"], "vertices"),
+        (["--linear", "--keyframes", "0", "7"], "from 0 to 6"),
+        (["--keyframes", "7"], "from 0 to 6"),
+        (["--fps", "0"], "fps must be a positive"),
+        (["--compare", "missing.ply"], "no such file"),
+    ):
+        assert main(["view", "grow.glb", *arguments, "--page", "page.html"]) == 1
+        assert message in capsys.readouterr().err and not Path("page.html").exists()
 
 
 # ----------------------------------------------------------------------------------------------------- in a browser

@@ -33,9 +33,7 @@ COMMANDS: dict[str, tuple[Callable[[Any], None], Callable[[Any], int | None]]] =
 status. The docstring of the second is the help: summary, description and examples with empty lines between them."""
 
 EXPECTED = (ValueError, OSError, MemoryError, ImportError)
-"""Errors of input, files and machine, which become one line; all others are bugs and show their traceback."""
-EXPECTED_NAMES = ("TetrahedralizationError", "ModalAnalysisError")
-"""Further such errors, whose modules take long to import."""
+"""Errors of input, files and machine, which become one line, as do errors of this package; all others are bugs."""
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -103,7 +101,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except Exception as error:
-        if args.debug or not (isinstance(error, EXPECTED) or type(error).__name__ in EXPECTED_NAMES):
+        if args.debug or not (isinstance(error, EXPECTED) or type(error).__module__.startswith("torch_modal.")):
             raise
         if isinstance(error, OSError) and error.strerror:
             reason = f"{str(error.filename)[:300]}: {error.strerror}" if error.filename else error.strerror

@@ -72,9 +72,9 @@ def write_usd(animation: Animation, path: Path) -> None:
     colors = None
     if asset is not None and "colors" in asset.carries:
         colors = np.ones((shapes.shape[1], 3), np.float32)
-        for part in asset.parts():
-            if part.colors is not None:
-                colors[part.vertices] = part.colors[:, :3]
+        for surface in asset.parts():
+            if surface.colors is not None:
+                colors[surface.vertices] = surface.colors[:, :3]
     shade = mesh.CreateDisplayColorPrimvar(UsdGeom.Tokens.constant if colors is None else UsdGeom.Tokens.vertex)
     shade.Set([Gf.Vec3f(*CLAY[:3])] if colors is None else Vt.Vec3fArray.FromNumpy(colors))
     stage.GetRootLayer().Save()

@@ -126,5 +126,5 @@ class Asset(ABC):
         holds = self.keeps if path.suffix.lower() == self.suffix else holds
         lost = [name for feature, name in self.carries.items() if feature not in holds]
         if lost:
-            listed = " and ".join(filter(None, [", ".join(lost[:-1]), lost[-1]]))
+            listed = ", ".join(lost[:-1]) + " and " * (len(lost) > 1) + lost[-1]
             warnings.warn(f"{path.name} is without the {listed} of {self.path.name}", MeshWarning, stacklevel=4)

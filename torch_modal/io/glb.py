@@ -93,7 +93,7 @@ def _add_skin(
     """
     weights, (bind, turns, shifts) = skin.weights.double().cpu().numpy(), skin.tracks()
     primitives = [primitive for mesh in document.get("meshes") for primitive in mesh["primitives"]]
-    vertices = [np.arange(len(weights))] if asset is None else [part.vertices for part in asset.parts()]
+    vertices = [np.arange(len(weights))] if asset is None else [surface.vertices for surface in asset.parts()]
     for primitive, rows in zip(primitives, vertices, strict=True):
         primitive["attributes"] |= document.add_influences(weights[rows])
     turns, shifts = turns[:, shown], shifts[shown]
@@ -138,24 +138,24 @@ def _document(shapes: FloatArray, faces: IntArray, asset: Asset | None, name: st
     _, first = np.unique(copies, return_index=True)
     smooth = np.stack([vertex_normals(shape[first], copies[faces])[copies] for shape in shapes])
     turned = carry_together(
-        [(part.normals, positions[part.vertices], part.triangles) for part in parts],
-        [shapes[:, part.vertices] for part in parts],
+        [(surface.normals, positions[surface.vertices], surface.triangles) for surface in parts],
+        [shapes[:, surface.vertices] for surface in parts],
     )
     document = Document()
     primitives = []
     materials: dict[Material, int] = {}
-    for part, normals in zip(parts, turned, strict=True):
-        index_type = np.uint16 if len(part.vertices) <= 65535 else np.uint32  # 65535 itself is no valid uint16 index
-        if part.material not in materials:
-            materials[part.material] = document.append("materials", _material(document, part.material))
-        normals = smooth[:, part.vertices] if normals is None else normals
-        primitive = document.add_frames(shapes[:, part.vertices], normals)
-        for key, kind, numbers in (("TEXCOORD_0", "VEC2", part.texcoords), ("COLOR_0", "VEC4", part.colors)):
+    for surface, normals in zip(parts, turned, strict=True):
+        index_type = np.uint16 if len(surface.vertices) <= 65535 else np.uint32  # 65535 itself is no valid uint16 index
+        if surface.material not in materials:
+            materials[surface.material] = document.append("materials", _material(document, surface.material))
+        normals = smooth[:, surface.vertices] if normals is None else normals
+        primitive = document.add_frames(shapes[:, surface.vertices], normals)
+        for key, kind, numbers in (("TEXCOORD_0", "VEC2", surface.texcoords), ("COLOR_0", "VEC4", surface.colors)):
             if numbers is not None:
                 primitive["attributes"][key] = document.add(numbers.astype(np.float32), kind, ARRAY_BUFFER)
-        corners = part.triangles.astype(index_type).reshape(-1)
+        corners = surface.triangles.astype(index_type).reshape(-1)
         primitive["indices"] = document.add(corners, "SCALAR", ELEMENT_ARRAY_BUFFER)
-        primitive["material"] = materials[part.material]
+        primitive["material"] = materials[surface.material]
         primitives.append(primitive)
     document.append("meshes", {"name": name, "primitives": primitives})
     document.append("nodes", {"name": name, "mesh": 0})

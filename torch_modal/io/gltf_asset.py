@@ -58,12 +58,12 @@ class GltfAsset(Asset):
         self._world = world_transforms(self.document)
         self._primitives: list[_Primitive] = []
         positions, faces, n = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], 0
-        posing = {"skeleton": False, "animations": bool(self.document.get("animations")), "morph targets": False}
+        posing = {"animations"} if self.document.get("animations") else set()
         for node, world in self._world.items():
             node_json = self.document.get("nodes", node)
             if "mesh" not in node_json:
                 continue
-            posing["skeleton"] |= "skin" in node_json
+            posing |= {"a skeleton"} if "skin" in node_json else set()
             shared: dict[int, tuple[FloatArray, slice]] = {}
             for primitive in self.document.get("meshes", node_json["mesh"])["primitives"]:
                 mode = primitive.get("mode", _TRIANGLES)
@@ -72,7 +72,7 @@ class GltfAsset(Asset):
                 if mode != _TRIANGLES or "POSITION" not in primitive.get("attributes", {}):
                     self.carries["groups"] = "lines and points"
                     continue
-                posing["morph targets"] |= "targets" in primitive
+                posing |= {"morph targets"} if "targets" in primitive else set()
                 accessor = primitive["attributes"]["POSITION"]
                 if accessor not in shared:
                     local = self.document.floats(accessor)
@@ -99,7 +99,7 @@ class GltfAsset(Asset):
         self._note("normals", "normals", "NORMAL" in names)
         self._note("colors", "vertex colours", "COLOR_0" in names)
         self._note("materials", "materials", self.document.get("materials"))
-        self._note("posing", " and ".join(name for name, there in posing.items() if there), any(posing.values()))
+        self._note("posing", " and ".join(sorted(posing)), posing)
 
     def play(self, times: FloatArray) -> FloatArray:
         """Shapes of the first animation, as players show them. *Shape:* ``(T,) -> (T, V, 3)``."""
@@ -171,14 +171,9 @@ class GltfAsset(Asset):
         # Each node gets a mesh of its own: the same mesh may be shown, and deformed, at several places.
         for node, group in groupby(self._primitives, lambda primitive: primitive.node):
             primitives = list(group)
-            try:
-                inverse = np.linalg.inv(self._world[node])
-            except np.linalg.LinAlgError:
-                name = old.get("nodes", node).get("name", node)
-                message = (
-                    f"{self.path}: the node {name} flattens its mesh, so that positions cannot be transformed back"
-                )
-                raise MeshError(message) from None
+            if np.linalg.det(self._world[node]) == 0:
+                raise MeshError(f"{self.path}: node {node} flattens its mesh; positions cannot be transformed back")
+            inverse = np.linalg.inv(self._world[node])
             mesh = copy.deepcopy({**old.get("meshes", old.get("nodes", node)["mesh"]), "primitives": []})
             mesh.pop("weights", None)
             shapes = [frames[:, one.points] @ inverse[:3, :3].T + inverse[:3, 3] for one in primitives]
