@@ -113,27 +113,6 @@ def test_what_an_obj_names_below_its_folder_keeps_its_place_in_a_copy(tmp_path):
         assert Image.open(io.BytesIO(part.material.texture)).getpixel((4, 4)) == color
 
 
-def test_what_an_obj_names_outside_its_folder_is_neither_read_nor_copied(tmp_path):
-    source = textured_obj(tmp_path / "in" / "deep", "bar.obj")
-    (tmp_path / "in" / "outside.png").write_bytes(png(RED))
-    (source.parent / "my bar.mtl").write_text("newmtl skin\nmap_Kd ../outside.png\nbump ../outside.png\n")
-    (tmp_path / "in" / "x.mtl").write_text("newmtl cap\nmap_Kd deep/blue.png\n")
-    source.write_text(source.read_text() + "mtllib ../x.mtl\n")
-    asset = tm.open_asset(source)
-    with warnings.catch_warnings(record=True) as said:
-        warnings.simplefilter("always")
-        out = write(asset, tmp_path / "out" / "a.obj", tube()[0])
-    why = "is not read, as it lies outside the folder of bar.obj; move it there"
-    assert sorted(str(warning.message) for warning in said) == [
-        f"bar.obj is without a material library: '../x.mtl' {why}",
-        f"bar.obj is without a texture of my bar.mtl: '../outside.png' {why}",
-    ]
-    assert files_of(tmp_path / "out") == {"a.obj", "my bar.mtl"}
-    assert (out.parent / "my bar.mtl").read_bytes() == (source.parent / "my bar.mtl").read_bytes()
-    assert lines_of(out)[-1] == "mtllib ../x.mtl"
-    assert [part.material.texture for part in asset.parts()] == [None, None]
-
-
 def test_a_copy_does_not_take_the_name_of_a_texture(tmp_path):
     source = textured_obj(tmp_path / "in", "bar.obj")
     (tmp_path / "in" / "frame-000.obj").write_bytes(png(BLUE))
@@ -154,16 +133,6 @@ def test_companions_are_not_overwritten_unasked(tmp_path):
     assert [p.name for p in (tmp_path / "out").iterdir()] == ["blue.png"]
     write(asset, tmp_path / "out" / "a.obj", asset.positions, overwrite=True)
     write(asset, tmp_path / "out" / "b.obj", asset.positions)  # the same content is no obstacle
-
-
-def test_missing_materials_are_said(tmp_path):
-    source = textured_obj(tmp_path, "bar.obj")
-    (tmp_path / "blue.png").unlink()
-    with pytest.warns(MeshWarning, match=r"bar.obj is without a texture of my bar.mtl: 'blue\.png' is not there"):
-        write(tm.open_asset(source), tmp_path / "new" / "a.obj", tube()[0])
-    (tmp_path / "my bar.mtl").unlink()
-    with pytest.warns(MeshWarning, match="bar.obj is without a material library: 'my' is not there"):
-        write(tm.open_asset(source), tmp_path / "newer" / "a.obj", tube()[0])
 
 
 @pytest.mark.parametrize(
