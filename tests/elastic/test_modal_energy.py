@@ -11,7 +11,7 @@ from torch_modal.elastic.bend import Bend
 from torch_modal.elastic.energy import Energy, RestShapes
 from torch_modal.elastic.modal import Derivatives, ModalEnergy
 from torch_modal.elastic.shell import ALPHA, BETA, GAMMA, ShellEnergy
-from torch_modal.elastic.term import Mesh
+from torch_modal.elastic.term import Mesh, Term
 
 N, BATCH = 5, 3
 MOEBIUS = [[i, (i + 1) % 7, (i + 2) % 7] if i % 2 == 0 else [(i + 1) % 7, i, (i + 2) % 7] for i in range(7)]
@@ -25,6 +25,16 @@ class SmoothShell(ShellEnergy):
         super().__init__(faces, alpha, beta, gamma)
         self.terms[1] = Bend(beta)
         self.energy = Energy(Mesh.of(self.faces, int(faces.max()) + 1), [*self.terms])
+
+
+class PlainShell(SmoothShell):
+    """The same by ``torch.func``, without what the terms write out."""
+
+    def __init__(self, faces: Tensor) -> None:
+        super().__init__(faces)
+        for term in self.terms:
+            written = {name: getattr(Term, name) for name in ("linearise", "hessians")}
+            term.__class__ = type("Plain", (type(term),), written)
 
 
 class Case:
@@ -93,7 +103,7 @@ def surface_of(request: pytest.FixtureRequest, small_bars: Shapes) -> tuple[Tens
     return faces, x
 
 
-@pytest.mark.parametrize("kind", [ShellEnergy, SmoothShell])
+@pytest.mark.parametrize("kind", [ShellEnergy, SmoothShell, PlainShell])
 def test_agrees_with_autograd(surface_of: tuple[Tensor, Tensor], kind: type[ShellEnergy]) -> None:
     """Gauss-Newton takes the largest curvature of the periodic function; with the rest it is the true Hessian."""
     case = Case(*surface_of, kind)
