@@ -251,16 +251,11 @@ def kernel_functions() -> KernelFunctions:
 
     @wp.func
     def weight(x: mat33, q: vec2, mean: real):
-        e = x[0]  # without hinge_of(), whose adjoint would be computed, too
-        n1 = wp.cross(e, x[1])
-        n2 = wp.cross(x[2], e)
-        base = wp.dot(e, e)
-        square1 = wp.dot(n1, n1)
-        square2 = wp.dot(n2, n2)
-        bound = flatness * base
+        h = hinge_of(x)
         result = real(0.0)
-        if wp.min(square1, square2) > bound * bound + tiny_square:
-            result = wp.min(real(2.0) * base / (wp.sqrt(square1) + wp.sqrt(square2)), ratio)
+        if not h.flat:
+            area = real(0.5) * (wp.length(h.n1) + wp.length(h.n2))
+            result = wp.min(wp.dot(x[0], x[0]) / area, ratio)
         return result
 
     @wp.func
