@@ -79,7 +79,7 @@ class ShapeSpace:
         self.bases = [basis.to("cpu") for basis in check_bases(bases)]
         # Checks and repairs the faces.
         self.faces = check_keyframes([self.bases[0].reference.double()], faces, warn=False).faces.cpu()
-        self.settings = settings(preset, objective, solver, contact)
+        self.settings = settings(preset, objective, solver, contact=contact)
         self.dtype = dtype
         #: Times of the key-frames, if they are a motion; if cyclic, with the time when the first comes again.
         self.motion, self.cyclic = motion_times(keyframe_times, len(self.bases), cyclic), cyclic

@@ -107,6 +107,15 @@ class KernelFunctions:
     """True if an edge may have either direction."""
 
 
+@outside_inference_mode
+def register_weight(module: nn.Module, name: str, value: float | Tensor) -> None:
+    """Keep a number or a parameter as an attribute, another tensor as a buffer."""
+    if isinstance(value, Tensor) and not isinstance(value, nn.Parameter):
+        module.register_buffer(name, as_normal_tensor(value))
+    else:
+        setattr(module, name, value)
+
+
 class Term(nn.Module):
     """One kind of measure on a mesh, as a term of an energy.
 
@@ -139,10 +148,7 @@ class Term(nn.Module):
 
     def __init__(self, stiffness: float | Tensor = 1.0) -> None:
         super().__init__()
-        if isinstance(stiffness, Tensor) and not isinstance(stiffness, nn.Parameter):
-            self.register_buffer("stiffness", outside_inference_mode(as_normal_tensor)(stiffness))
-        else:
-            self.stiffness = stiffness
+        register_weight(self, "stiffness", stiffness)
 
     # ------------------------------------------------------------------------------------------- required of a term
     def elements(self, mesh: Mesh) -> Tensor:

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -121,8 +121,8 @@ class Solver:
         _choice("gradient", self.gradient, ("implicit", "unroll"))
         _choice("unconverged", self.unconverged, ("warn", "raise"))
         _choice("backend", self.backend, names())
-        for name, lowest in (("max_steps", 0), ("local_steps", 0), ("polish", 0), ("regions", 0)):
-            _whole(name, getattr(self, name), lowest)
+        for name in ("max_steps", "local_steps", "polish", "regions"):
+            _whole(name, getattr(self, name), 0)
         if not self.tolerance >= 0:
             raise ValueError(f"tolerance bounds a relative gradient norm and is 0 or more; got {self.tolerance!r}")
 
@@ -148,12 +148,10 @@ def settings(
     preset: str,
     objective: Objective | None = None,
     solver: Solver | None = None,
-    contact: bool | None = None,
-    space: str | None = None,
-    mu: float | Tensor | None = None,
     regions: int | None = None,
+    **changes: Any,
 ) -> Settings:
-    """The settings of a preset; given ones replace its own.
+    """The settings of a preset, with another objective or solver, and with changes of the objective that are not None.
 
     Raises:
         ValueError: There is no such preset, or ``mu`` or regions do not fit the space.
@@ -161,13 +159,12 @@ def settings(
     """
     _choice("preset", preset, tuple(PRESETS))
     chosen = PRESETS[preset]
-    changes = {"contact": contact, "space": space, "mu": mu}
     changes = {name: value for name, value in changes.items() if value is not None}
     objective, solver = objective or chosen.objective, solver or chosen.solver
-    objective = replace(objective, **changes) if changes else objective  # type: ignore[arg-type]
+    objective = replace(objective, **changes) if changes else objective
     solver = solver if regions is None else replace(solver, regions=regions)
-    if objective.space == "joint" and (mu is not None or solver.regions):
-        what = "mu weighs the similarity" if mu is not None else f"regions={solver.regions} are interpolated"
+    if objective.space == "joint" and ("mu" in changes or solver.regions):
+        what = "mu weighs the similarity" if "mu" in changes else f"regions={solver.regions} are interpolated"
         raise ValueError(f"{what} of the two shapes of Eq. 4; the joint space has one: preset='paper' has two")
     if objective.contact:
         require_contact()

@@ -7,9 +7,9 @@ import torch
 from torch import Tensor, nn
 
 from torch_modal.arrays import FloatArray
-from torch_modal.autograd import as_normal_tensor, full_precision, is_eager, outside_inference_mode, require_numbers
+from torch_modal.autograd import full_precision, is_eager, outside_inference_mode, require_numbers
 from torch_modal.contact.in_between import ContactSolver
-from torch_modal.elastic.term import Mesh
+from torch_modal.elastic.term import Mesh, register_weight
 from torch_modal.elastic.volume import encloses
 from torch_modal.geometry.bodies import bodies
 from torch_modal.geometry.canonical import own_order
@@ -111,6 +111,7 @@ class InBetweenLayer(PreciseModule):
 
     terms: Any
     cores: Any
+    mu: Any
     separate = True
     """False to solve all bodies as one problem, for example with contact."""
 
@@ -118,11 +119,7 @@ class InBetweenLayer(PreciseModule):
         super().__init__()
         self.objective, self.solver = chosen
         self.terms = nn.ModuleList(self.objective.all_terms())
-        mu = self.objective.mu
-        if isinstance(mu, Tensor) and not isinstance(mu, nn.Parameter):
-            self.register_buffer("mu", as_normal_tensor(mu))
-        else:
-            self.mu = mu
+        register_weight(self, "mu", self.objective.mu)
         self.bases = nn.ModuleList(bases)
         self.faces = torch.from_numpy(as_faces(faces))
         self._build()

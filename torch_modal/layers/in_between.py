@@ -57,7 +57,7 @@ class InBetween(InBetweenLayer):
                 f"an in-between lies between two bases, got {len(ends)}; Path and Blend take more: pass "
                 "[basis_a, basis_b]"
             )
-        chosen = settings(preset, objective, solver, contact)
+        chosen = settings(preset, objective, solver, contact=contact)
         if chosen.objective.space == "paired" and not len(ends[0].modes):
             raise ValueError("the paired space (Eq. 4) is one of modes; pass bases, not key-frames")
         super().__init__(ends * 2 if len(ends) == 1 else ends, faces, chosen)

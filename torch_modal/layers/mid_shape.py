@@ -41,7 +41,7 @@ class MidShape(nn.Module):
         regions: int | None = None,
     ) -> None:
         super().__init__()
-        objective, solver = settings(preset, objective, solver, None, space, mu, regions)
+        objective, solver = settings(preset, objective, solver, regions, space=space, mu=mu)
         self.in_between = InBetween(bases, faces, objective=objective, solver=solver)
 
     @property

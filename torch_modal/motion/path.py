@@ -89,7 +89,7 @@ class Path(PreciseModule):
         n = len(buffers)
         if n < 2:
             raise ValueError(f"a path needs two key-frames or more, got {n}")
-        objective, self.solver = settings(preset, objective, solver, contact)
+        objective, self.solver = settings(preset, objective, solver, contact=contact)
         if objective.space == "paired":
             raise ValueError("the paired space (Eq. 4) knows the middle of a pair only; a path needs space='joint'")
         #: True where shapes are pushed apart: per interval, not per time as in a layer, to stay continuous.

@@ -107,7 +107,7 @@ def subdivide(
     carrier = Proxy(keyframes, faces, n_proxy) if n_proxy else None
     if carrier:
         keyframes, faces = check_keyframes(carrier.keyframes, carrier.faces)
-    chosen = settings(preset, objective, solver, contact, None, mu, regions)
+    chosen = settings(preset, objective, solver, regions, contact=contact, mu=mu)
     recursive = chosen.objective.space == "paired"
     if recursive and (smooth or n_frames is not None):
         raise ValueError("the paired space (Eq. 4) knows the middle of a pair only: leave out smooth and n_frames")
