@@ -1,7 +1,6 @@
 """Output formats of one's own: one function each, found by its suffix."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +9,7 @@ from textured import bend, textured_obj
 import torch_modal as tm
 from torch_modal.cli import main as cli
 from torch_modal.errors import MeshWarning
-from torch_modal.io.formats import ANIMATION_FORMATS, MESH_FORMATS, OutputFormat, Timing
+from torch_modal.io.formats import ANIMATION_FORMATS, MESH_FORMATS, OutputFormat
 
 FACES = np.array([[0, 1, 2]])
 FRAMES = np.arange(18.0).reshape(2, 3, 3)
@@ -60,12 +59,3 @@ def test_messages_and_help_list_all_formats(tmp_path: Path, capsys: pytest.Captu
         cli.main(["subdivide", "--help"])
     said = " ".join(capsys.readouterr().out.split())
     assert "{ply,obj,off,glb,xyz}" in said and all(suffix in said for suffix in (".glb", ".mp4", ".usdc", ".npz"))
-
-
-def test_samples_at_a_fixed_rate_repeat_no_end() -> None:
-    there = [0, 0.5, 1, 1.5, 2]
-    timing: dict[str, Any] = {"duration": 1.0, "fps": 4.0}
-    np.testing.assert_array_equal(Timing(3, **timing).samples(), there)
-    np.testing.assert_array_equal(Timing(3, **timing, ping_pong=True).samples(), [*there, 1.5, 1, 0.5])
-    np.testing.assert_allclose(Timing(3, **timing, cyclic=True).samples(), [0, 0.75, 1.5, 2.25])
-    np.testing.assert_array_equal(Timing(1, **timing, ping_pong=True).samples(), [0])

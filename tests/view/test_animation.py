@@ -33,6 +33,7 @@ def test_knots_and_samples_agree():
         np.testing.assert_allclose(samples, np.interp(np.arange(len(samples)) / 16, times, unrolled), atol=1e-12)
         # A video that starts again does not show its first picture twice.
         assert len(samples) == {"ping_pong": 64, "cyclic": 32}.get(next(iter(options), ""), 33)
+    assert Timing(1, ping_pong=True).samples().tolist() == [0]
 
 
 def test_ease_is_slow_at_both_ends():

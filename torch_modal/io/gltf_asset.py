@@ -63,7 +63,7 @@ class GltfAsset(Asset):
             node_json = self.document.get("nodes", node)
             if "mesh" not in node_json:
                 continue
-            posing |= {"a skeleton"} if "skin" in node_json else set()
+            posing |= {"skeleton"} if "skin" in node_json else set()
             shared: dict[int, tuple[FloatArray, slice]] = {}
             for primitive in self.document.get("meshes", node_json["mesh"])["primitives"]:
                 mode = primitive.get("mode", _TRIANGLES)
