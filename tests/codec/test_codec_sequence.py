@@ -120,13 +120,6 @@ def test_frames_of_the_decoder_are_found_again(encoded: tm.ModalSequence, motion
     assert encoded.n_floats == 3 * motion[0].numel() + 3 + 6 * (12 + 7)
 
 
-def test_own_amplitudes_are_found_again(motion: Tensor, bars: Shapes) -> None:
-    first = tm.encode(motion, bars.faces, [0, 3, 8], 12, progress=False)
-    again = tm.encode(first.decode(), bars.faces, [0, 3, 8], 12, progress=False)
-    assert float(again.errors.max()) < 1e-3 and float(again.errors.median()) < 1e-5
-    assert float((again.amplitudes - first.amplitudes).abs().max()) < 0.05 * float(first.amplitudes.abs().max())
-
-
 def test_a_rigid_motion_of_frames_goes_along(motion: Tensor, bars: Shapes, encoded: tm.ModalSequence) -> None:
     generator = torch.Generator().manual_seed(3)
     turned = motion.clone()

@@ -54,18 +54,6 @@ def test_places_by_hand(options: dict[str, Any], places: list[int]) -> None:
     assert keyframe_places(3, **options) == places
 
 
-@pytest.mark.parametrize("cyclic", [False, True])
-def test_places_are_even(cyclic: bool) -> None:
-    for n_keyframes in range(2, 7):
-        for n_frames in range(n_keyframes, 40):
-            places = torch.tensor(keyframe_places(n_keyframes, cyclic=cyclic, n_frames=n_frames))
-            steps = places.diff()
-            assert places[0] == 0
-            assert places[-1] == (n_frames if cyclic else n_frames - 1)
-            assert steps.min() >= 1
-            assert steps.max() - steps.min() <= 1
-
-
 # ------------------------------------------------------------------------------------------ counts and keyframes
 
 
@@ -115,15 +103,6 @@ def test_presets_are_those_of_the_layers(scattered: Shapes) -> None:
 
 
 # ---------------------------------------------------------------------------------------------- the shapes between
-
-
-def test_a_pair_has_the_shapes_of_the_layer(scattered: Shapes) -> None:
-    pair = scattered.pick(1, 2)
-    frames = subdivide(pair.keyframes, pair.faces, n_frames=6, bases=pair.bases, progress=False, **COARSE)
-    layer = tm.InBetween(pair.bases, pair.faces, **COARSE)
-    t = torch.linspace(0, 1, 6, dtype=torch.float64)
-    torch.testing.assert_close(frames, layer(*pair.keyframes, t), rtol=0, atol=1e-9)
-    assert largest(frames[1] - torch.lerp(*pair.keyframes, 0.2)) > 0.1, "not linear interpolation"
 
 
 def test_cycle_closes(scattered: Shapes) -> None:

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torch_modal.arrays import BoolArray
 from torch_modal.contact.detect import Search
+from torch_modal.elastic.backend import choose
 from torch_modal.errors import MeshError
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.crossings import require_contact
@@ -44,8 +45,8 @@ class SelfContacts(NamedTuple):
 def self_contacts(x: Any, faces: Any, ignore: Any = None) -> SelfContacts:
     """Find self-intersections of shapes.
 
-    Two triangles without a common vertex intersect if their interiors do (exact predicates of ``libigl``); touching and
-    coplanar triangles do not. Depths come from winding numbers (``libigl``).
+    Two triangles without a common vertex intersect if their interiors do, by exact predicates; touching and coplanar
+    triangles do not. Depths come from winding numbers (``libigl``).
     Not differentiable.
 
     Args:
@@ -70,7 +71,8 @@ def self_contacts(x: Any, faces: Any, ignore: Any = None) -> SelfContacts:
             message = f"ignore has {ignored.shape[-2]} vertices, the shapes have {shapes.shape[1]}; they must be equal"
             raise MeshError(message)
         known = check_arrays(ignored.reshape(-1, *ignored.shape[-2:]), faces)[1]
-    search = Search(Connectivity(corners, shapes.shape[1]), known, known[0] if len(known) else shapes[0])
+    mesh, like = Connectivity(corners, shapes.shape[1]), known[0] if len(known) else shapes[0]
+    search = Search(mesh, known, like, choose("auto").crossings(mesh, like))
     if not search.diagonal > 0:
         raise MeshError("all vertices of a shape lie at one place: it has no size")
     pairs = [search.pairs(shape) for shape in shapes]

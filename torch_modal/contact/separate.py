@@ -98,11 +98,8 @@ def separate(
             x = start + field
             dual = dual.index_add(0, chosen, (alone - x)[chosen])
             springs[limited] = PULL * areas[limited]
-        some = (
-            every
-            if k == SEPARATION_ROUNDS[0]
-            else torch.unique(torch.cat([active.shapes, torch.nonzero(n_far).flatten()]))
-        )
+        some = torch.unique(torch.cat([active.shapes, torch.nonzero(n_far).flatten()]))
+        some = every if k == SEPARATION_ROUNDS[0] else some
         contacts, counts = search(x, some)
         active, n_far = contacts.with_former(active), n_far.index_copy(0, some, counts)
         if k < SEPARATION_ROUNDS[0]:
