@@ -49,8 +49,7 @@ class Search(Crossings):
         """
         pairs = self.far_pairs(x)
         if not len(pairs):
-            none = np.zeros(0, np.int64)
-            return none, none, 0
+            return np.zeros(0, np.int64), np.zeros(0, np.int64), 0
         corners = np.zeros(len(x), dtype=bool)
         corners[self.mesh.faces[pairs.reshape(-1)]] = True
         before = self.known_inside

@@ -1,5 +1,6 @@
 """The smooth motion through key-frames: splines of triangle rotations and sizes, then one Poisson solve."""
 
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import torch
@@ -140,13 +141,9 @@ class Spline(nn.Module):
 
             return cubics(steps, durations, self.cyclic, squared_norm, self.scheme)
 
-        faces = self.rotations[0].faces
-        here, steps = frames_of(shapes[0], faces), []
-        unit = here.size / len(shapes)
-        for rotations_of, shape in zip(self.rotations, shapes[1:], strict=True):
-            there = frames_of(shape, faces)
-            steps.append(rotations_of.step(here, there))
-            here, unit = there, unit + there.size / len(shapes)
+        frames = [frames_of(shape, self.rotations[0].faces) for shape in shapes]
+        steps = [each.step(*ends) for each, ends in zip(self.rotations, pairwise(frames), strict=True)]
+        unit = torch.stack([each.size for each in frames]).mean(0)
         unit = torch.maximum(unit, SMALLEST * unit.mean(-1, keepdim=True))
         unit = torch.cat([torch.ones_like(unit)[None].expand(3, -1, -1), unit[None].expand(3, -1, -1)])
         triangles = Cubics(*(unit * cubic for cubic in fit_cubics(torch.stack(steps) / unit, 1)))
