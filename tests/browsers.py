@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import shutil
 from collections.abc import Iterator
@@ -20,28 +21,17 @@ class NoBrowser(Exception):
     """No page can be opened here, and why."""
 
 
-def find_browser() -> tuple[str, str]:
-    """Files of a browser and of its driver; the driver is never downloaded."""
-    try:
-        import selenium.webdriver  # noqa: F401
-    except ImportError:
-        raise NoBrowser("selenium is not installed") from None
-    browser = next(filter(None, map(shutil.which, BROWSERS)), None)
-    driver = shutil.which("chromedriver")
-    if browser is None or driver is None:
-        missing = "no Chromium or Chrome" if browser is None else "no chromedriver"
-        raise NoBrowser(f"{missing} on the PATH (on Debian: apt-get install chromium chromium-driver)")
-    return browser, driver
-
-
 @contextmanager
 def open_browser(width: int = 1200, height: int = 800, *extra: str) -> Iterator[Chrome]:
     """A browser that reaches nothing but files, and writes down every request. It draws in software."""
+    browser = next(filter(None, map(shutil.which, BROWSERS)), None)
+    driver = shutil.which("chromedriver")  # never downloaded
+    if importlib.util.find_spec("selenium") is None or browser is None or driver is None:
+        raise NoBrowser("selenium, Chromium or Chrome, and chromedriver are needed (apt-get install chromium-driver)")
     from selenium.common.exceptions import WebDriverException
     from selenium.webdriver import Chrome, ChromeOptions
     from selenium.webdriver.chrome.service import Service
 
-    browser, driver = find_browser()
     options = ChromeOptions()
     options.binary_location = browser
     for argument in (

@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
+from unittest.mock import MagicMock
 
 import pytest
 import torch
@@ -40,26 +41,17 @@ class Body:
 
 @pytest.fixture
 def addon(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    registered: list[type] = []
-    menu: list[Any] = []
-    fake: Any = ModuleType("bpy")
-    operator = type("Operator", (), {"report": lambda self, kind, text: self.said.append((kind, text))})
-    fake.types = SimpleNamespace(
-        AddonPreferences=type("AddonPreferences", (), {}),
-        Operator=operator,
-        VIEW3D_MT_object=SimpleNamespace(append=menu.append, remove=menu.remove),
-    )
-    fake.props = SimpleNamespace(
-        **{name: lambda **options: options for name in ("StringProperty", "IntProperty", "BoolProperty")}
-    )
-    fake.utils = SimpleNamespace(register_class=registered.append, unregister_class=registered.remove)
+    fake = MagicMock()
+    fake.types.AddonPreferences = type("AddonPreferences", (), {})
+    fake.types.Operator = type("Operator", (), {"report": lambda self, kind, text: self.said.append((kind, text))})
     monkeypatch.setitem(sys.modules, "bpy", fake)
-    found = load_example("blender/in_between_keys/__init__")
-    found.register()
-    assert len(registered) == 3 and len(menu) == 1
-    found.unregister()
-    assert not registered and not menu
-    return found
+    module = load_example("blender/in_between_keys/__init__")
+    module.register()
+    module.unregister()
+    utils, menu = fake.utils, fake.types.VIEW3D_MT_object
+    assert utils.register_class.call_count == utils.unregister_class.call_count == 3
+    assert menu.append.call_args_list == menu.remove.call_args_list and menu.append.call_count == 1
+    return module
 
 
 def run(addon: ModuleType, body: Body, program: str = PROGRAM) -> tuple[set[str], Any]:

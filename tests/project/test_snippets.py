@@ -9,7 +9,7 @@ import re
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from unittest.mock import patch
 
 import pytest
 from snippets import COMMAND, LANGUAGES, NOT_RUN, PAGES, ROOT, Block, blocks, commands, expanded, run_python
@@ -38,12 +38,8 @@ def meshes(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(autouse=True)
 def registered() -> Iterator[None]:
     """Formats and backends that a page registers are gone after it."""
-    tables: tuple[dict[str, Any], ...] = (MESH_FORMATS, ANIMATION_FORMATS, BACKENDS)
-    before = [set(table) for table in tables]
-    yield
-    for table, names in zip(tables, before, strict=True):
-        for name in set(table) - names:
-            del table[name]
+    with patch.dict(MESH_FORMATS), patch.dict(ANIMATION_FORMATS), patch.dict(BACKENDS):
+        yield
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
