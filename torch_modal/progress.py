@@ -15,13 +15,13 @@ class ProgressReport(tqdm):
     """A progress bar whose total may grow.
 
     Args:
-        total: Number of steps.
+        total: Number of steps; None if it is not known.
         what: Description of the work.
         progress: See :data:`Progress`.
         unit: Unit of the steps.
     """
 
-    def __init__(self, total: int, what: str, progress: Progress = None, unit: str = "step") -> None:
+    def __init__(self, total: int | None, what: str, progress: Progress = None, unit: str = "step") -> None:
         shown = sys.stderr is not None and sys.stderr.isatty() if progress is None else progress
         super().__init__(total=total, desc=what, unit=unit, leave=False, disable=not shown)
 

@@ -11,7 +11,7 @@ import torch_modal as tm
 from torch_modal.completion.bending import ModalBending
 from torch_modal.completion.energy import PointEnergy
 from torch_modal.completion.gradient import LastSolve
-from torch_modal.completion.pairs import Cloud, Pairs, SampledSurface
+from torch_modal.completion.pairs import Sample, SampledSurface
 from torch_modal.elastic.steps import FineEnergy
 from torch_modal.elastic.term import Mesh
 from torch_modal.geometry.rigid import best_fit
@@ -24,14 +24,10 @@ def tube():
     """A bending tube, half as thick as it is wide: shapes at five times, faces, and its diagonal."""
     n, m = 24, 12
     t, a = np.meshgrid(np.linspace(0, 1, n), np.arange(m) * 2 * np.pi / m, indexing="ij")
-    shapes = []
-    for bend in np.linspace(-1.2, 1.2, 5):
-        angle = bend * t
-        spine = np.stack([np.sin(angle), 1 - np.cos(angle)], -1) / max(abs(bend), 1e-9) if abs(bend) > 1e-9 else None
-        spine = np.stack([t, 0 * t], -1) if spine is None else spine * np.sign(bend)
-        radius = 0.12 - 0.05 * t
-        x = spine[..., 0] - radius * np.cos(a) * np.sin(angle)
-        y = spine[..., 1] * 1.0 + radius * np.cos(a) * np.cos(angle)
+    radius, shapes = 0.12 - 0.05 * t, []
+    for bend in (-1.2, -0.6, 1e-6, 0.6, 1.2):
+        angle, out = bend * t, radius * np.cos(a)
+        x, y = np.sin(angle) / bend - out * np.sin(angle), (1 - np.cos(angle)) / bend + out * np.cos(angle)
         rings = np.stack([x, y, 0.5 * radius * np.sin(a)], -1).reshape(-1, 3)
         shapes.append(np.concatenate([rings, rings[:m].mean(0)[None], rings[-m:].mean(0)[None]]))
     i, j = np.meshgrid(np.arange(n - 1), np.arange(m), indexing="ij")
@@ -75,148 +71,146 @@ def between(tube):
     return tm.complete(x[[0, 4]], faces, scans[::-1], times=[0.0, 4.0], progress=False)
 
 
-class TestKeyframesAndScans:
-    def test_shapes_of_a_gallop_are_far_nearer_than_the_path(self):
-        sample = tm.load_sample("creature")
-        ends, truth, faces = sample.keyframes[[0, 1]].double(), sample.truth[:1].double(), sample.faces
-        diagonal = float((truth[0].amax(0) - truth[0].amin(0)).norm())
-        scan = scanned(truth[0], faces, 0.5, np.array([0.6, 0.0, 0.8]), n=1000, noise=0.003 * diagonal)
-        found = tm.complete(ends, faces, [scan], progress=False)
-        path = tm.Path(ends, faces)(ends, 0.5)[None]
-        assert sample.true_times[0] == 0.5
-        assert error(found.shapes, truth, diagonal) < 0.4 * error(path, truth, diagonal)
-
-    def test_times_are_sorted_and_keyframes_exact(self, tube, between):
-        x = tube[0]
-        assert between.times.tolist() == [1.0, 2.0, 3.0]
-        assert torch.equal(between(0.0), x[0])
-        assert torch.equal(between(4.0), x[4])
-        assert torch.equal(between(torch.tensor([1.0, 2.0, 3.0])), between.shapes)
-
-    def test_misses_and_trust_are_in_the_given_order(self, between):
-        assert [len(one) for one in between.misses] == [400] * 3
-        assert all(float(one.median()) < 0.02 for one in between.misses)
-        assert all(float(one.min()) >= 0 and float(one.max()) <= 1 for one in between.trust)
-
-    def test_what_was_seen_is_more_certain(self, tube, between):
-        assert between.confidence.shape == (3, tube[0].shape[1])
-        seen = between.confidence > 0.5
-        assert 0.2 < float(seen.double().mean()) < 0.95
-        assert 0 <= float(between.confidence.min()) <= float(between.confidence.max()) <= 1
-
-    def test_what_moves_far_is_less_certain(self, tube, between):
-        before, x = tube[0][1], tube[0][2]
-        moved = (best_fit(before, x).apply(before) - x).norm(dim=1)
-        by_ring = torch.stack([moved, between.confidence[1]])[:, :-2].reshape(2, -1, 12).mean(2)
-        assert float(torch.corrcoef(by_ring)[0, 1]) < -0.8
+def test_shapes_of_a_gallop_are_far_nearer_than_the_path():
+    sample = tm.load_sample("creature")
+    ends, truth, faces = sample.keyframes[[0, 1]].double(), sample.truth[:1].double(), sample.faces
+    diagonal = float((truth[0].amax(0) - truth[0].amin(0)).norm())
+    scan = scanned(truth[0], faces, 0.5, np.array([0.6, 0.0, 0.8]), n=1000, noise=0.003 * diagonal)
+    found = tm.complete(ends, faces, [scan], progress=False)
+    path = tm.Path(ends, faces)(ends, 0.5)[None]
+    assert sample.true_times[0] == 0.5
+    assert error(found.shapes, truth, diagonal) < 0.4 * error(path, truth, diagonal)
 
 
-class TestTemplateAlone:
-    def test_a_template_follows_scans_of_two_sides(self, tube):
-        x, faces, diagonal = tube
-        scans = [
-            scanned(x[i], faces, i, side * VIEWS[i], i, noise=0.002 * diagonal) for i in range(5) for side in (1, -1)
-        ]
-        found = tm.complete(x[2], faces, scans, progress=False)
-        assert found.shapes.shape == x.shape
-        assert error(found.shapes, x, diagonal) < 0.25 * error(x[2].expand_as(x), x, diagonal)
-
-    def test_one_observation_is_one_shape(self, tube):
-        x, faces, diagonal = tube
-        seen = tm.Observation(3.0, x[1], vertices=torch.arange(len(x[1])))
-        found = tm.complete(x[2], faces, [seen], progress=False)
-        assert found.path is None
-        assert error(found(3.0), x[1], diagonal) < 0.7
-        with pytest.raises(ValueError, match="one shape alone"):
-            found(4.0)
-
-    def test_a_loose_part_that_was_not_seen_stays_with_the_body(self, tube):
-        x, faces, diagonal = tube
-        eye = x[2, :40] * 0.1 + x[2].mean(0) + torch.tensor([0.0, 0.0, 0.15])
-        some = faces[(faces < 40).all(1)]
-        rest = torch.cat([x[2], eye])
-        scans = [scanned(x[i], faces, i, VIEWS[i], i, noise=0.003 * diagonal) for i in (1, 2, 3)]
-        found = tm.complete(rest, torch.cat([faces, some + x.shape[1]]), scans, progress=False)
-        assert bool(found.shapes.isfinite().all())
-        assert float((found.shapes[1, -40:] - eye).norm(dim=-1).max()) < 0.1 * diagonal
+def test_times_are_sorted_keyframes_exact_and_misses_in_the_given_order(tube, between):
+    x = tube[0]
+    assert between.times.tolist() == [1.0, 2.0, 3.0]
+    assert torch.equal(between(0.0), x[0])
+    assert torch.equal(between(4.0), x[4])
+    assert torch.equal(between(torch.tensor([1.0, 2.0, 3.0])), between.shapes)
+    assert [len(one) for one in between.misses] == [400] * 3
+    assert all(float(one.median()) < 0.02 for one in between.misses)
+    assert all(float(one.min()) >= 0 and float(one.max()) <= 1 for one in between.trust)
 
 
-class TestMarkersAndMeshes:
-    def test_noise_of_meshes_is_removed(self, tube):
-        x, faces, diagonal = tube
-        noise = 0.01 * diagonal / 3**0.5
-        noisy = x + noise * torch.randn(x.shape, generator=torch.Generator().manual_seed(0), dtype=x.dtype)
-        every = torch.arange(x.shape[1])
-        given = [tm.Observation(i, one, vertices=every, noise=noise) for i, one in enumerate(noisy)]
-        found = tm.complete(x[2], faces, given, progress=False)
-        assert error(found.shapes, x, diagonal) < 0.6 * error(noisy, x, diagonal)
-
-    def test_markers_within_triangles_are_met(self, tube):
-        x, faces, diagonal = tube
-        corners = faces[::20]
-        weights = torch.full((len(corners), 3), 1 / 3, dtype=x.dtype)
-        places = x[1][corners].mean(1)
-        seen = tm.Observation(1.0, places, corners=corners, barycentric=weights, noise=0.001 * diagonal)
-        found = tm.complete(x[[0, 4]], faces, [seen], times=[0.0, 4.0], progress=False)
-        assert float(found.misses[0].mean()) < 0.006 * diagonal
-        assert error(found.shapes, x[1:2], diagonal) < 1.0
+def test_what_was_seen_is_more_certain(tube, between):
+    assert between.confidence.shape == (3, tube[0].shape[1])
+    assert 0.2 < float((between.confidence > 0.5).double().mean()) < 0.95
+    assert 0 <= float(between.confidence.min()) <= float(between.confidence.max()) <= 1
 
 
-class TestCoordinates:
-    def test_a_motion_and_other_units_change_nothing(self, tube):
-        x, faces, _ = tube
-        turn = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(1), dtype=x.dtype)).Q
-        turn = turn * torch.linalg.det(turn).sign()
-        scan = scanned(x[1], faces, 1.0, VIEWS[1])
-
-        def moved(points):
-            return 25.4 * points @ turn.T + 3.0
-
-        other = tm.Observation(1.0, moved(scan.points), normals=scan.normals @ turn.T, view=turn @ scan.view)
-        first = tm.complete(x[[0, 4]], faces, [scan], times=[0.0, 4.0], progress=False).shapes
-        second = tm.complete(moved(x[[0, 4]]), faces, [other], times=[0.0, 4.0], progress=False).shapes
-        assert float((moved(first) - second).abs().max()) < 1e-4 * 25.4
+def test_what_moves_far_is_less_certain(tube, between):
+    before, x = tube[0][1], tube[0][2]
+    moved = (best_fit(before, x).apply(before) - x).norm(dim=1)
+    by_ring = torch.stack([moved, between.confidence[1]])[:, :-2].reshape(2, -1, 12).mean(2)
+    assert float(torch.corrcoef(by_ring)[0, 1]) < -0.8
 
 
-class TestRefusals:
-    def test_other_units_and_shapes_are_refused(self, tube):
-        x, faces, _ = tube
-        seen, paired = [tm.Observation(0.0, x[1])], tm.Objective(space="paired")
-        for observations, options, message in (
-            ([tm.Observation(1.0, 1000 * x[1])], {}, "other units"),
-            (seen, {"times": [0.0]}, "has no time"),
-            ([tm.Observation(0.0, x[1][:3], vertices=[0, 1, 9999])], {}, "vertices lie in"),
-            ([], {}, "got none"),
-            (seen, {"objective": paired}, "space='joint'"),
-        ):
-            with pytest.raises(ValueError, match=message):
-                tm.complete(x[0], faces, observations, progress=False, **options)
+def test_a_template_follows_scans_of_two_sides(tube):
+    x, faces, diagonal = tube
+    scans = [scanned(x[i], faces, i, side * VIEWS[i], i, noise=0.002 * diagonal) for i in range(5) for side in (1, -1)]
+    found = tm.complete(x[2], faces, scans, progress=False)
+    assert found.shapes.shape == x.shape
+    assert error(found.shapes, x, diagonal) < 0.25 * error(x[2].expand_as(x), x, diagonal)
 
-    @pytest.mark.parametrize(
-        ("given", "message"),
-        [
-            ({"points": torch.zeros(2, 3)}, "n of 3 or more"),
-            ({"points": torch.full((4, 3), torch.nan)}, "points must be finite"),
-            ({"time": torch.inf}, "time must be finite"),
-            ({"normals": torch.zeros(3, 3)}, "normals have the shape"),
-            ({"vertices": [0, 1, 2, 3], "normals": torch.ones(4, 3)}, "clouds"),
-            ({"corners": torch.zeros(4, 3, dtype=torch.int64)}, "go together"),
-            ({"weights": torch.zeros(4)}, "not all 0"),
-            ({"noise": 0.0}, "above 0"),
-            ({"view": torch.zeros(3)}, "direction"),
-        ],
-    )
-    def test_an_observation_says_what_does_not_fit(self, given, message):
+
+def test_one_observation_is_one_shape(tube):
+    x, faces, diagonal = tube
+    seen = tm.Observation(3.0, x[1], vertices=torch.arange(len(x[1])))
+    found = tm.complete(x[2], faces, [seen], progress=False)
+    assert found.path is None
+    assert error(found(3.0), x[1], diagonal) < 0.7
+    with pytest.raises(ValueError, match="one shape alone"):
+        found(4.0)
+
+
+def test_a_loose_part_that_was_not_seen_stays_with_the_body(tube):
+    x, faces, diagonal = tube
+    eye = x[2, :40] * 0.1 + x[2].mean(0) + torch.tensor([0.0, 0.0, 0.15])
+    some = faces[(faces < 40).all(1)]
+    rest = torch.cat([x[2], eye])
+    scans = [scanned(x[i], faces, i, VIEWS[i], i, noise=0.003 * diagonal) for i in (1, 2, 3)]
+    found = tm.complete(rest, torch.cat([faces, some + x.shape[1]]), scans, progress=False)
+    assert bool(found.shapes.isfinite().all())
+    assert float((found.shapes[1, -40:] - eye).norm(dim=-1).max()) < 0.1 * diagonal
+
+
+def test_noise_of_meshes_is_removed(tube):
+    x, faces, diagonal = tube
+    noise = 0.01 * diagonal / 3**0.5
+    noisy = x + noise * torch.randn(x.shape, generator=torch.Generator().manual_seed(0), dtype=x.dtype)
+    every = torch.arange(x.shape[1])
+    given = [tm.Observation(i, one, vertices=every, noise=noise) for i, one in enumerate(noisy)]
+    found = tm.complete(x[2], faces, given, progress=False)
+    assert error(found.shapes, x, diagonal) < 0.6 * error(noisy, x, diagonal)
+
+
+def test_markers_within_triangles_are_met(tube):
+    x, faces, diagonal = tube
+    corners = faces[::20]
+    weights = torch.full((len(corners), 3), 1 / 3, dtype=x.dtype)
+    places = x[1][corners].mean(1)
+    seen = tm.Observation(1.0, places, corners=corners, barycentric=weights, noise=0.001 * diagonal)
+    found = tm.complete(x[[0, 4]], faces, [seen], times=[0.0, 4.0], progress=False)
+    assert float(found.misses[0].mean()) < 0.006 * diagonal
+    assert error(found.shapes, x[1:2], diagonal) < 1.0
+
+
+def test_a_motion_and_other_units_change_nothing(tube):
+    x, faces, _ = tube
+    turn = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(1), dtype=x.dtype)).Q
+    turn = turn * torch.linalg.det(turn).sign()
+    scan = scanned(x[1], faces, 1.0, VIEWS[1])
+
+    def moved(points):
+        return 25.4 * points @ turn.T + 3.0
+
+    other = tm.Observation(1.0, moved(scan.points), normals=scan.normals @ turn.T, view=turn @ scan.view)
+    first = tm.complete(x[[0, 4]], faces, [scan], times=[0.0, 4.0], progress=False).shapes
+    second = tm.complete(moved(x[[0, 4]]), faces, [other], times=[0.0, 4.0], progress=False).shapes
+    assert float((moved(first) - second).abs().max()) < 1e-4 * 25.4
+
+
+def test_other_units_and_shapes_are_refused(tube):
+    x, faces, _ = tube
+    seen, paired = [tm.Observation(0.0, x[1])], tm.Objective(space="paired")
+    for observations, options, message in (
+        ([tm.Observation(1.0, 1000 * x[1])], {}, "other units"),
+        (seen, {"times": [0.0]}, "has no time"),
+        ([tm.Observation(0.0, x[1][:3], vertices=[0, 1, 9999])], {}, "vertices lie in"),
+        ([], {}, "got none"),
+        (seen, {"objective": paired}, "space='joint'"),
+    ):
         with pytest.raises(ValueError, match=message):
-            tm.Observation(**({"time": 0.0, "points": torch.rand(4, 3)} | given))
+            tm.complete(x[0], faces, observations, progress=False, **options)
 
-    def test_something_else_has_low_confidence_and_a_warning(self, tube):
-        x, faces, diagonal = tube
-        ball = torch.randn(400, 3, generator=torch.Generator().manual_seed(0), dtype=x.dtype)
-        ball = 0.4 * diagonal * ball / ball.norm(dim=1, keepdim=True)
-        with pytest.warns(tm.MeshWarning, match="doubtful"):
-            found = tm.complete(x[0], faces, [tm.Observation(0.0, ball, noise=0.002)], progress=False)
-        assert float(found.confidence.mean()) < 0.5
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"points": torch.zeros(2, 3)}, "n of 3 or more"),
+        ({"points": torch.full((4, 3), torch.nan)}, "points must be finite"),
+        ({"time": torch.inf}, "time must be finite"),
+        ({"normals": torch.zeros(3, 3)}, "normals have the shape"),
+        ({"vertices": [0, 1, 2, 3], "normals": torch.ones(4, 3)}, "clouds"),
+        ({"corners": torch.zeros(4, 3, dtype=torch.int64)}, "go together"),
+        ({"weights": torch.zeros(4)}, "not all 0"),
+        ({"noise": 0.0}, "above 0"),
+        ({"view": torch.zeros(3)}, "direction"),
+    ],
+)
+def test_an_observation_says_what_does_not_fit(given, message):
+    with pytest.raises(ValueError, match=message):
+        tm.Observation(**({"time": 0.0, "points": torch.rand(4, 3)} | given))
+
+
+def test_something_else_has_low_confidence_and_a_warning(tube):
+    x, faces, diagonal = tube
+    ball = torch.randn(400, 3, generator=torch.Generator().manual_seed(0), dtype=x.dtype)
+    ball = 0.4 * diagonal * ball / ball.norm(dim=1, keepdim=True)
+    with pytest.warns(tm.MeshWarning, match="doubtful"):
+        found = tm.complete(x[0], faces, [tm.Observation(0.0, ball, noise=0.002)], progress=False)
+    assert float(found.confidence.mean()) < 0.5
 
 
 def test_derivatives_of_modal_bending(tube):
@@ -248,11 +242,11 @@ def test_derivatives_of_the_energy_of_points(tube):
     x, faces, _ = tube
     surface = SampledSurface(100 * x[0].numpy(), faces.numpy())
     weights, numbers = np.ones(len(x[1])), np.arange(len(x[1]))
-    cloud = Cloud(100 * x[1].numpy() + 1, None, weights / weights.sum(), numbers, 1.0, None)
-    pairs = cloud.places(surface)
+    cloud = Sample(100 * x[1].numpy() + 1, None, weights / weights.sum(), numbers, 1.0)
+    pairs = cloud.pair(surface)
     normals = np.random.default_rng(0).standard_normal((len(pairs.points), 3))
     places = places_between(faces.numpy()[:5], np.full((5, 3), 1 / 3), len(x[0]))
-    markers = Pairs(np.ones((5, 3)), None, np.ones(5), np.arange(5), 1.0, places)
+    markers = Sample(np.ones((5, 3)), None, np.ones(5), np.arange(5), 1.0, places)
     energy = PointEnergy([pairs._replace(normals=normals / np.linalg.norm(normals, axis=1, keepdims=True)), markers])
     at = energy.at(100 * x[:1])
     field = torch.randn(x[:1].shape, generator=torch.Generator().manual_seed(0), dtype=x.dtype)
@@ -267,7 +261,7 @@ def test_points_of_weight_zero_do_not_count_in_a_score(tube):
     surface, on, away = SampledSurface(100 * x[0].numpy(), faces.numpy()), 100 * x[0].numpy(), np.full((9, 3), 500.0)
     for points, n, score in ((np.concatenate([on, away]), len(on), 0), (away, 9, 1)):
         weights = (np.arange(len(points)) < n) / n
-        cloud = Cloud(points, None, weights, np.arange(len(points)), 1.0, None)
+        cloud = Sample(points, None, weights, np.arange(len(points)), 1.0)
         assert cloud.score(surface, 1.0) == pytest.approx(score, abs=1e-3)
 
 

@@ -109,33 +109,12 @@ def star() -> Mesh:
     return points, np.concatenate([np.stack(corners, axis=1) for corners in (*sides, *caps)])
 
 
-def shell() -> Mesh:
-    """A cup with a thick wall, as the muscle of a heart's chamber, slightly oval."""
-    angle = 1.1 * np.pi / 2 * np.linspace(0.15, 1, 16)
-    profile = [
-        (r * np.sin(a), -1.6 * r * np.cos(a)) for r, angles in ((1.0, angle), (0.75, angle[::-1])) for a in angles
-    ]
-    ends = (1e-9, profile[0][1] - 0.02), (1e-9, profile[-1][1] - 0.01)
-    body = trimesh.creation.revolve(np.array([ends[0], *profile, ends[1]]), sections=36)
-    body.merge_vertices(digits_vertex=5)
-    body.update_faces(body.nondegenerate_faces())
-    body.remove_unreferenced_vertices()
-    return np.array(body.vertices) * [1, 1.12, 1], np.array(body.faces, dtype=np.int64)
-
-
-SYMMETRIC = ("box", "cylinder", "sphere", "torus", "star", "shell")
-
-
 def symmetric(name: str) -> Mesh:
-    create = trimesh.creation
     body = {
-        "box": lambda: create.box((1.0, 1.5, 0.7)),
-        "cylinder": lambda: create.cylinder(0.5, 2.0, sections=24),
-        "sphere": lambda: create.icosphere(3),
-        "torus": lambda: create.torus(1.0, 0.35, major_sections=36, minor_sections=16),
-        "star": lambda: trimesh.Trimesh(*star()),
-        "shell": lambda: trimesh.Trimesh(*shell()),
-    }[name]()
+        "box": trimesh.creation.box((1.0, 1.5, 0.7)),
+        "torus": trimesh.creation.torus(1.0, 0.35, major_sections=36, minor_sections=16),
+        "star": trimesh.Trimesh(*star()),
+    }[name]
     if len(body.vertices) < 100:
         body = trimesh.Trimesh(*trimesh.remesh.subdivide_to_size(body.vertices, body.faces, 0.15 * body.scale / 2))
         body.merge_vertices()
@@ -152,10 +131,7 @@ def tilted(points: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return truth[order], np.argsort(order)[faces], truth
 
 
-@pytest.mark.parametrize(
-    "name",
-    ["star", *(pytest.param(name, marks=pytest.mark.slow) for name in SYMMETRIC if name != "star")],
-)
+@pytest.mark.parametrize("name", ["star", *(pytest.param(name, marks=pytest.mark.slow) for name in ("box", "torus"))])
 def test_symmetric_bodies_are_doubtful(name: str) -> None:
     """The other maps are given too, and fit as well."""
     points, faces = symmetric(name)

@@ -125,7 +125,7 @@ def test_dtype_and_units_follow_the_inputs(pair: tuple[Mesh, Mesh, np.ndarray]) 
 def test_the_second_time_is_from_the_cache(
     pair: tuple[Mesh, Mesh, np.ndarray], found: tm.Registration, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """By the content of both meshes and of the landmarks, which are vertices or points; in any dtype."""
+    """By the content of both meshes and of the landmarks, which are vertices or points."""
     (rest, faces), (there, there_faces), _ = pair
     calls: list[int] = []
 
@@ -135,23 +135,21 @@ def test_the_second_time_is_from_the_cache(
 
     monkeypatch.setattr(register_module._RegistrationProblem, "solve", solved)
 
-    def again(target: np.ndarray, marks: object = None, dtype: type = np.float64) -> tm.Registration:
-        own = rest.astype(np.float32).astype(dtype)
-        options = {"landmarks": marks, "cache_dir": tmp_path, "progress": False}
-        return register(own, faces, target, there_faces, **options)
+    def again(target: np.ndarray, marks: object = None, cache: bool = True) -> tm.Registration:
+        options = {"landmarks": marks, "cache_dir": tmp_path, "cache": cache, "progress": False}
+        return register(rest, faces, target, there_faces, **options)
 
-    first, second = again(there), again(there, dtype=np.float32)
-    assert calls == [0] and second.positions.dtype == torch.float32 and first.positions.dtype == torch.float64
-    assert second.warnings == ("one, with a comma", "two") and second.doubtful
+    again(there)
+    second = again(there)
+    assert calls == [0] and second.warnings == ("one, with a comma", "two") and second.doubtful
     assert second.to_target == found.to_target and isinstance(second.to_target, type(found.to_target))
     for name in ("barycentric", "target_corners", "landmark_errors"):
         assert torch.equal(getattr(second, name), getattr(found, name)), name
     again(there + 1e-9)
-    assert calls == [0, 1]
     marks = np.array([[3, 5], [40, 70]])
     again(there, marks)
-    again(there, np.stack([rest.astype(np.float32)[marks[:, 0]].astype(np.float64), there[marks[:, 1]]], axis=1))
-    register(rest, faces, there, there_faces, cache=False, progress=False)
+    again(there, np.stack([rest[marks[:, 0]], there[marks[:, 1]]], axis=1))
+    again(there, cache=False)
     assert calls == [0, 1, 2, 3]
 
 
@@ -236,15 +234,6 @@ def test_across_shapes(pair: tuple[Mesh, Mesh, np.ndarray], marked: bool) -> Non
     assert result.to_target.mean < 0.12 and result.flipped_area < 0.02 and not result.doubtful
 
 
-def test_symmetric_bodies_are_doubtful_across_shapes() -> None:
-    """Several maps fit: the ends of a bar are alike."""
-    bar = trimesh.creation.box((3.0, 1.0, 0.6)).subdivide_to_size(0.15)
-    bar.merge_vertices()
-    capsule = trimesh.creation.capsule(2.0, 0.5)
-    result = register(bar.vertices, bar.faces, capsule.vertices, capsule.faces, same_subject=False, progress=False)
-    assert result.doubtful and any("another map" in what for what in result.warnings)
-
-
 def test_attributes_are_sampled(pair: tuple[Mesh, Mesh, np.ndarray], found: tm.Registration) -> None:
     there = torch.from_numpy(pair[1][0])
     below = found.sample(there)  # positions are an attribute too
@@ -261,14 +250,6 @@ def test_attributes_are_sampled(pair: tuple[Mesh, Mesh, np.ndarray], found: tm.R
 
 def test_bad_input_is_refused(pair: tuple[Mesh, Mesh, np.ndarray], monkeypatch: pytest.MonkeyPatch) -> None:
     (rest, faces), target, _ = pair
-    for marks, what in (
-        ([[0, 1, 2]], r"vertex numbers \(n, 2\) or finite points"),
-        ([[0, 10**6]], "names vertex 1000000 of mesh 1"),
-        ([[0.5, 1.0]], "vertex numbers"),
-        (np.full((2, 2, 3), np.nan), "finite points"),
-    ):
-        with pytest.raises(tm.MeshError, match=what):
-            register(rest, faces, *target, landmarks=marks, progress=False)
     with pytest.raises(tm.MeshError, match="need 5 landmarks"):
         register(rest, faces, *target, landmarks=[[0, 0]], same_subject=False, progress=False)
     with pytest.raises(tm.MeshError, match="NaN"):
@@ -359,8 +340,14 @@ def test_landmark_files(tmp_path: Path) -> None:
             read_landmarks(file, 2)
     with pytest.raises(FileNotFoundError):
         read_landmarks(tmp_path / "none.txt", 2)
-    with pytest.raises(tm.MeshError, match="names vertex 9 of mesh 1"):
-        landmark_table(np.array([[0, 9]]), [np.zeros((3, 3)), np.zeros((3, 3))])
+    for marks, what in (
+        ([[0, 9]], "names vertex 9 of mesh 1"),
+        ([[0, 1, 2]], r"vertex numbers \(n, 2\) or finite points"),
+        ([[0.5, 1.0]], "vertex numbers"),
+        (np.full((2, 2, 3), np.nan), "finite points"),
+    ):
+        with pytest.raises(tm.MeshError, match=what):
+            landmark_table(np.array(marks), [np.zeros((3, 3)), np.zeros((3, 3))])
 
 
 @pytest.fixture(scope="module")
@@ -414,49 +401,16 @@ def test_register_command_writes_the_registered_mesh(
 
 
 @pytest.mark.slow
-def test_subdivide_meshes_of_different_connectivity(files: list[Path], tmp_path: Path) -> None:
-    out = tmp_path / "between.glb"
-    options = ["--register", "--modes", "6", "--levels", "1", "--mesher", "lattice"]
-    assert cli.main(["subdivide", *map(str, files[:2]), "--out", str(out), *options]) == 0
-    assert out.stat().st_size > 10_000
-
-
-@pytest.mark.slow
-def test_skin_that_stretches_is_found_with_landmarks() -> None:
-    """Gathered to stretched: the first fit is 1.3 % off and more, and with what contradicts the landmarks 3.7 %."""
-    import registration
-
-    case = registration.pair("creature", 3, 0, "non-manifold", 1017)
-    surface = MeshSurface(case.rest, case.triangles)
-    shape = SpectralShape(surface)  # of points spread over the template
-    chosen = surface.nearest_alike(shape.placed.vertices, shape.coarse.vertex_normals)[shape.samples[0][:5]]
-    marks = np.stack([case.rest[chosen], case.truth[chosen]], axis=1)
-    target = case.there, case.there_faces
-    found = register(case.rest, case.triangles, *target, landmarks=marks, cache=False, progress=False)
-    assert errors(found, case.truth).mean() < 1.2
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("flaw", ["none", "severed", "mirrored", "mirrored pose"])
+@pytest.mark.parametrize("flaw", ["none", "mirrored", "mirrored pose"])
 def test_confidence_in_a_hand(data_dir: Path, flaw: str) -> None:
-    """A piece of the target is severed by a plane, or it is a left hand."""
     keyframes, triangles = tm.load_keyframes(sorted((data_dir / "mh-hand").glob("*.obj")))
-    shapes, faces = keyframes.numpy(), triangles.numpy()
-    rest, there = shapes[0], shapes[0 if flaw == "mirrored" else 1]
-    order = np.random.default_rng(0).permutation(len(rest))
-    target, target_faces = there[order], np.argsort(order)[faces]
-    if flaw == "severed":
-        along = (rest - rest.mean(0)) @ np.linalg.svd(rest - rest.mean(0), full_matrices=False)[2][0]
-        along *= np.sign(along[np.abs(along).argmax()])  # towards the fingers
-        gone = (along < np.quantile(along, 0.16))[order]
-        target_faces = target_faces[~gone[target_faces].any(1)]
-    elif flaw.startswith("mirrored"):
+    rest, there = keyframes.numpy()[[0, 0 if flaw == "mirrored" else 1]]
+    target, target_faces, _ = shuffled(there, triangles.numpy())
+    if flaw != "none":
         target, target_faces = target * [-1, 1, 1], target_faces[:, ::-1]
-    result = register(rest, faces, target, target_faces, progress=False)
+    result = register(rest, triangles.numpy(), target, target_faces, progress=False)
     if flaw == "none":
         assert result.confidence > 0.9 and not result.warnings
         assert errors(result, there).mean() < 0.6
     else:
-        assert result.doubtful
-        said = "no target next to them" if flaw == "severed" else "mirror image"
-        assert any(said in line for line in result.warnings)
+        assert result.doubtful and any("mirror image" in line for line in result.warnings)

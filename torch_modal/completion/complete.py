@@ -81,8 +81,8 @@ def complete(
     """A motion through whole key-frames and partial, noisy samples.
 
     Modal poses of all frames are found first, by pairs of points and places on the surface, from far to near, outward
-    in time from what is known; points that nothing explains are tried on the limbs nearby. Then all vertices minimise
-    the distances together with Eq. 5 towards neighbours in time and whole shapes (docs/completion.md).
+    in time from what is known, and again between all others. Then all vertices minimise the distances together with
+    Eq. 5 towards neighbours in time and whole shapes (docs/completion.md).
 
     Args:
         keyframes: Whole shapes, which are exact, *shape* ``(K, V, 3)``, or one rest shape of no time, ``(V, 3)``.
@@ -143,7 +143,7 @@ def _complete(
     check_observations(observations, shapes.shape[1])
     exact = np.zeros(0) if is_template else check_times(times, len(shapes)).numpy()
     problem = CompletionProblem(shapes, torch.from_numpy(indices), exact, observations)
-    with ProgressReport(len(problem.frames) * (4 + ROUNDS), "completing", progress) as report:
+    with ProgressReport(len(problem.frames) * (3 + ROUNDS), "completing", progress) as report:
         poses = FramePoses(problem).search(report)
         if estimate_times:
             when = times_between(problem, poses)
@@ -160,8 +160,9 @@ def _complete(
             stacklevel=4,
         )
     moments = [frame.time for frame in problem.frames]
-    completed = dict(zip(moments, problem.to_caller(x).to(like), strict=True))
-    shape_at = completed | dict(zip(exact.tolist(), like, strict=False))
+    whole_at = dict(zip(exact.tolist(), like, strict=False))
+    shape_at = dict(zip(moments, problem.to_caller(x).to(like), strict=True)) | whole_at
+    solve_at = dict(zip(moments, solves, strict=True)) | dict.fromkeys(whole_at)
     order = sorted(shape_at)
     knots = torch.stack([shape_at[t] for t in order])
     completion = Completion(
@@ -173,5 +174,4 @@ def _complete(
         knots,
         Path(knots, problem.faces, times=order, objective=objective) if len(order) > 1 else None,
     )
-    solve_at: dict[float, LastSolve | None] = dict(zip(moments, solves, strict=True))
-    return completion, problem.axes, {t: None if t in exact else solve_at[t] for t in order}
+    return completion, problem.axes, {t: solve_at[t] for t in order}

@@ -7,7 +7,7 @@ import torch
 from scipy import sparse
 from torch import Tensor
 
-from torch_modal.completion.pairs import SLIDE, Pairs
+from torch_modal.completion.pairs import SLIDE, Sample
 from torch_modal.elastic.steps import Point
 
 
@@ -20,9 +20,8 @@ class PointEnergy:
         pairs: The places, each between three vertices at most, at one shape.
     """
 
-    def __init__(self, pairs: Sequence[Pairs]) -> None:
-        matrices = [one.places.tocsr() for one in pairs]
-        self.places = sparse.vstack(matrices).tocsr()
+    def __init__(self, pairs: Sequence[Sample]) -> None:
+        self.places = sparse.vstack([one.places for one in pairs]).tocsr()
         self.points = torch.from_numpy(np.concatenate([one.points for one in pairs]))
         #: The observed point of each pair. *Shape:* ``(n,)``.
         self.numbers = np.concatenate([one.numbers for one in pairs])

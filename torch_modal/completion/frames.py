@@ -1,6 +1,6 @@
 """Observations by their times, at a size of 100 in the axes of the first shape."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torch_modal.arrays import FloatArray
 from torch_modal.completion.observation import Observation
-from torch_modal.completion.pairs import Cloud, Pairs, SampledSurface
+from torch_modal.completion.pairs import NOISES, Sample
 from torch_modal.geometry.canonical import to_canonical
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.keyframes.arrays import require_units
@@ -18,8 +18,6 @@ SWAY, SOFT = 2.0, 3e-5
 """Standard deviation of the amplitude of the first mode, at a size of 100; least stiffness of the modes."""
 NOISE = 0.5
 """Of points before it is estimated, at a size of 100."""
-NOISES = 0.1, 2.0
-"""Least noise, and the largest that is estimated, at a size of 100."""
 HALF, NOISES_OF_HALF = 1.0, 3.0
 """Distance at which half of a miss counts, at least, and in noises."""
 
@@ -28,32 +26,11 @@ class Frame(NamedTuple):
     """Observations of one time."""
 
     time: float
-    clouds: list[Cloud]
-    markers: list[Pairs]
+    seen: list[Sample]
     soft: float
     """Stiffness of the modes that the observations leave, if amplitudes have the standard deviation :data:`SWAY`."""
     unit: float
     """Distance at which half of a miss counts."""
-
-    @property
-    def seen(self) -> list[Cloud | Pairs]:
-        """All observations."""
-        return [*self.clouds, *self.markers]
-
-    def with_noise(self, surface: SampledSurface) -> "Frame":
-        """The noise estimated where it is not known."""
-        clouds, markers = ([_with_noise(one, surface) for one in seen] for seen in (self.clouds, self.markers))
-        return self._replace(clouds=clouds, markers=markers)
-
-    def thin(self, n: int) -> "Frame":
-        """With so many points of each cloud, chosen at random, always the same."""
-        return self._replace(clouds=[cloud.thin(n) for cloud in self.clouds])
-
-
-def _with_noise(seen: Any, surface: SampledSurface) -> Any:
-    """The noise from the median of distances with such an error, from a surface or from a point."""
-    median = float(np.median(seen.misses(surface)[0])) / (0.6745 if isinstance(seen, Cloud) else 1.538)
-    return seen._replace(noise=seen.noise or float(np.clip(median, *NOISES)))
 
 
 class CompletionProblem:
@@ -92,26 +69,19 @@ class CompletionProblem:
         return (x / self.scale) @ torch.from_numpy(self.axes) + torch.from_numpy(self.centre)
 
     @staticmethod
-    def _frame(time: float, samples: list[Cloud | Pairs]) -> Frame:
-        soft = min((one.noise or NOISE) ** 2 / (SWAY**2 * len(one.points)) for one in samples)
-        unit = NOISES_OF_HALF * max(one.noise for one in samples)
-        clouds = [one for one in samples if isinstance(one, Cloud)]
-        markers = [one for one in samples if isinstance(one, Pairs)]
-        return Frame(time, clouds, markers, max(SOFT, soft), max(HALF, unit))
+    def _frame(time: float, seen: list[Sample]) -> Frame:
+        soft = min((one.noise or NOISE) ** 2 / (SWAY**2 * len(one.points)) for one in seen)
+        return Frame(time, seen, max(SOFT, soft), max(HALF, NOISES_OF_HALF * max(one.noise for one in seen)))
 
-    def _sample(self, one: Observation, end: int) -> Cloud | Pairs:
+    def _sample(self, one: Observation, end: int) -> Sample:
         points, known = self.to_canonical(one.points), self.template[self.faces.unique()]
         weights = np.ones(len(points)) if one.weights is None else one.weights.cpu().double().numpy()
-        noise = 0.0 if one.noise is None else max(one.noise * self.scale, NOISES[0])
-        weights, numbers = weights / weights.sum(), np.arange(end - len(points), end)
-        sample: Cloud | Pairs
-        if one.is_cloud:
-            normals, view = (None if x is None else self.to_canonical(x, True) for x in (one.normals, one.view))
-            sample = Cloud(points, normals, weights, numbers, noise, view)
-        else:
+        normals, view = (None if x is None else self.to_canonical(x, True) for x in (one.normals, one.view))
+        noise, places = 0.0 if one.noise is None else max(one.noise * self.scale, NOISES[0]), None
+        if not one.is_cloud:
             corners, barycentric = one.places()
             places = places_between(corners.cpu().numpy(), barycentric.cpu().double().numpy(), len(self.template))
-            sample = Pairs(points, None, weights, numbers, noise, places)
             known = torch.from_numpy(places @ self.template.numpy())
         require_units(f"{one}: the points", torch.from_numpy(points), "the first shape", known[None], 1 / self.scale)
-        return sample
+        numbers = np.arange(end - len(points), end)
+        return Sample(points, normals, weights / weights.sum(), numbers, noise, places, view)

@@ -70,18 +70,17 @@ class Observation:
             if not bool(torch.as_tensor(value).detach().isfinite().all()):
                 raise ValueError(f"{self}: {name} must be finite; leave out what was not observed")
         weights, view = values.get("weights"), values.get("view")
-        if (self.corners is None) != (self.barycentric is None):
-            raise ValueError(f"{self}: corners and barycentric go together")
-        if self.vertices is not None and self.corners is not None:
-            raise ValueError(f"{self}: markers lie at vertices, or in triangles (corners); got both")
-        if not self.is_cloud and (self.normals is not None or self.view is not None):
-            raise ValueError(f"{self}: normals and view belong to clouds; these points have their places already")
-        if weights is not None and not (bool((weights >= 0).all()) and bool(weights.sum() > 0)):
-            raise ValueError(f"{self}: weights are 0 or more, and not all 0")
-        if self.noise is not None and not 0 < self.noise < torch.inf:
-            raise ValueError(f"{self}: noise is a length above 0, in the unit of the points; got {self.noise}")
-        if view is not None and not bool(view.any()):
-            raise ValueError(f"{self}: view is a direction; got a vector of length 0")
+        for wrong, message in (
+            ((self.corners is None) != (self.barycentric is None), "corners and barycentric go together"),
+            (self.vertices is not None and self.corners is not None, "markers have vertices or corners; got both"),
+            (not self.is_cloud and (self.normals is not None or view is not None), "normals and view are for clouds"),
+            (weights is not None and not (weights >= 0).all(), "weights are 0 or more"),
+            (weights is not None and not weights.any(), "weights are not all 0"),
+            (self.noise is not None and not 0 < self.noise < torch.inf, "noise is a length above 0, in their unit"),
+            (view is not None and not view.any(), "view is a direction; got a vector of length 0"),
+        ):
+            if wrong:
+                raise ValueError(f"{self}: {message}")
         for name in values.keys() & {"normals", "view"}:
             lengths = values[name].norm(dim=-1, keepdim=True)
             values[name] = values[name] / lengths.clamp_min(torch.finfo(points.dtype).tiny)

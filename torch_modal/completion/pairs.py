@@ -1,6 +1,6 @@
-"""Pairs of observed points and places on a surface: by position and normal, in both directions, robust."""
+"""Pairs of observed points and places on a surface, by position and normal, and their robust weights."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import sparse
@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from torch_modal.arrays import BoolArray, FloatArray, IntArray
 from torch_modal.geometry.closest import closest_on_triangles, dot
-from torch_modal.geometry.connectivity import Connectivity, label_pieces
+from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.registration.surface import MeshSurface, places_between
 
 # Places of each triangle that are candidates: its middle, and one near each corner.
@@ -24,38 +24,76 @@ LEAST_COSINE = 0.3
 CELL, DEPTH, GRAZING = 2.0, 3.0, 0.15
 # Distance, in standard deviations of the noise, at which a point loses three quarters of its weight.
 OUTLIERS = 4.0
-# Neighbours of a point of a cloud, and how many of their usual distances are a gap.
-N_NEIGHBOURS, GAP = 8, 3.0
+# Least noise, and the largest that is estimated, at a size of 100.
+NOISES = 0.1, 2.0
 
 
-class Pairs(NamedTuple):
-    """Points, and the places on a surface that belong to them."""
+class Sample(NamedTuple):
+    """Observed points at a size of 100: a cloud, or points whose places on the surface are known."""
 
     points: FloatArray
     """*Shape:* ``(n, 3)``."""
     normals: FloatArray | None
-    """Where the places may slide across these. *Shape:* ``(n, 3)``."""
+    """Places may slide across these. *Shape:* ``(n, 3)``."""
     weights: FloatArray
     """*Shape:* ``(n,)``."""
     numbers: IntArray
     """Indices of the points among all observed ones. *Shape:* ``(n,)``."""
     noise: float
     """Standard deviation; 0 where it is not known yet."""
-    places: sparse.csr_matrix
-    """*Shape:* ``(n, V)``."""
+    places: Any = None
+    """Interpolation matrix from vertices to the places of the points; None for a cloud. *Shape:* ``(n, V)``."""
+    view: FloatArray | None = None
+    """Direction to the camera of a cloud. *Shape:* ``(3,)``."""
+
+    def restrict(self, select: sparse.csr_matrix) -> "Sample":
+        """With places on a coarse mesh, by the coarse vertex of each vertex. *Shape:* ``(V, V_coarse)``."""
+        return self if self.places is None else self._replace(places=self.places @ select)
+
+    def thin(self, n: int) -> "Sample":
+        """At most n points of a cloud, chosen at random, always the same."""
+        if self.places is not None or len(self.points) <= n:
+            return self
+        chosen = np.random.default_rng(0).permutation(len(self.points))[:n]
+        points, weights, numbers = (x[chosen] for x in (self.points, self.weights, self.numbers))
+        normals = None if self.normals is None else self.normals[chosen]
+        return self._replace(points=points, normals=normals, weights=weights / weights.sum(), numbers=numbers)
+
+    def with_noise(self, surface: "SampledSurface") -> "Sample":
+        """The noise, where it is not known, from the median of distances from a surface, or from points."""
+        median = float(np.median(self.misses(surface)[0])) / (0.6745 if self.places is None else 1.538)
+        return self._replace(noise=self.noise or float(np.clip(median, *NOISES)))
 
     def distances(self, x: FloatArray) -> FloatArray:
         """Distances of the points from their places on a shape. *Shape:* ``(V, 3) -> (n,)``."""
         return np.linalg.norm(self.places @ x - self.points, axis=1)
 
-    def misses(self, surface: MeshSurface) -> tuple[FloatArray, BoolArray]:
-        """Distances of the points from their places, all of which count. *Shape:* ``(n,)``."""
-        return self.distances(surface.vertices), np.ones(len(self.points), bool)
+    def misses(self, surface: "SampledSurface") -> tuple[FloatArray, BoolArray]:
+        """Distances of the points from their places, or from the most alike ones whose normals may agree or not.
 
-    def score(self, surface: MeshSurface, unit: float) -> float:
-        """Part of the points that the surface leaves out."""
-        off = (self.distances(surface.vertices) / unit) ** 2
-        return float(self.weights @ (off / (1 + off)))
+        *Shape:* ``(n,)`` each.
+        """
+        if self.places is not None:
+            return self.distances(surface.vertices), np.ones(len(self.points), bool)
+        return surface.most_alike(self.points, self.normals)[2:]
+
+    def pair(self, surface: "SampledSurface") -> "Sample":
+        """The points with their places; of a cloud, those whose normals do not agree weigh nothing."""
+        if self.places is not None:
+            return self
+        face, barycentric, _, agree = surface.most_alike(self.points, self.normals)
+        places = places_between(surface.faces[face], barycentric, len(surface.vertices))
+        return self._replace(weights=self.weights * agree, places=places)
+
+    def score(self, surface: "SampledSurface", unit: float) -> float:
+        """Fraction of the points that the surface leaves out, and of the visible surface that a cloud leaves out."""
+        distances, agree = self.misses(surface)
+        total = float(self.weights @ np.where(agree, 1 - 1 / (1 + (distances / unit) ** 2), 1))
+        if self.view is not None:
+            seen = surface.samples[surface.visible(self.view)]
+            gap = (cKDTree(self.points).query(seen)[0] / (3 * unit)) ** 2
+            total += float((gap / (1 + gap)).mean()) if len(seen) else 1.0
+        return total
 
 
 def robust_weights(distances: FloatArray, noise: float) -> FloatArray:
@@ -97,82 +135,3 @@ class SampledSurface(MeshSurface):
         np.maximum.at(nearest, cell.ravel(), depth)
         front = self.face_normals[self.sample_faces] @ view > GRAZING
         return np.flatnonzero(front & (nearest[cell.ravel()] - depth < DEPTH))
-
-
-class Cloud(NamedTuple):
-    """A cloud at a size of 100, with the fields of :class:`Pairs`, and the direction to the camera."""
-
-    points: FloatArray
-    normals: FloatArray | None
-    weights: FloatArray
-    numbers: IntArray
-    noise: float
-    view: FloatArray | None
-
-    def thin(self, n: int) -> "Cloud":
-        """So many of the points, chosen at random, always the same."""
-        if len(self.points) <= n:
-            return self
-        chosen = np.random.default_rng(0).permutation(len(self.points))[:n]
-        return Cloud(*self._select(chosen, self.weights[chosen] / self.weights[chosen].sum()), self.view)
-
-    def _select(
-        self, rows: IntArray, weights: FloatArray
-    ) -> tuple[FloatArray, FloatArray | None, FloatArray, IntArray, float]:
-        """The first fields of some of the points, with other weights."""
-        normals = None if self.normals is None else self.normals[rows]
-        return self.points[rows], normals, weights, self.numbers[rows], self.noise
-
-    def misses(self, surface: SampledSurface) -> tuple[FloatArray, BoolArray]:
-        """Distances of the points from the places that look most like them, and if normals agree. *Shape:* ``(n,)``."""
-        return surface.most_alike(self.points, self.normals)[2:]
-
-    def places(self, surface: SampledSurface, released: BoolArray | None = None) -> Pairs:
-        """The places of the points whose normals agree."""
-        face, barycentric, _, agree = surface.most_alike(self.points, self.normals)
-        if released is not None:
-            agree &= ~released[surface.faces[face]].any(1)
-        kept = np.flatnonzero(agree)
-        places = places_between(surface.faces[face[kept]], barycentric[kept], len(surface.vertices))
-        return Pairs(*self._select(kept, self.weights[kept]), places)
-
-    def pairs(self, surface: SampledSurface, released: BoolArray | None = None) -> list[Pairs]:
-        """Places for the points, and, where the view is known, points for the visible places."""
-        pairs = [self.places(surface, released)]
-        if self.view is None or self.normals is None:
-            return pairs
-        seen = surface.visible(self.view)
-        seen = seen[:: max(1, len(seen) // len(self.points))]
-        faces = surface.sample_faces[seen]
-        tree = cKDTree(join_features(self.points, self.normals))
-        nearest = tree.query(join_features(surface.samples[seen], surface.face_normals[faces]))[1]
-        agree = dot(surface.face_normals[faces], self.normals[nearest]) > LEAST_COSINE
-        if released is not None:
-            agree &= ~released[surface.faces[faces]].any(1)
-        seen, faces, nearest = seen[agree], faces[agree], nearest[agree]
-        if len(seen):
-            places = places_between(surface.faces[faces], _PLACES[seen % len(_PLACES)], len(surface.vertices))
-            pairs.append(Pairs(*self._select(nearest, np.full(len(seen), 1 / len(seen))), places))
-        return pairs
-
-    def score(self, surface: SampledSurface, unit: float) -> float:
-        """Part of the cloud that the surface leaves out, and of the visible surface that the cloud leaves out."""
-        distances, agree = self.misses(surface)
-        total = float(self.weights @ np.where(agree, 1 - 1 / (1 + (distances / unit) ** 2), 1))
-        if self.view is not None:
-            seen = surface.samples[surface.visible(self.view)]
-            gap = (cKDTree(self.points).query(seen)[0] / (3 * unit)) ** 2
-            total += float((gap / (1 + gap)).mean()) if len(seen) else 1.0
-        return total
-
-    def find_unexplained(self, surface: SampledSurface, reach: float, least: int) -> list[IntArray]:
-        """Connected groups of points that are far from the surface, the largest first."""
-        distances, agree = self.misses(surface)
-        off = np.flatnonzero(~agree | (distances > reach))
-        if len(off) < least:
-            return []
-        neighbours = cKDTree(self.points).query(self.points, min(N_NEIGHBOURS, len(self.points)))[0]
-        gap = GAP / 2 * float(np.median(neighbours[:, -1]))
-        pieces = label_pieces(cKDTree(self.points[off]).query_pairs(gap, output_type="ndarray"), len(off))
-        sizes = np.bincount(pieces)
-        return [off[pieces == k] for k in np.argsort(-sizes, kind="stable") if sizes[k] >= least]

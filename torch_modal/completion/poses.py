@@ -2,17 +2,16 @@
 
 import math
 from collections.abc import Sequence
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 import torch
+from scipy import sparse
 from scipy.optimize import minimize_scalar
 from torch import Tensor
 
 from torch_modal.completion.bending import ModalBending, ModalPose
 from torch_modal.completion.frames import CompletionProblem
-from torch_modal.completion.pairs import Pairs
 from torch_modal.completion.search import PoseSearch
 from torch_modal.geometry.rigid import best_fit
 from torch_modal.modes.coarsening import coarsen
@@ -27,8 +26,8 @@ COARSE_FACES = 2500
 """Faces of the mesh on which they are searched; of fewer, it is the caller's."""
 SHIFTS = (-0.17, 0.17)
 """Times at which a motion may be instead of where its neighbours say, in parts of the gap between these."""
-TRUSTED, N_ALIKE = 0.34, 2
-"""Part of the frames, those that explain most, from which the others are searched again; starts from their shapes."""
+N_ALIKE = 2
+"""Shapes of other times from which a search starts where there are no key-frames."""
 TIME_ROUNDS, LATEST, UNCHANGED = 6, 0.5, 10.0
 """Rounds in which times are estimated; the largest change, in parts of the gap between neighbours, and its weight."""
 
@@ -57,49 +56,36 @@ class FramePoses:
         self.poses = PoseSearch(ModalBending(reference, torch.from_numpy(self.coarse.faces), fields), basis.eigenvalues)
         #: Times and whole shapes.
         self.whole = list(zip(problem.times.tolist(), problem.whole, strict=False))
+        select = sparse.identity(self.coarse.n_vertices, format="csr")[np.maximum(self.coarse.clusters, 0)]
         #: With known places on the coarse mesh.
-        self.frames = [one._replace(markers=[self._restrict(pairs) for pairs in one.markers]) for one in problem.frames]
+        self.frames = [one._replace(seen=[each.restrict(select) for each in one.seen]) for one in problem.frames]
 
     def search(self, report: ProgressReport) -> list[Tensor]:
         """Shapes of all frames. *Shape of each:* ``(V, 3)``."""
-        n, fits, template = len(self.frames), dict[int, ModalFit](), self.problem.template
+        frames, fits, template = self.frames, dict[int, ModalFit](), self.problem.template
         if not self.whole:
-            rigid = [self.poses.rigid(self._coarsen(template), frame) for frame in self.frames]
+            rigid = [self.poses.rigid(self._coarsen(template), frame) for frame in frames]
             first = int(np.argmin([score for _, score in rigid]))
             fits[first] = self._search(first, [(template, rigid[first][0])])
             report.update()
-        self._outward(fits, {}, report)
-        if not self.whole:
-            before, bound = fits, float(np.quantile([one.score for one in fits.values()], TRUSTED))
-            fits = {i: one for i, one in before.items() if one.score <= bound}
-            report.update(len(fits))
-            self._outward(fits, before, report)
-        for i in sorted(range(n), key=lambda i: -fits[i].score):
+        while left := [i for i in range(len(frames)) if i not in fits]:  # those near in time to what is known first
+            known = self._knots(fits)
+            i = min(left, key=lambda i: min(abs(frames[i].time - t) for t, _ in known))
+            fits[i] = self._search(i, self._starts(frames[i].time, known))
+            report.update()
+        for i in sorted(fits, key=lambda i: -fits[i].score):
             if known := self._knots({j: one for j, one in fits.items() if j != i}):
-                again = self._search(i, self._starts(self.frames[i].time, known))
-                fits[i] = min(fits[i], again, key=lambda one: one.score)
+                starts = self._starts(frames[i].time, known)
+                if not self.whole:
+                    starts += self._alike(i, [x for _, x in known])
+                fits[i] = min(fits[i], self._search(i, starts), key=lambda one: one.score)
             report.update()
         shapes = []
-        for i, frame in enumerate(self.frames):
+        for i, frame in enumerate(frames):
             pose = self.poses.stiffen(self._coarsen(fits[i].base), fits[i].pose, frame)
             shapes.append(self.bending.shape(fits[i].base, pose))
             report.update()
         return shapes
-
-    def _outward(self, fits: dict[int, ModalFit], before: dict[int, ModalFit], report: ProgressReport) -> None:
-        """Add all other frames, those near in time to what is known first; none is worse than it was before."""
-        left = [i for i in range(len(self.frames)) if i not in fits]
-        while left:
-            known = self._knots(fits)
-            gaps = [min(abs(self.frames[i].time - t) for t, _ in known) for i in left]
-            i = left.pop(int(np.argmin(gaps)))
-            starts = self._starts(self.frames[i].time, known)
-            if before:
-                starts += self._alike(i, [x for _, x in known])
-            fits[i] = self._search(i, starts)
-            if i in before:
-                fits[i] = min(fits[i], before[i], key=lambda one: one.score)
-            report.update()
 
     def _knots(self, fits: dict[int, ModalFit]) -> list[tuple[float, Tensor]]:
         """Times and shapes of frames, and of whole ones, in the order of time."""
@@ -116,35 +102,30 @@ class FramePoses:
         times, shapes = np.array([time for time, _ in known]), torch.stack([x for _, x in known])
         nearest = np.argsort(np.abs(times - t))
         bases = [shapes[nearest[0]]]
-        if t not in times and len(known) > 1:
-            if times[0] < t < times[-1]:
-                path, gap = (
-                    Path(shapes, self.faces, times=times.tolist()),
-                    np.diff(times)[np.searchsorted(times, t) - 1],
-                )
-                bases = [path(shapes, t)]
-                for shift in SHIFTS:
-                    other = path(shapes, float(np.clip(t + shift * gap, times[0], times[-1])))
-                    bases.append(best_fit(other, bases[0]).apply(other))
-            else:
-                last, before = shapes[nearest[:2], None]
-                bases.append(self.bending.reconstruction.extrapolate(last, before)[0])
+        if times[0] < t < times[-1] and t not in times:
+            path = Path(shapes, self.faces, times=times.tolist())
+            gap = np.diff(times)[np.searchsorted(times, t) - 1]
+            bases = [path(shapes, t)]
+            for shift in SHIFTS:
+                other = path(shapes, float(np.clip(t + shift * gap, times[0], times[-1])))
+                bases.append(best_fit(other, bases[0]).apply(other))
+        elif t not in times and len(known) > 1:
+            last, before = shapes[nearest[:2], None]
+            bases.append(self.bending.reconstruction.extrapolate(last, before)[0])
         return [(x, self.bending.still()) for x in bases]
 
     def _search(self, i: int, starts: Sequence[tuple[Tensor, ModalPose]]) -> ModalFit:
-        """A frame by modes."""
-        k, pose, score = self.poses.fit([(self._coarsen(x), pose) for x, pose in starts], self.frames[i])
-        return ModalFit(self.bending.shape(starts[k][0], pose), starts[k][0], pose, score)
+        """The best pose of a frame from several starts, or one of these."""
+        frame, fits = self.frames[i], []
+        for base, start in starts:
+            coarse = self._coarsen(base)
+            for pose in (self.poses.descend(coarse, start, frame), start):
+                fits.append((base, pose, self.poses.score(coarse, pose, frame)))
+        base, pose, score = min(fits, key=lambda one: one[2])
+        return ModalFit(self.bending.shape(base, pose), base, pose, score)
 
     def _coarsen(self, x: Tensor) -> Tensor:
         return torch.from_numpy(self.coarse.restrict(x.numpy()))
-
-    def _restrict(self, pairs: Pairs) -> Pairs:
-        """Known places on the coarse mesh."""
-        rows = pairs.places.tocoo()
-        cluster = np.maximum(self.coarse.clusters[rows.col], 0)
-        shape = len(pairs.points), self.coarse.n_vertices
-        return pairs._replace(places=type(rows)((rows.data, (rows.row, cluster)), shape=shape).tocsr())
 
 
 def times_between(problem: CompletionProblem, shapes: list[Tensor]) -> list[float]:
@@ -168,12 +149,12 @@ def times_between(problem: CompletionProblem, shapes: list[Tensor]) -> list[floa
         around = slice(max(0, after - 2), after + 2)
         near = torch.stack([other for _, other in known[around]])
         path = Path(near, problem.faces, times=axis[around].tolist())
-        cost = partial(_cost_of_time, path, near, shapes[i], first[i], gap)
         bounds = max(axis[after - 1], first[i] - gap), min(axis[after], first[i] + gap)
-        times[i] = float(minimize_scalar(cost, bounds=bounds, method="bounded").x)
+        others = path, near, shapes[i], first[i], gap
+        times[i] = float(minimize_scalar(_cost_of_time, args=others, bounds=bounds, method="bounded").x)
     return times
 
 
-def _cost_of_time(path: Path, knots: Tensor, x: Tensor, t0: float, gap: float, t: float) -> float:
+def _cost_of_time(t: float, path: Path, knots: Tensor, x: Tensor, t0: float, gap: float) -> float:
     """Log-likelihood of a shape at a time, where the path errs by as much as it does at best, and of the change."""
     return math.log(float((path(knots, t) - x).square().sum())) + UNCHANGED * ((t - t0) / gap) ** 2

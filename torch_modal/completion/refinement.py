@@ -8,7 +8,7 @@ from torch import Tensor
 from torch_modal.completion.energy import PointEnergy
 from torch_modal.completion.frames import CompletionProblem, Frame
 from torch_modal.completion.gradient import LastSolve
-from torch_modal.completion.pairs import OUTLIERS, Cloud, SampledSurface, robust_weights
+from torch_modal.completion.pairs import OUTLIERS, SampledSurface, robust_weights
 from torch_modal.contact.active import ContactSearch
 from torch_modal.contact.separate import separate
 from torch_modal.elastic.backend import choose
@@ -65,7 +65,7 @@ class Refinement:
         frames = self.problem.frames
         for i, pose in enumerate(poses):
             surface = SampledSurface(pose.numpy(), self.problem.mesh)
-            frames[i] = frames[i].with_noise(surface)
+            frames[i] = frames[i]._replace(seen=[one.with_noise(surface) for one in frames[i].seen])
         followed = torch.stack([self._follow(frame, pose) for frame, pose in zip(frames, poses, strict=True)])
         (numbers, weights), solves = self._rests(), list[LastSolve]()
         x, of_known = followed, OF_KNOWN
@@ -81,7 +81,8 @@ class Refinement:
             ratios = [
                 np.mean(np.minimum(one.distances(shape) / one.noise, OUTLIERS) ** 2) / 3
                 for frame, shape in zip(frames, x.numpy(), strict=True)
-                for one in frame.markers
+                for one in frame.seen
+                if one.places is not None
             ]
             if ratios:
                 of_known = float(np.clip(of_known * np.clip(np.median(ratios), 0.5, 2.0) ** 2, *STIFFNESSES))
@@ -89,16 +90,16 @@ class Refinement:
 
     def _follow(self, frame: Frame, pose: Tensor) -> Tensor:
         """The shape after as-rigid-as-possible steps towards the clouds of a frame. *Shape:* ``(V, 3)``."""
-        if not frame.clouds:
+        x, n = pose.numpy(), sum(len(one.points) for one in frame.seen if one.places is None)
+        if not n:
             return pose
-        x, n = pose.numpy(), sum(len(cloud.points) for cloud in frame.clouds)
         elastic = ElasticSurface(SampledSurface(x, self.problem.mesh))
         unit = elastic.stiffness * min(n, len(x) / 2)
         # Every part is anchored, also one that no point is near.
         anchor = sparse.identity(len(x), format="csr"), x, np.full(len(x), ANCHOR * elastic.stiffness)
         for weight, reach in zip(np.geomspace(*WEIGHTS, FOLLOWS), np.geomspace(*REACH, FOLLOWS), strict=True):
             current, pulls = SampledSurface(x, self.problem.mesh), [anchor]
-            for pairs in [*(cloud.places(current) for cloud in frame.clouds), *frame.markers]:
+            for pairs in [one.pair(current) for one in frame.seen]:
                 trust = robust_weights(pairs.distances(x), reach / OUTLIERS)
                 pulls.append((pairs.places, pairs.points, weight * unit * pairs.weights * trust))
             x = elastic.follow(x, pulls)
@@ -108,7 +109,7 @@ class Refinement:
         """Steps of all vertices of a frame, with pairs found where they start. *Shape:* ``(1, V, 3)``."""
         surface, springs = SampledSurface(x[0].numpy(), self.problem.mesh), []
         for seen in frame.seen:
-            pairs, factor = (seen.places(surface), STIFFNESS) if isinstance(seen, Cloud) else (seen, of_known)
+            pairs, factor = seen.pair(surface), STIFFNESS if seen.places is None else of_known
             trust = robust_weights(pairs.distances(surface.vertices), seen.noise)
             weights = factor / seen.noise**2 * len(seen.points) * pairs.weights * trust
             springs.append(pairs._replace(weights=weights))
@@ -142,7 +143,7 @@ class Refinement:
         whole, completed = np.arange(n, n + len(exact)), np.arange(n + n_whole, 2 * n + n_whole)
         rows, weights = [], []
         for i, frame in enumerate(frames):
-            by_modes = OWN_OF_CLOUDS if frame.clouds else OWN
+            by_modes = OWN_OF_CLOUDS if any(one.places is None for one in frame.seen) else OWN
             every = np.append(whole, np.delete(completed, i)), np.append(exact, np.delete(times, i))
             row, shares = [i], [by_modes]
             for share, numbers, when in ((WHOLE, whole, exact), (1 - by_modes - WHOLE, *every)):

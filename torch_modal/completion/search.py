@@ -1,23 +1,18 @@
 """Poses and amplitudes of modes that bring a shape near to what was seen, from far to near."""
 
-from collections.abc import Callable, Sequence
-
 import numpy as np
 import torch
-from scipy import sparse
-from scipy.spatial import cKDTree
 from torch import Tensor
 
-from torch_modal.arrays import BoolArray, FloatArray
 from torch_modal.completion.bending import ModalBending, ModalPose
 from torch_modal.completion.frames import Frame
-from torch_modal.completion.pairs import SLIDE, Cloud, Pairs, SampledSurface
-from torch_modal.geometry.connectivity import Connectivity, edge_graph, farthest_apart
+from torch_modal.completion.pairs import SLIDE, Sample, SampledSurface
+from torch_modal.geometry.connectivity import Connectivity
 
 # Steps, and the distance from which on pairs lose weight at the first and the last; stiffness of the modes likewise.
 STEPS, FAR, NEAR = 12, 20.0, 2.0
 # Points of a cloud, and visible places of a surface, that take part in a step, and in one of the pose alone.
-N_POINTS, N_RIGID = 800, 200
+N_POINTS, N_RIGID = 1500, 200
 STIFF, STIFFER = 1e-2, (1e-4, 1e-3, 1e-2)
 # Stiffness of a turn and a move of the whole.
 OF_MOTIONS = 1e-2
@@ -26,13 +21,8 @@ LARGEST_STEP = 6.0
 
 # Weight of the modes' energy next to what is left unexplained: limbs that crossed explain points as well.
 PRIOR = 3e-5
-# Distance at which points are unexplained; part of a cloud that makes a group.
-REACH, PART_OF_GROUP = 2.0, 300
-# Ends of limbs that are tried for a group, of how many, how far away, with which weight; rounds of such trials; and the
-# gain that they need.
-N_TRIED, N_TIPS, MOST_AWAY, WEIGHT, ROUNDS, GAIN = 3, 12, 40.0, 3.0, 3, 1e-3
-# Smallest and largest length of a limb that is tried.
-LIMBS = 8.0, 30.0
+# Loss of score that stiffer modes may have.
+GAIN = 1e-3
 
 
 class PoseSearch:
@@ -48,17 +38,10 @@ class PoseSearch:
         self.mesh = Connectivity(bending.faces.numpy(), len(bending.reference))
         relative = eigenvalues / eigenvalues[:1]
         self.stiffness = torch.cat([relative, relative.new_full((6,), OF_MOTIONS)])
-        graph = edge_graph(bending.reference.numpy(), self.mesh.edges)
-        #: Ends of limbs, and the distances along the surface from each. *Shape:* ``(n,), (n, V)``.
-        self.tips, self.from_tips = farthest_apart(graph, self.mesh.used, N_TIPS)
-
-    def surface(self, base: Tensor, pose: ModalPose) -> SampledSurface:
-        """The deformed shape."""
-        return SampledSurface(self.bending.shape(base, pose).numpy(), self.mesh)
 
     def score(self, base: Tensor, pose: ModalPose, frame: Frame) -> float:
         """Part that is left unexplained, and a little of the energy of the modes; 0 or more."""
-        surface = self.surface(base, pose)
+        surface = SampledSurface(self.bending.shape(base, pose).numpy(), self.mesh)
         total = PRIOR * float(self.stiffness[:-6] @ pose.amplitudes**2)
         return total + sum(seen.score(surface, frame.unit) for seen in frame.seen)
 
@@ -77,20 +60,17 @@ class PoseSearch:
         distances: tuple[float, float] = (FAR, NEAR),
         stiff: float = STIFF,
         n_steps: int = STEPS,
-        released: BoolArray | None = None,
-        springs: Callable[[FloatArray, int], Pairs] | None = None,
         rigid: bool = False,
     ) -> ModalPose:
         """Gauss-Newton steps, each with new pairs, from far to near and from stiff to soft; no vertex moves far."""
-        frame = frame.thin(N_RIGID if rigid else N_POINTS)
+        seen = [one.thin(N_RIGID if rigid else N_POINTS) for one in frame.seen]
         schedule = zip(np.geomspace(*distances, n_steps), np.geomspace(stiff, frame.soft, n_steps), strict=True)
         for k, (far, stiffness) in enumerate(schedule):
             if rigid or k % 2 == 0:
                 x, fields = self.bending.linearise(base, pose, rigid)
             else:  # the derivatives of the step before do nearly as well
                 x = self.bending.shape(base, pose)
-            markers = [*frame.markers, springs(x.numpy(), k)] if springs else frame.markers
-            rows = self._rows(x, fields, frame._replace(markers=markers), float(far), released)
+            rows = self._rows(x, fields, seen, float(far))
             products, n = (rows.mT @ rows).double(), fields.shape[-1]
             amplitudes = torch.cat([pose.amplitudes, pose.amplitudes.new_zeros(6)])[-n:]
             prior = float(stiffness) * self.stiffness[-n:]
@@ -100,22 +80,6 @@ class PoseSearch:
             largest = float((fields @ step).norm(dim=-1).max()) / LARGEST_STEP
             pose = self.bending.step(pose, step / max(1.0, largest), x.mean(0))
         return pose
-
-    def fit(self, starts: Sequence[tuple[Tensor, ModalPose]], frame: Frame) -> tuple[int, ModalPose, float]:
-        """The number of the best of several starts, its pose after limbs were tried, and its score."""
-        poses = [(k, self.descend(*start, frame)) for k, start in enumerate(starts)]
-        poses += [(k, pose) for k, (_, pose) in enumerate(starts)]  # never worse than these
-        scores = [self.score(starts[k][0], pose, frame) for k, pose in poses]
-        best = min(scores)
-        k, pose = poses[scores.index(best)]
-        base = starts[k][0]
-        for _ in range(ROUNDS):
-            others = [self._try_limb(base, pose, frame, *limb) for limb in self._limbs(base, pose, frame)]
-            scores = [self.score(base, other, frame) for other in others]
-            if not others or min(scores) > best - GAIN:
-                break
-            best, pose = min(scores), others[int(np.argmin(scores))]
-        return k, pose, best
 
     def stiffen(self, base: Tensor, pose: ModalPose, frame: Frame) -> ModalPose:
         """The pose of the stiffest modes that explain as much: where little moves, soft ones would follow the noise."""
@@ -129,41 +93,11 @@ class PoseSearch:
                 best, pose = min(best, score), other
         return pose
 
-    def _limbs(self, base: Tensor, pose: ModalPose, frame: Frame) -> list[tuple[Cloud, FloatArray, int]]:
-        """Groups of points that nothing explains, each with the end of a limb that might."""
-        surface, limbs = self.surface(base, pose), []
-        for cloud in frame.clouds:
-            for group in cloud.find_unexplained(surface, REACH, max(4, len(cloud.points) // PART_OF_GROUP))[:2]:
-                points = cloud.points[group]
-                away = np.linalg.norm(surface.vertices[self.tips] - points.mean(0), axis=1)
-                nearest = np.argsort(away)[:N_TRIED]
-                limbs += [(cloud, points, int(tip)) for tip in nearest if away[tip] < MOST_AWAY]
-        return limbs
-
-    def _try_limb(
-        self, base: Tensor, pose: ModalPose, frame: Frame, cloud: Cloud, points: FloatArray, tip: int
-    ) -> ModalPose:
-        """A pose in which a limb explains points that nothing explained; its former pairs are released."""
-        extent = 2 * float(np.percentile(np.linalg.norm(points - points.mean(0), axis=1), 90))
-        limb = self.from_tips[tip] < np.clip(extent, *LIMBS)
-        vertices = np.flatnonzero(limb)
-        weights, numbers = np.full(len(points), WEIGHT / len(cloud.points)), np.arange(len(points))
-
-        def springs(x: FloatArray, k: int) -> Pairs:
-            shift = 0 if k else points.mean(0) - x[vertices].mean(0)
-            nearest = vertices[cKDTree(x[vertices] + shift).query(points)[1]]
-            places = sparse.identity(len(limb), format="csr")[nearest]
-            return Pairs(points, None, weights, numbers, 0.0, places)
-
-        distances = MOST_AWAY, MOST_AWAY
-        pose = self.descend(base, pose, frame, distances, frame.soft, STEPS // 2, released=limb, springs=springs)
-        return self.descend(base, pose, frame, (FAR / 3, NEAR), 10 * frame.soft, STEPS // 2)
-
-    def _rows(self, x: Tensor, fields: Tensor, frame: Frame, far: float, released: BoolArray | None) -> Tensor:
+    def _rows(self, x: Tensor, fields: Tensor, seen: list[Sample], far: float) -> Tensor:
         """Derivatives of the weighted offsets of all pairs, and last the offsets. *Shape:* ``(m, n + 1)``."""
         n, surface, rows = fields.shape[-1], SampledSurface(x.numpy(), self.mesh), []
         columns = fields.flatten(1).float().numpy()  # products of float32: half the time
-        for pairs in [*(pairs for cloud in frame.clouds for pairs in cloud.pairs(surface, released)), *frame.markers]:
+        for pairs in [one.pair(surface) for one in seen]:
             off = pairs.places @ surface.vertices - pairs.points
             root = (pairs.weights**0.5 / (1 + (off**2).sum(1) / far**2)).astype(np.float32)
             moved = (pairs.places.astype(np.float32) @ columns).reshape(-1, 3, n)

@@ -137,12 +137,9 @@ class TemplateFit:
 
         The places keep a small weight in the stages. *Shape:* ``(V, 3), (V, 3)``.
         """
-        self.progress.expect(sum(n_steps for *_, n_steps in stages))
         if places is not None:
-            self.progress.expect(len(_MAP_WEIGHTS))
             for weight in _MAP_WEIGHTS:
                 x = self.elastic.follow(x, [self._pull(self._everywhere, places, weight), self._landmarks], _MAP_ROUNDS)
-                self.progress.update()
         none = np.zeros(len(x), dtype=bool)
         for stage in stages:
             x = self._step(x, stage, none, places)
@@ -206,10 +203,7 @@ def sliding_freedom(shape: SpectralShape, fixed: IntArray) -> float:
     (i, j), faces, k = surface.edges.T, surface.faces, functions.shape[1]
     sides = surface.vertices[i] - surface.vertices[j]
     areas: FloatArray = np.bincount(surface.connectivity.sides, np.tile(surface.face_areas, 3), minlength=len(i)) / 3
-    # Gradient of the curvature.
-    opposite = surface.vertices[np.roll(faces, 1, axis=1)] - surface.vertices[np.roll(faces, -1, axis=1)]
-    slopes = np.cross(surface.face_normals, (opposite * shape.curvature()[faces][..., None]).sum(1))
-    slopes /= 2 * np.maximum(surface.face_areas, 1e-12)[:, None]
+    slopes = surface.gradients(shape.curvature()[:, None])[:, 0]
 
     def rows(weights: FloatArray, values: FloatArray, directions: FloatArray) -> FloatArray:
         return (np.sqrt(weights)[:, None, None] * values[:, :, None] * directions[:, None]).reshape(-1, 3 * k)

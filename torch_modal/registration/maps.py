@@ -21,7 +21,6 @@ from torch_modal.geometry import inspect
 from torch_modal.geometry.closest import dot
 from torch_modal.geometry.connectivity import edge_graph
 from torch_modal.geometry.decimation import decimate
-from torch_modal.progress import ProgressReport
 from torch_modal.registration.surface import DUST, MeshSurface, drop_unreferenced, largest_pieces, main_part
 
 N_COARSE = 2000  # approximate number of vertices of the coarse copies
@@ -126,9 +125,7 @@ class SpectralShape:
         distances, mesh = self.geodesics_from(tips), self.coarse
         lengths = np.maximum(_limb_lengths(distances[tips]), _SHORTEST_LIMB)
         along = np.minimum(distances / lengths, 1) + np.maximum(distances - lengths, 0) / lengths.mean()
-        corners = mesh.vertices[mesh.faces]
-        opposite = np.roll(corners, 1, axis=1) - np.roll(corners, -1, axis=1)
-        gradients = np.einsum("fci,fcm->fmi", np.cross(mesh.face_normals[:, None], opposite), distances[mesh.faces])
+        gradients = mesh.gradients(distances)
         gradients /= np.maximum(np.linalg.norm(gradients, axis=2, keepdims=True), 1e-12)
         first, second = np.triu_indices(len(tips), 1)
         sines = dot(np.cross(gradients[:, first], gradients[:, second]), mesh.face_normals[:, None])
@@ -136,13 +133,6 @@ class SpectralShape:
         # Integrals of products with functions that are linear in each face, by their values at its corners.
         integrals = functions[mesh.faces].sum(1).T @ (mesh.face_areas[:, None] * sines / 3)
         return np.hstack([along, _ORIENTATION * functions @ integrals])
-
-    def principal_axes(self) -> tuple[FloatArray, FloatArray]:
-        """Centred vertices with normals of small weight, and the axes as columns. *Shape:* ``(n, 6), (3, 3)``."""
-        mesh = self.coarse
-        points = mesh.vertices - np.average(mesh.vertices, 0, mesh.vertex_areas)
-        axes = np.linalg.eigh(points.T @ (mesh.vertex_areas[:, None] * points))[1]
-        return np.hstack([points, 0.1 * mesh.vertex_normals]), axes * [1, 1, np.sign(np.linalg.det(axes))]
 
     def curvature(self, n_functions: int = N_FUNCTIONS) -> FloatArray:
         """Twice the mean curvature, of low frequencies, positive where the surface is convex. *Shape:* ``(n,)``."""
@@ -263,23 +253,16 @@ class CoarsePair:
         shapes = zip((self.first, self.second), pairs.T, strict=True)
         return self.rate(nearest_rows(*(shape.limb_coordinates(ends) for shape, ends in shapes)))
 
-    def from_spectra(self, n_signs: int, progress: ProgressReport) -> list[Map]:
+    def from_spectra(self, n_signs: int) -> list[Map]:
         """The best maps from spectra, best first; the last is the best map to the mirrored target.
 
-        The initial maps are all ``2**n_signs`` sign patterns of the lowest eigenfunctions, and rigid alignments of
-        principal axes. All are refined with few eigenfunctions, the best with all.
+        The initial maps are all ``2**n_signs`` sign patterns of the lowest eigenfunctions. All are refined with few
+        eigenfunctions, the best with all.
         """
-        k, coarse = n_signs + 1, []
+        k = n_signs + 1
         lowest, others = self.first.functions[:, :k], self.second.functions[:, :k]
-        starts = [(lowest, others * [1.0, *signs], k) for signs in itertools.product([1.0, -1.0], repeat=n_signs)]
-        (here, axes), (there, other_axes) = self.first.principal_axes(), self.second.principal_axes()
-        flips = [1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]
-        for turn in (np.eye(3), *(axes * signs @ other_axes.T for signs in flips)):
-            starts.append(((here.reshape(-1, 2, 3) @ turn).reshape(-1, 6), there, 12))
-        progress.expect(len(starts))
-        for rows, goal, n in starts:
-            coarse.append(self.refine(nearest_rows(rows, goal), n, COARSE_FUNCTIONS))
-            progress.update()
+        patterns = [[1.0, *signs] for signs in itertools.product([1.0, -1.0], repeat=n_signs)]
+        coarse = [self.refine(nearest_rows(lowest, others * signs), k, COARSE_FUNCTIONS) for signs in patterns]
         coarse.sort(key=lambda one: -one.score)
         best = coarse[:N_REFINED]
         for one in coarse[N_REFINED:]:  # the best ones are often the same map
@@ -306,9 +289,7 @@ class CoarsePair:
 def nearest_rows(queries: FloatArray, rows: FloatArray) -> IntArray:
     """Index of the nearest row. Dense: trees are no faster in fifty dimensions. *Shape:* ``(n, k), (m, k) -> (n,)``."""
     queries, rows = queries.astype(np.float32), rows.astype(np.float32)
-    half = 0.5 * (rows * rows).sum(1)
-    chunks = np.array_split(queries, len(queries) // 2048 + 1)
-    return np.concatenate([(chunk @ rows.T - half).argmax(1) for chunk in chunks])
+    return (queries @ rows.T - 0.5 * (rows * rows).sum(1)).argmax(1)
 
 
 def _limb_lengths(distances: FloatArray) -> FloatArray:

@@ -11,7 +11,7 @@ from torch_modal.registration.surface import drop_unreferenced, main_part, outwa
 MIN_VERTICES = MORE_SIGNS + 3  # minimum number of vertices of a surface: two more than eigenfunctions
 
 
-class MeshPair:
+class MeshPair(CoarsePair):
     """Both meshes in percent of the target's diagonal, the target centred, the template with equal area.
 
     Args:
@@ -47,8 +47,7 @@ class MeshPair:
         size = np.sqrt(bodies["target"].area / bodies["template"].area) / self.unit
         self.rest = template[0] * size
         self.template = source.with_vertices(source.vertices * size)
-        self.first, self.second = SpectralShape(self.template), SpectralShape(self.target)
-        self.pair = CoarsePair(self.first, self.second)
+        super().__init__(SpectralShape(self.template), SpectralShape(self.target))
         self.marks = points[:, 0] * size, (points[:, 1] - self.origin) / self.unit
         shapes = (self.first, self.template), (self.second, self.target)
         vertices = [

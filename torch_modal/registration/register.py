@@ -5,7 +5,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from scipy import sparse
 from threadpoolctl import threadpool_limits
 
 from torch_modal.arrays import FloatArray, IntArray
@@ -14,6 +13,7 @@ from torch_modal.geometry.rigid import best_fit
 from torch_modal.io.cache import Cache
 from torch_modal.keyframes.check import check_keyframes
 from torch_modal.keyframes.seams import weld_seams
+from torch_modal.passengers.passengers import Passengers
 from torch_modal.progress import Progress, ProgressReport
 from torch_modal.registration.fit import COARSE_STAGES, FINE_STAGES, TemplateFit, sliding_freedom
 from torch_modal.registration.landmarks import landmark_table
@@ -29,7 +29,7 @@ from torch_modal.registration.pair import MeshPair
 from torch_modal.registration.report import LEAD, SLIDING, TRUSTED, Quality, Registration, judge, measure, ramp
 from torch_modal.registration.surface import MeshSurface
 
-VERSION = 9  # part of the cache key: raise it when the algorithm changes
+VERSION = 10  # part of the cache key: raise it when the algorithm changes
 MIN_LANDMARKS = 5  # minimum number of landmarks between different subjects: fewer do not determine the map
 _SURE_SCORE = 0.62  # score of a spectral map below which more initial maps are tried
 _SCORE_SHARE = 0.5  # weight of a map's score and likeness relative to the stretch of its fit
@@ -51,7 +51,6 @@ _MISPLACED = 0.20, 0.10  # largest error of these, for a surface of unit area: n
 class _Candidate(NamedTuple):
     map: Map
     x: FloatArray
-    fit: TemplateFit
     quality: Quality
     likeness: float
 
@@ -88,7 +87,7 @@ def register(
         same_subject: True for nearly isometric poses of one body. Different bodies may need five landmarks or more.
         cache_dir: Folder of the cache; by default ``TORCH_MODAL_CACHE`` or the user's cache folder.
         cache: Keep results on disk, and find them there.
-        progress: See :data:`torch_modal.progress.Progress`; the total grows during the work.
+        progress: See :data:`torch_modal.progress.Progress`; steps of fits are counted.
 
     Returns:
         Positions of the template's vertices on the target, and a report. Doubtful results have a confidence below 0.5
@@ -115,7 +114,7 @@ def register(
 
     def compute() -> dict[str, Any]:
         # The matrices are too small for BLAS threads.
-        with ProgressReport(0, "register", progress) as report, threadpool_limits(1):
+        with ProgressReport(None, "register", progress) as report, threadpool_limits(1):
             return _RegistrationProblem(meshes[0], meshes[1], points, same_subject, report).solve().arrays()
 
     names = ("template", "faces", "target", "target_faces", "here", "there")
@@ -156,22 +155,22 @@ class _RegistrationProblem(MeshPair):
     # ------------------------------------------------------------------------------------------------------------- maps
     def _maps(self) -> list[Map]:
         if len(self.mark_vertices):
-            maps = [self.pair.from_landmarks(self.mark_vertices)]
+            maps = [self.from_landmarks(self.mark_vertices)]
             if not self.same_subject:
-                return [*maps, self.pair.from_limbs(self.mark_vertices)]
+                return [*maps, self.from_limbs(self.mark_vertices)]
             return maps + [one for one in self._spectral_maps(N_SIGNS) if self._agrees(one)]
         maps = self._spectral_maps(N_SIGNS)
         sure = maps[0].score >= _SURE_SCORE
         if sure and self.same_subject:
             return maps
-        tips = self.pair.from_tips()
-        maps += [self.pair.refine(one.vertices, COARSE_FUNCTIONS) for one in tips]
+        tips = self.from_tips()
+        maps += [self.refine(one.vertices, COARSE_FUNCTIONS) for one in tips]
         if not (self.same_subject or sure):  # proportions may differ so much that spectra do not match
             maps += tips
         return maps if sure or tips else maps + self._spectral_maps(MORE_SIGNS)
 
     def _spectral_maps(self, n_signs: int) -> list[Map]:
-        *maps, other = self.pair.from_spectra(n_signs, self.progress)
+        *maps, other = self.from_spectra(n_signs)
         self.mirrored = max(self.mirrored, other.mirrored_score - other.distortion)
         return maps
 
@@ -183,7 +182,7 @@ class _RegistrationProblem(MeshPair):
 
     def _rivals(self, maps: list[Map]) -> list[Map]:
         """Different maps that will be fitted."""
-        repaired = [self.pair.repair(one.vertices) for one in maps] if self.same_subject else []
+        repaired = [self.repair(one.vertices) for one in maps] if self.same_subject else []
         everything = [*maps, *(one for one in repaired if one is not None and self._agrees(one))]
         best, *others = sorted(everything, key=lambda one: one.distortion - one.score)
         rivals = [best]
@@ -194,19 +193,16 @@ class _RegistrationProblem(MeshPair):
         return rivals
 
     # ------------------------------------------------------------------------------------------------------------- fits
-    def _fit_coarse(self, one: Map, x: FloatArray | None = None) -> _Candidate:
-        """Fit of the coarse template along a map, or from positions near the target."""
+    def _fit_coarse(self, one: Map) -> _Candidate:
+        """Fit of the coarse template along a map."""
         template, back = self.first.placed, self.second.placed
         fit, places = TemplateFit(self, template, back, one.vertices), back.vertices[one.vertices]
-        if x is None:
-            rest, goal, areas = map(torch.from_numpy, (template.vertices, places, template.vertex_areas))
-            with torch.no_grad():
-                placed = best_fit(rest, goal, areas).apply(rest).numpy()
-            x = fit.run(placed, COARSE_STAGES, 2, places)
-        else:
-            x = fit.run(x, COARSE_STAGES, 2)
-        likeness = self.pair.likeness(self._images(template.with_vertices(x)))
-        return _Candidate(one, x, fit, measure(template, x, back)[0], likeness)
+        rest, goal, areas = map(torch.from_numpy, (template.vertices, places, template.vertex_areas))
+        with torch.no_grad():
+            placed = best_fit(rest, goal, areas).apply(rest).numpy()
+        x = fit.run(placed, COARSE_STAGES, 2, places)
+        likeness = self.likeness(self._images(template.with_vertices(x)))
+        return _Candidate(one, x, measure(template, x, back)[0], likeness)
 
     def _images(self, shape: MeshSurface) -> IntArray:
         """Coarse vertices of the target nearest to the vertices of a fitted template. *Shape:* ``(n,)``."""
@@ -219,9 +215,7 @@ class _RegistrationProblem(MeshPair):
         most = candidate.cost + _WORSE
         for spectral in _SPECTRAL_REFINEMENTS if self.same_subject else (False,):
             vertices = self._images(self.first.placed.with_vertices(candidate.x))
-            again = self._fit_coarse(
-                self.pair.refine(vertices, FINE_FUNCTIONS) if spectral else self.pair.rate(vertices)
-            )
+            again = self._fit_coarse(self.refine(vertices, FINE_FUNCTIONS) if spectral else self.rate(vertices))
             if again.cost > most:
                 break
             if np.linalg.norm(again.x - candidate.x, axis=1).mean() < _CONVERGED:
@@ -240,17 +234,13 @@ class _RegistrationProblem(MeshPair):
         self.rest, self.marks = change * self.rest, (change * self.marks[0], self.marks[1])
         self.template = self.template.with_vertices(change * self.template.vertices)
         self.first.placed = coarse.with_vertices(change * coarse.vertices)
-        return self._fit_coarse(candidate.map, candidate.x)
+        return self._fit_coarse(candidate.map)
 
     def _fit_fine(self, candidate: _Candidate) -> FloatArray:
         """Positions of all vertices after the last stages."""
-        coarse, x = self.first.placed, candidate.x
-        frames = candidate.fit.elastic.local_frames(x)
-        # Each vertex by the barycentric mean of the affine maps of the corners of the closest coarse face.
-        rows: sparse.csr_matrix = coarse.rows(coarse.closest(self.rest))
-        turns = (rows @ frames.reshape(len(frames), 9)).reshape(-1, 3, 3)
-        moved = rows @ (x - np.einsum("vij,vj->vi", frames, coarse.vertices))
-        everything: FloatArray = moved + np.einsum("nij,nj->ni", turns, self.rest)
+        coarse = self.first.placed
+        carrier, faces, rest, x = map(torch.from_numpy, (coarse.vertices, coarse.faces, self.rest, candidate.x))
+        everything: FloatArray = Passengers(carrier, faces.clone(), rest)(x).numpy()
         images = self._images(self.template.with_vertices(everything[self.used]))
         fit = TemplateFit(self, self.template, self.target, images)
         everything[self.used] = fit.run(everything[self.used], FINE_STAGES, 1)
@@ -262,7 +252,7 @@ class _RegistrationProblem(MeshPair):
         x = everything[self.used]
         quality, supported = measure(self.template, x, self.target)
         images = self._images(self.first.placed.with_vertices(best.x))
-        rated = self.pair.rate(images)
+        rated = self.rate(images)
         # Where sheets touch, the image of a sample may lie on the wrong one; the map has no such errors.
         score, distortion = rated.score, min(best.map.distortion, rated.distortion)
         rows = self.template.rows(self.template.closest(self.marks[0]))
@@ -270,7 +260,7 @@ class _RegistrationProblem(MeshPair):
         near = self.first.placed.nearest_alike(self.template.vertices, self.template.vertex_normals)
         if self.same_subject:
             # Of a vertex in a wrong place, many distances are wrong; of the others, the few to such vertices.
-            misplaced = np.quantile(self.pair.errors(images), _MOST, axis=1)
+            misplaced = np.quantile(self.errors(images), _MOST, axis=1)
             supported = np.minimum(supported, ramp(misplaced, *_MISPLACED)[near])
         lost = float(self.template.vertex_areas[supported < TRUSTED].sum() / self.template.area)
         quality = quality._replace(unsupported_area=max(quality.unsupported_area, lost))
