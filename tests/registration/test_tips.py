@@ -31,16 +31,11 @@ def shape(points: np.ndarray, faces: np.ndarray) -> SpectralShape:
     return SpectralShape(MeshSurface(points, faces))
 
 
-def tip_ends(one: SpectralShape) -> np.ndarray:
-    """Directions of the tips."""
-    places = one.coarse.vertices[one.tips]
-    return places / np.linalg.norm(places, axis=1, keepdims=True)
-
-
 def test_tips_are_the_ends_of_limbs() -> None:
     one = shape(*figure())
     assert len(one.tips) == 5
-    ends = tip_ends(one)
+    ends = one.coarse.vertices[one.tips]
+    ends /= np.linalg.norm(ends, axis=1, keepdims=True)
     assert (ends[:, 1] > 0.9).sum() == 1 and (np.abs(ends[:, 0]) > 0.6).sum() == 2 and (ends[:, 1] < -0.8).sum() == 2
     ball = trimesh.creation.icosphere(3)
     assert len(shape(np.array(ball.vertices), np.array(ball.faces)).tips) < 5
