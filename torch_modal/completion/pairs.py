@@ -55,7 +55,7 @@ class Sample(NamedTuple):
         if self.places is not None or len(self.points) <= n:
             return self
         chosen = np.random.default_rng(0).permutation(len(self.points))[:n]
-        points, weights, numbers = (x[chosen] for x in (self.points, self.weights, self.numbers))
+        points, weights, numbers = self.points[chosen], self.weights[chosen], self.numbers[chosen]
         normals = None if self.normals is None else self.normals[chosen]
         return self._replace(points=points, normals=normals, weights=weights / weights.sum(), numbers=numbers)
 
