@@ -134,6 +134,13 @@ class SpectralShape:
         integrals = functions[mesh.faces].sum(1).T @ (mesh.face_areas[:, None] * sines / 3)
         return np.hstack([along, _ORIENTATION * functions @ integrals])
 
+    def principal_axes(self) -> tuple[FloatArray, FloatArray]:
+        """Centred vertices with normals of small weight, and the axes as columns. *Shape:* ``(n, 6), (3, 3)``."""
+        mesh = self.coarse
+        points = mesh.vertices - np.average(mesh.vertices, 0, mesh.vertex_areas)
+        axes = np.linalg.eigh(points.T @ (mesh.vertex_areas[:, None] * points))[1]
+        return np.hstack([points, 0.1 * mesh.vertex_normals]), axes * [1, 1, np.sign(np.linalg.det(axes))]
+
     def curvature(self, n_functions: int = N_FUNCTIONS) -> FloatArray:
         """Twice the mean curvature, of low frequencies, positive where the surface is convex. *Shape:* ``(n,)``."""
         functions, mesh = self.functions[:, :n_functions], self.coarse
@@ -256,13 +263,17 @@ class CoarsePair:
     def from_spectra(self, n_signs: int) -> list[Map]:
         """The best maps from spectra, best first; the last is the best map to the mirrored target.
 
-        The initial maps are all ``2**n_signs`` sign patterns of the lowest eigenfunctions. All are refined with few
-        eigenfunctions, the best with all.
+        The initial maps are all ``2**n_signs`` sign patterns of the lowest eigenfunctions, and rigid alignments of
+        principal axes. All are refined with few eigenfunctions, the best with all.
         """
         k = n_signs + 1
         lowest, others = self.first.functions[:, :k], self.second.functions[:, :k]
-        patterns = [[1.0, *signs] for signs in itertools.product([1.0, -1.0], repeat=n_signs)]
-        coarse = [self.refine(nearest_rows(lowest, others * signs), k, COARSE_FUNCTIONS) for signs in patterns]
+        starts = [(lowest, others * [1.0, *signs], k) for signs in itertools.product([1.0, -1.0], repeat=n_signs)]
+        (here, axes), (there, other_axes) = self.first.principal_axes(), self.second.principal_axes()
+        flips = [1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]
+        for turn in (np.eye(3), *(axes * signs @ other_axes.T for signs in flips)):
+            starts.append(((here.reshape(-1, 2, 3) @ turn).reshape(-1, 6), there, 12))
+        coarse = [self.refine(nearest_rows(rows, goal), n, COARSE_FUNCTIONS) for rows, goal, n in starts]
         coarse.sort(key=lambda one: -one.score)
         best = coarse[:N_REFINED]
         for one in coarse[N_REFINED:]:  # the best ones are often the same map

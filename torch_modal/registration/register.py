@@ -193,14 +193,17 @@ class _RegistrationProblem(MeshPair):
         return rivals
 
     # ------------------------------------------------------------------------------------------------------------- fits
-    def _fit_coarse(self, one: Map) -> _Candidate:
-        """Fit of the coarse template along a map."""
+    def _fit_coarse(self, one: Map, x: FloatArray | None = None) -> _Candidate:
+        """Fit of the coarse template along a map, or from positions near the target."""
         template, back = self.first.placed, self.second.placed
         fit, places = TemplateFit(self, template, back, one.vertices), back.vertices[one.vertices]
-        rest, goal, areas = map(torch.from_numpy, (template.vertices, places, template.vertex_areas))
-        with torch.no_grad():
-            placed = best_fit(rest, goal, areas).apply(rest).numpy()
-        x = fit.run(placed, COARSE_STAGES, 2, places)
+        if x is None:
+            rest, goal, areas = map(torch.from_numpy, (template.vertices, places, template.vertex_areas))
+            with torch.no_grad():
+                placed = best_fit(rest, goal, areas).apply(rest).numpy()
+            x = fit.run(placed, COARSE_STAGES, 2, places)
+        else:
+            x = fit.run(x, COARSE_STAGES, 2)
         likeness = self.likeness(self._images(template.with_vertices(x)))
         return _Candidate(one, x, measure(template, x, back)[0], likeness)
 
@@ -234,13 +237,13 @@ class _RegistrationProblem(MeshPair):
         self.rest, self.marks = change * self.rest, (change * self.marks[0], self.marks[1])
         self.template = self.template.with_vertices(change * self.template.vertices)
         self.first.placed = coarse.with_vertices(change * coarse.vertices)
-        return self._fit_coarse(candidate.map)
+        return self._fit_coarse(candidate.map, candidate.x)
 
     def _fit_fine(self, candidate: _Candidate) -> FloatArray:
         """Positions of all vertices after the last stages."""
         coarse = self.first.placed
-        carrier, faces, rest, x = map(torch.from_numpy, (coarse.vertices, coarse.faces, self.rest, candidate.x))
-        everything: FloatArray = Passengers(carrier, faces.clone(), rest)(x).numpy()
+        carrier, faces, rest, x = map(torch.tensor, (coarse.vertices, coarse.faces, self.rest, candidate.x))
+        everything: FloatArray = Passengers(carrier, faces, rest)(x).numpy()
         images = self._images(self.template.with_vertices(everything[self.used]))
         fit = TemplateFit(self, self.template, self.target, images)
         everything[self.used] = fit.run(everything[self.used], FINE_STAGES, 1)
