@@ -11,7 +11,7 @@ import torch_modal as tm
 from torch_modal.completion.bending import ModalBending
 from torch_modal.completion.energy import PointEnergy
 from torch_modal.completion.gradient import LastSolve
-from torch_modal.completion.pairs import Sample, SampledSurface
+from torch_modal.completion.pairs import ObservedPoints, SampledSurface
 from torch_modal.elastic.steps import FineEnergy
 from torch_modal.elastic.term import Mesh
 from torch_modal.geometry.rigid import best_fit
@@ -242,11 +242,11 @@ def test_derivatives_of_the_energy_of_points(tube):
     x, faces, _ = tube
     surface = SampledSurface(100 * x[0].numpy(), faces.numpy())
     weights, numbers = np.ones(len(x[1])), np.arange(len(x[1]))
-    cloud = Sample(100 * x[1].numpy() + 1, None, weights / weights.sum(), numbers, 1.0)
+    cloud = ObservedPoints(100 * x[1].numpy() + 1, None, weights / weights.sum(), numbers, 1.0)
     pairs = cloud.pair(surface)
     normals = np.random.default_rng(0).standard_normal((len(pairs.points), 3))
     places = places_between(faces.numpy()[:5], np.full((5, 3), 1 / 3), len(x[0]))
-    markers = Sample(np.ones((5, 3)), None, np.ones(5), np.arange(5), 1.0, places)
+    markers = ObservedPoints(np.ones((5, 3)), None, np.ones(5), np.arange(5), 1.0, places)
     energy = PointEnergy([pairs._replace(normals=normals / np.linalg.norm(normals, axis=1, keepdims=True)), markers])
     at = energy.at(100 * x[:1])
     field = torch.randn(x[:1].shape, generator=torch.Generator().manual_seed(0), dtype=x.dtype)
@@ -261,7 +261,7 @@ def test_points_of_weight_zero_do_not_count_in_a_score(tube):
     surface, on, away = SampledSurface(100 * x[0].numpy(), faces.numpy()), 100 * x[0].numpy(), np.full((9, 3), 500.0)
     for points, n, score in ((np.concatenate([on, away]), len(on), 0), (away, 9, 1)):
         weights = (np.arange(len(points)) < n) / n
-        cloud = Sample(points, None, weights, np.arange(len(points)), 1.0)
+        cloud = ObservedPoints(points, None, weights, np.arange(len(points)), 1.0)
         assert cloud.score(surface, 1.0) == pytest.approx(score, abs=1e-3)
 
 

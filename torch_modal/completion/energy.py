@@ -7,7 +7,7 @@ import torch
 from scipy import sparse
 from torch import Tensor
 
-from torch_modal.completion.pairs import SLIDE, Sample
+from torch_modal.completion.pairs import SLIDE, ObservedPoints
 from torch_modal.elastic.steps import Point
 
 
@@ -20,7 +20,7 @@ class PointEnergy:
         pairs: The places, each between three vertices at most, at one shape.
     """
 
-    def __init__(self, pairs: Sequence[Sample]) -> None:
+    def __init__(self, pairs: Sequence[ObservedPoints]) -> None:
         self.places = sparse.vstack([one.places for one in pairs]).tocsr()
         self.points = torch.from_numpy(np.concatenate([one.points for one in pairs]))
         #: The observed point of each pair. *Shape:* ``(n,)``.

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torch_modal.arrays import FloatArray
 from torch_modal.completion.observation import Observation
-from torch_modal.completion.pairs import NOISES, Sample
+from torch_modal.completion.pairs import NOISES, ObservedPoints
 from torch_modal.geometry.canonical import to_canonical
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.keyframes.arrays import require_units
@@ -26,7 +26,7 @@ class Frame(NamedTuple):
     """Observations of one time."""
 
     time: float
-    seen: list[Sample]
+    seen: list[ObservedPoints]
     soft: float
     """Stiffness of the modes that the observations leave, if amplitudes have the standard deviation :data:`SWAY`."""
     unit: float
@@ -69,11 +69,11 @@ class CompletionProblem:
         return (x / self.scale) @ torch.from_numpy(self.axes) + torch.from_numpy(self.centre)
 
     @staticmethod
-    def _frame(time: float, seen: list[Sample]) -> Frame:
+    def _frame(time: float, seen: list[ObservedPoints]) -> Frame:
         soft = min((one.noise or NOISE) ** 2 / (SWAY**2 * len(one.points)) for one in seen)
         return Frame(time, seen, max(SOFT, soft), max(HALF, NOISES_OF_HALF * max(one.noise for one in seen)))
 
-    def _sample(self, one: Observation, end: int) -> Sample:
+    def _sample(self, one: Observation, end: int) -> ObservedPoints:
         points, known = self.to_canonical(one.points), self.template[self.faces.unique()]
         weights = np.ones(len(points)) if one.weights is None else one.weights.cpu().double().numpy()
         normals, view = (None if x is None else self.to_canonical(x, True) for x in (one.normals, one.view))
@@ -84,4 +84,4 @@ class CompletionProblem:
             known = torch.from_numpy(places @ self.template.numpy())
         require_units(f"{one}: the points", torch.from_numpy(points), "the first shape", known[None], 1 / self.scale)
         numbers = np.arange(end - len(points), end)
-        return Sample(points, normals, weights / weights.sum(), numbers, noise, places, view)
+        return ObservedPoints(points, normals, weights / weights.sum(), numbers, noise, places, view)

@@ -28,7 +28,7 @@ OUTLIERS = 4.0
 NOISES = 0.1, 2.0
 
 
-class Sample(NamedTuple):
+class ObservedPoints(NamedTuple):
     """Observed points at a size of 100: a cloud, or points whose places on the surface are known."""
 
     points: FloatArray
@@ -46,11 +46,11 @@ class Sample(NamedTuple):
     view: FloatArray | None = None
     """Direction to the camera of a cloud. *Shape:* ``(3,)``."""
 
-    def restrict(self, select: sparse.csr_matrix) -> "Sample":
+    def restrict(self, select: sparse.csr_matrix) -> "ObservedPoints":
         """With places on a coarse mesh, by the coarse vertex of each vertex. *Shape:* ``(V, V_coarse)``."""
         return self if self.places is None else self._replace(places=self.places @ select)
 
-    def thin(self, n: int) -> "Sample":
+    def thin(self, n: int) -> "ObservedPoints":
         """At most n points of a cloud, chosen at random, always the same."""
         if self.places is not None or len(self.points) <= n:
             return self
@@ -59,7 +59,7 @@ class Sample(NamedTuple):
         normals = None if self.normals is None else self.normals[chosen]
         return self._replace(points=points, normals=normals, weights=weights / weights.sum(), numbers=numbers)
 
-    def with_noise(self, surface: "SampledSurface") -> "Sample":
+    def with_noise(self, surface: "SampledSurface") -> "ObservedPoints":
         """The noise, where it is not known, from the median of distances from a surface, or from points."""
         median = float(np.median(self.misses(surface)[0])) / (0.6745 if self.places is None else 1.538)
         return self._replace(noise=self.noise or float(np.clip(median, *NOISES)))
@@ -77,7 +77,7 @@ class Sample(NamedTuple):
             return self.distances(surface.vertices), np.ones(len(self.points), bool)
         return surface.most_alike(self.points, self.normals)[2:]
 
-    def pair(self, surface: "SampledSurface") -> "Sample":
+    def pair(self, surface: "SampledSurface") -> "ObservedPoints":
         """The points with their places; of a cloud, those whose normals do not agree weigh nothing."""
         if self.places is not None:
             return self

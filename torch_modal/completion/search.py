@@ -6,7 +6,7 @@ from torch import Tensor
 
 from torch_modal.completion.bending import ModalBending, ModalPose
 from torch_modal.completion.frames import Frame
-from torch_modal.completion.pairs import SLIDE, Sample, SampledSurface
+from torch_modal.completion.pairs import SLIDE, ObservedPoints, SampledSurface
 from torch_modal.geometry.connectivity import Connectivity
 
 # Steps, and the distance from which on pairs lose weight at the first and the last; stiffness of the modes likewise.
@@ -93,7 +93,7 @@ class PoseSearch:
                 best, pose = min(best, score), other
         return pose
 
-    def _rows(self, x: Tensor, fields: Tensor, seen: list[Sample], far: float) -> Tensor:
+    def _rows(self, x: Tensor, fields: Tensor, seen: list[ObservedPoints], far: float) -> Tensor:
         """Derivatives of the weighted offsets of all pairs, and last the offsets. *Shape:* ``(m, n + 1)``."""
         n, surface, rows = fields.shape[-1], SampledSurface(x.numpy(), self.mesh), []
         columns = fields.flatten(1).float().numpy()  # products of float32: half the time
