@@ -72,11 +72,10 @@ class ShellEnergy(nn.Module):
         """Vertices of faces, components first, extended, float32 or more. *Shape:* ``(..., V, 3) -> (3, ..., V)``."""
         rows = x[..., : self.energy.n_vertices, :].movedim(-1, 0).contiguous()
         rows = rows.to(torch.promote_types(rows.dtype, torch.float32))
-        points = self.energy.anchors
-        if points is None:
-            return self.energy.extend(rows)
-        lead = [1] * (rows.dim() - 2)
-        return self.energy.extend(rows, points.to(rows).mT.reshape(3, *lead, -1))
+        anchors = self.energy.anchors
+        if anchors is not None:
+            anchors = anchors.to(rows).mT.reshape(3, *[1] * (rows.dim() - 2), -1)
+        return self.energy.extend(rows, anchors)
 
     def rest(self, x_rest: Tensor) -> Rest:
         """Measures and weights of rest shapes. *Shape:* ``(..., V, 3)``."""

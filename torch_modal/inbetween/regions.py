@@ -124,9 +124,8 @@ def segments(space: PairedSpace, references: Tensor, n_segments: int = N_SEGMENT
 
 def _moments(x: FloatArray, modes: FloatArray, area: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Normal equations of the rigid motions nearest to modes. *Shape:* ``(V, 6, 6), (V, 6, k), (V,)``."""
-    skew = np.zeros((len(x), 3, 3))
-    skew[:, [0, 1, 2], [1, 2, 0]], skew[:, [1, 2, 0], [0, 1, 2]] = x[:, [2, 0, 1]], -x[:, [2, 0, 1]]
-    rigid = np.concatenate([np.broadcast_to(np.eye(3), skew.shape), skew], axis=2)  # of a turn: w x p
+    turns = np.cross(np.eye(3), x[:, None]).swapaxes(1, 2)
+    rigid = np.concatenate([np.broadcast_to(np.eye(3), turns.shape), turns], axis=2)
     normal = np.einsum("v,vci,vcj->vij", area, rigid, rigid)
     return normal, np.einsum("v,vci,kvc->vik", area, rigid, modes), np.einsum("v,kvc,kvc->v", area, modes, modes)
 
