@@ -183,8 +183,8 @@ class Crossings:
         """
         corners = np.zeros(self.mesh.n_vertices, dtype=bool)
         corners[self.mesh.faces[pairs.reshape(-1)]] = True
-        inside = self.encloses(Surface(x, self.mesh), np.ones(len(x), dtype=bool) if len(pairs) else corners)
-        return self.select_connected(inside & ~self.known_inside if len(self.known) else inside, corners)
+        inside = self.encloses(Surface(x, self.mesh), np.full(len(x), len(pairs) > 0))
+        return self.select_connected(inside & ~self.known_inside, corners)
 
     def encloses(self, surface: Surface, asked: BoolArray) -> BoolArray:
         """Around which of some vertices a shape winds: around a point just outside. *Shape:* ``(V,) -> (V,)``."""

@@ -20,10 +20,10 @@ def as_positions(keyframes: Any) -> Tensor:
         if not keyframes:
             raise MeshError("keyframes is empty; it needs the shape (K, V, 3)")
         shapes = [_as_tensor("keyframes", shape) for shape in keyframes]
-        for i, x in enumerate(shapes):
-            kind, first = (f"shape {tuple(shape.shape)}, {shape.dtype}, on {shape.device}" for shape in (x, shapes[0]))
-            if kind != first:
-                raise MeshError(f"key-frame {i} has {kind}, key-frame 0 has {first}; they must be equal")
+        kinds = [f"shape {tuple(shape.shape)}, {shape.dtype}, on {shape.device}" for shape in shapes]
+        for i, kind in enumerate(kinds):
+            if kind != kinds[0]:
+                raise MeshError(f"key-frame {i} has {kind}, key-frame 0 has {kinds[0]}; they must be equal")
         positions = torch.stack(shapes)
     else:
         positions = _as_tensor("keyframes", keyframes)

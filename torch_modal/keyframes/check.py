@@ -127,30 +127,25 @@ def _count(places: IntArray, what: str, name: Callable[..., str]) -> str:
 
 def _repair(faces: IntArray, n_vertices: int) -> tuple[Connectivity, bool, list[str]]:
     """Drop degenerate and repeated faces, orient the others; return the mesh, its orientability, and messages."""
-    kept, messages = np.arange(len(faces)), []
-
-    def name(i: int) -> str:
-        return f"face {kept[i]}, {faces[kept[i]].tolist()}"
-
-    for flaw, what in (
-        (inspect.degenerate_faces, "use a vertex twice"),
-        (inspect.find_repeated_faces, "have the same vertices as an earlier face"),
-    ):
-        bad = flaw(faces[kept])
-        messages.append(_count(np.argwhere(bad), f"faces {what} and were dropped", name))
-        kept = kept[~bad]
+    degenerate = inspect.degenerate_faces(faces)
+    repeated = inspect.find_repeated_faces(faces) & ~degenerate
+    kept = np.flatnonzero(~degenerate & ~repeated)
     if len(kept) == 0:
         raise MeshError("all faces use a vertex twice, so none is a triangle")
     mesh = Connectivity(faces[kept], n_vertices)
     wound, flipped, non_orientable = inspect.consistent_winding(mesh)
-    messages += [
-        _count(flipped[:, None], "faces wind against their neighbours and were turned over", name),
-        _count(
-            non_orientable[:, None],
-            "faces belong to a surface that has no consistent winding (like a Moebius strip) and were left as they "
-            "are, so some dihedral angles have the wrong sign and the volume means nothing",
-            name,
+    flaws = (
+        (np.flatnonzero(degenerate), "use a vertex twice and were dropped"),
+        (np.flatnonzero(repeated), "have the same vertices as an earlier face and were dropped"),
+        (kept[flipped], "wind against their neighbours and were turned over"),
+        (
+            kept[non_orientable],
+            "belong to a surface that has no consistent winding (like a Moebius strip) and were left as they are, so "
+            "some dihedral angles have the wrong sign and the volume means nothing",
         ),
+    )
+    messages = [
+        _count(bad[:, None], f"faces {what}", lambda i: f"face {i}, {faces[i].tolist()}") for bad, what in flaws
     ]
     return Connectivity(wound, n_vertices) if len(flipped) else mesh, not len(non_orientable), messages
 
