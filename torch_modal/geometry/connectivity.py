@@ -122,9 +122,12 @@ def spanning_forest(n: int, pairs: IntArray, costs: FloatArray) -> tuple[IntArra
     Returns:
         The parent of each node, itself for a root; its connected component. *Shape:* ``(n,)`` each.
     """
-    order = np.argsort(costs, kind="stable")
-    order = order[np.unique(pairs[order] @ [n, 1], return_index=True)[1]]  # of duplicate edges, the cheapest
-    tree = minimum_spanning_tree(sparse.coo_matrix((costs[order], pairs[order].T), shape=(n, n)).tocsr()).tocoo()
+    graph = sparse.coo_matrix((costs, pairs.T), shape=(n, n)).tocsr()
+    if graph.nnz < len(pairs):  # costs of duplicate edges were summed: the cheapest counts
+        order = np.argsort(costs, kind="stable")
+        order = order[np.unique(pairs[order] @ [n, 1], return_index=True)[1]]
+        graph = sparse.coo_matrix((costs[order], pairs[order].T), shape=(n, n)).tocsr()
+    tree = minimum_spanning_tree(graph).tocoo()
     piece = connected_components(tree, directed=False)[1].astype(np.int64)
     # An extra node above all roots: one traversal visits all trees.
     roots = np.unique(piece, return_index=True)[1]

@@ -22,6 +22,8 @@ RINGS_OF_CROSSINGS = 2
 """Pairs within so many rings of a crossing of a key-frame belong to it: it grows and shrinks with every rounding."""
 FAR_APART = 0.06
 """Part of the diagonal, along the surface; nearer crossings are folds, not two parts that meet."""
+SOURCES_AT_ONCE = 256
+"""Vertices from which distances along the surface are searched at a time, to bound memory."""
 _OFFSET = 1e-4
 """Offset along the normal, over the diagonal, at which winding numbers of vertices are taken: on the surface they are
 1/2."""
@@ -57,13 +59,18 @@ class Crossings:
         self.mesh, self.known, self._search = mesh, known, search
         self.like = known[0] if like is None else like
         self.diagonal = float(np.linalg.norm(np.ptp(self.like[mesh.used], axis=0)))
-        #: Edge lengths as a graph, and True between vertices that an edge joins. *Shape:* ``(V, V)``.
-        self.lengths = edge_graph(self.like, mesh.edges)
-        self.adjacency: sparse.csr_matrix = self.lengths.astype(bool)
-        #: Of the vertices searched so far, those within :data:`FAR_APART`.
-        self._near: dict[int, IntArray] = {}
 
     # ------------------------------------------------------------------------------------------------- once for a mesh
+    @cached_property
+    def lengths(self) -> sparse.csr_matrix:
+        """Edge lengths as a graph. *Shape:* ``(V, V)``."""
+        return edge_graph(self.like, self.mesh.edges)
+
+    @cached_property
+    def adjacency(self) -> sparse.csr_matrix:
+        """True between vertices that an edge joins. *Shape:* ``(V, V)``."""
+        return self.lengths.astype(bool)
+
     @cached_property
     def pairs_of_known(self) -> list[IntArray]:
         """Pairs that cross in each of the known shapes. *Shape of each:* ``(P, 2)``."""
@@ -154,18 +161,13 @@ class Crossings:
     def are_far_apart(self, vertices: IntArray, faces: IntArray) -> BoolArray:
         """True for a vertex and a face more than :data:`FAR_APART` apart on the surface. *Shape:* ``(n,), (n, 3)``."""
         sources, which = np.unique(vertices, return_inverse=True)
-        new = [v for v in sources.tolist() if v not in self._near]
-        for some in (new[i : i + 256] for i in range(0, len(new), 256)):
+        far = np.ones(len(vertices), dtype=bool)
+        for start in range(0, len(sources), SOURCES_AT_ONCE):
+            some = sources[start : start + SOURCES_AT_ONCE]
             reached = dijkstra(self.lengths, indices=some, limit=FAR_APART * self.diagonal)
-            self._near.update((v, np.flatnonzero(np.isfinite(row))) for v, row in zip(some, reached, strict=True))
-        if not len(sources):
-            return np.ones(0, dtype=bool)
-        n = self.mesh.n_vertices
-        # Sorted, as they are put together.
-        codes = np.concatenate([k * n + self._near[v] for k, v in enumerate(sources.tolist())])
-        wanted = which.reshape(-1, 1) * n + faces
-        is_near = codes[np.minimum(np.searchsorted(codes, wanted), len(codes) - 1)] == wanted
-        return ~is_near.any(1)  # type: ignore[no-any-return]
+            rows = np.flatnonzero(which // SOURCES_AT_ONCE == start // SOURCES_AT_ONCE)
+            far[rows] = np.isinf(reached[which[rows, None] - start, faces[rows]]).all(1)
+        return far
 
     def within(self, vertices: BoolArray, distance: float) -> BoolArray:
         """Vertices within a part of the diagonal of given ones, along the surface. *Shape:* ``(V,) -> (V,)``."""

@@ -22,8 +22,9 @@ def degenerate_faces(faces: IntArray) -> BoolArray:
 
 def find_repeated_faces(faces: IntArray) -> BoolArray:
     """Faces with the same vertices as an earlier face, in any order. *Shape:* ``(F,)``."""
-    repeated = np.ones(len(faces), dtype=bool)
-    repeated[np.unique(np.sort(faces, axis=1), axis=0, return_index=True)[1]] = False
+    repeated, corners = np.zeros(len(faces), dtype=bool), np.sort(faces, axis=1).T
+    order = np.lexsort(corners)  # stable: among equal faces the earliest comes first
+    repeated[order[1:]] = (corners[:, order[1:]] == corners[:, order[:-1]]).all(axis=0)
     return repeated
 
 
@@ -65,11 +66,11 @@ def diagonals(keyframes: FloatArray) -> FloatArray:
     return largest * np.linalg.norm(extent / np.where(largest > 0, largest, 1)[:, None], axis=1)
 
 
-def fatness(corners: FloatArray) -> FloatArray:
-    """Altitude of triangles over their longest side, 0.87 of equilateral ones. *Shape:* ``(..., 3, 3) -> (...)``."""
-    sides = corners - np.roll(corners, 1, axis=-2)
-    twice_areas = np.linalg.norm(np.cross(sides[..., 0, :], sides[..., 1, :]), axis=-1)
-    altitudes: FloatArray = twice_areas / np.maximum((sides**2).sum(-1).max(-1), np.finfo(np.float64).tiny)
+def fatness(points: FloatArray, faces: IntArray) -> FloatArray:
+    """Altitude of faces over their longest side, 0.87 of equilateral ones. *Shape:* ``(V, 3), (F, 3) -> (F,)``."""
+    a, b, c = points[faces.T]
+    longest = np.maximum.reduce([np.einsum("fi,fi->f", side, side) for side in (b - a, c - b, a - c)])
+    altitudes: FloatArray = double_areas(points, faces) / np.maximum(longest, np.finfo(np.float64).tiny)
     return altitudes
 
 

@@ -210,7 +210,7 @@ def _flaws(scaled: FloatArray, mesh: Connectivity, resolution: float) -> list[st
             lambda k, e: f"edge {edges[e].tolist()} in key-frame {k}",
         ),
         _count(
-            np.argwhere([inspect.fatness(shape[mesh.faces]) <= resolution for shape in scaled]),
+            np.argwhere([inspect.fatness(shape, mesh.faces) <= resolution for shape in scaled]),
             "faces have no area in some key-frame, so their dihedral angles are noise",
             lambda k, f: f"face {mesh.faces[f].tolist()} in key-frame {k}",
         ),

@@ -89,7 +89,7 @@ def coarsen(
         for i in set(sources) - set(known) if n < len(faces) else ():
             known[i] = decimate(keyframes[i], faces, n)[2]
         each = [collapse(keyframes[i], faces, n, known.get(i)) for i in sources]
-        shares = [fatness(one.restrict(keyframes)[:, one.faces]) for one in each]
+        shares = [np.stack([fatness(x, one.faces) for x in one.restrict(keyframes)]) for one in each]
         # In the worst key-frame: those without needles first, then by the 1st percentile.
         ranks = [(min(float(x.min()), NEEDLE), float(np.percentile(x, 1, axis=-1).min())) for x in shares]
         best = max(range(len(each)), key=ranks.__getitem__)
