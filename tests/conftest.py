@@ -18,6 +18,7 @@ from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from solids import box, eigenmodes, element_hessian, lumped_mass, surface
 from timing import limit_threads
 
+from torch_modal.data.space import ShapeSpace
 from torch_modal.elastic.backend import WarpBackend
 from torch_modal.elastic.energy import RestShapes
 from torch_modal.elastic.implicit import ConvergenceWarning
@@ -116,6 +117,12 @@ def small_bars() -> Shapes:
 
 
 @pytest.fixture(scope="session")
+def space(bars: Shapes) -> ShapeSpace:
+    """The space of the bars, in float64."""
+    return ShapeSpace(bars.bases, bars.faces, dtype=torch.float64)
+
+
+@pytest.fixture(scope="session")
 def hand_path(data_dir: Path) -> Keyframes:
     """Frames 00, 02, 04, 06, 08 of a hand that closes: the middle of a span is its reference in-between."""
     return load_keyframes([data_dir / "mh-hand-path" / f"{i:02}.obj" for i in (0, 2, 4, 6, 8)])
@@ -140,6 +147,11 @@ def converged() -> Iterator[None]:
     with warnings.catch_warnings():
         warnings.simplefilter("error", ConvergenceWarning)
         yield
+
+
+def seeded(seed: int = 0) -> torch.Generator:
+    """A source of random numbers."""
+    return torch.Generator().manual_seed(seed)
 
 
 @pytest.fixture

@@ -2,14 +2,15 @@
 
 import json
 import os
-import sys
+import time
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from conftest import Shapes, processes, wait_until
+from conftest import Shapes
 
 import torch_modal as tm
 from torch_modal.cli import main as cli
@@ -17,52 +18,39 @@ from torch_modal.data import precompute
 from torch_modal.data.precompute import Options, Record, read_record
 from torch_modal.data.stored import SET_FILE, StoredSet, find_sets, write_set
 from torch_modal.io.write import save_frames
+from torch_modal.modes.processes import ChildError
 
-# In place of the process that computes a set: the set's name says what becomes of it. The package itself starts it,
-# keeps its time and reads its result.
-FAKE = """
-import hashlib, json, os, signal, subprocess, sys, time
-job = json.loads(sys.stdin.readline())
-name, record = os.path.basename(job["target"]), {"key": job["key"]}
-with open(os.environ["FAKE_LOG"], "a") as log:
-    log.write(ascii(name)[1:-1] + " " + str(os.getpid()) + " " + os.environ["OMP_NUM_THREADS"] + "\\n")
-open(os.path.join(os.environ["TMPDIR"], "leftover"), "w").write("x")
-if "crash" in name:
-    os.kill(os.getpid(), signal.SIGSEGV)
-if "killed" in name:
-    os.kill(os.getpid(), signal.SIGKILL)
-if "hang" in name:
-    time.sleep(60)
-if "stubborn" in name:
-    subprocess.run([sys.executable, "-c", "import time; time.sleep(60)", os.environ["TMPDIR"]])
-if "silent" in name:
-    sys.exit("no luck")
-record.update(status="done", seconds=0.1, warnings=["a bit open"] if "open" in name else [])
-data = open(os.environ["FAKE_SET"], "rb").read()
-end = 8 + int.from_bytes(data[:8], "little")
-header, body = json.loads(data[8:end]), bytearray(data[end:])
-entry = json.loads(header["__metadata__"]["torch_modal"])
-entry = json.dumps({**entry, "note": json.dumps(record)}, sort_keys=True)
-header["__metadata__"]["torch_modal"] = entry
-names = sorted(name for name in header if name not in ("__metadata__", "digests"))
-first, last = header["digests"]["data_offsets"]
-digest = hashlib.sha256(json.dumps([entry, names]).encode() + body[first + 32 : last]).digest()
-body[first : first + 32] = digest
-head = json.dumps(header).encode()
-head += b" " * (-len(head) % 8)
-os.makedirs(job["target"], exist_ok=True)
-file = os.path.join(job["target"], "set.safetensors")
-open(file + ".tmp", "wb").write(len(head).to_bytes(8, "little") + head + body)
-os.replace(file + ".tmp", file)
-"""
+FAILURES = {
+    "crash": "its process ended with signal SIGSEGV",
+    "hang": "no result after the timeout of {} s",
+    "silent": "its process ended with exit code 1 (no luck)",
+}
+"""Ends of the processes of sets with these words in their names."""
 
 
 class Bench:
-    """A folder tree, an output folder, and the command."""
+    """A folder tree, an output folder, and the command, whose sets are computed at once, without a process."""
 
-    def __init__(self, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-        self.root, self.out, self.log, self._capsys = folder / "shapes", folder / "out", folder / "log", capsys
+    def __init__(self, folder: Path, shapes: Shapes, capsys: pytest.CaptureFixture[str]) -> None:
+        self.root, self.out, self.shapes, self._capsys = folder / "shapes", folder / "out", shapes, capsys
         self.said: list[str] = []
+        self.started: list[str] = []
+
+    def run_child(
+        self, command: list[str], folder: Path, timeout: float, stop: object, job: bytes, environment: dict[str, str]
+    ) -> None:
+        """What a process would do with its job."""
+        what = json.loads(job)
+        name = Path(what["target"]).name
+        self.started.append(name)
+        assert environment["OMP_NUM_THREADS"] == "1" and environment["TMPDIR"] == str(folder)
+        (folder / "leftover").write_text("x")
+        for word, reason in FAILURES.items():
+            if word in name:
+                raise ChildError(reason.format(f"{timeout:g}"))
+        record = Record("done", "", ["a bit open"] if "open" in name else [], 0.1, what["key"])
+        names = ["1.obj", "2.obj", "3.obj"]
+        write_set(what["target"], *self.shapes, names, note=json.dumps(asdict(record)))
 
     def add(self, *names: str) -> None:
         """Sets of two files, which nobody reads but to hash them."""
@@ -81,9 +69,9 @@ class Bench:
 
     def computed(self) -> list[str]:
         """Sets for which a process was started since this was last asked, sorted."""
-        names = [line.split()[0] for line in self.log.read_text().splitlines()] if self.log.exists() else []
-        self.log.unlink(missing_ok=True)
-        return sorted(names)
+        names = sorted(self.started)
+        self.started.clear()
+        return names
 
     def record(self, name: str) -> Record:
         """The record of a set."""
@@ -94,48 +82,31 @@ class Bench:
 
 @pytest.fixture
 def bench(tmp_path: Path, bars: Shapes, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Bench:
-    """The command with a fake process for each set, which is up in no time."""
-    made = Bench(tmp_path, capsys)
-    (tmp_path / "worker.py").write_text(FAKE)
-    write_set(tmp_path / "stored", *bars, ["1.obj", "2.obj", "3.obj"])
+    """The command with no process for the sets."""
+    made = Bench(tmp_path, bars, capsys)
     (tmp_path / "scratch").mkdir()
-    monkeypatch.setattr(precompute, "COMMAND", [sys.executable, str(tmp_path / "worker.py")])
+    monkeypatch.setattr(precompute, "run_child", made.run_child)
     monkeypatch.setattr(precompute.tempfile, "tempdir", str(tmp_path / "scratch"))
-    monkeypatch.setenv("FAKE_LOG", str(made.log))
-    monkeypatch.setenv("FAKE_SET", str(tmp_path / "stored" / SET_FILE))
     return made
 
 
 # --------------------------------------------------------------------------------------------- one run
 def test_bad_sets_are_named_and_do_not_stop_the_others(bench: Bench) -> None:
-    good = [f"good/{i}" for i in range(6)]
-    bench.add("crash", "killed", "hang", "stubborn", "silent", "open", *good)
+    done = [*(f"good/{i}" for i in range(6)), "open"]
+    bench.add(*FAILURES, *done)
     assert bench.run("--timeout", "3", "--workers", "4") == 3
-    wanted = {
-        "crash": "its process ended with signal SIGSEGV",
-        "hang": "no result after the timeout of 3 s",
-        "killed": "its process ended with signal SIGKILL (perhaps memory ran out)",
-        "silent": "its process ended with exit code 1 (no luck)",
-        "stubborn": "no result after the timeout of 3 s",
-    }
-    done = [*good, "open"]
-    assert bench.computed() == sorted(name.split("/")[-1] for name in [*wanted, *done])
-    assert not any((bench.out / name).exists() for name in wanted)
+    assert bench.computed() == sorted(name.split("/")[-1] for name in [*FAILURES, *done])
+    assert not any((bench.out / name).exists() for name in FAILURES)
     for name in done:
-        record = bench.record(name)
-        assert record.status == "done"
-        assert len(StoredSet(bench.out / name)) == 3
+        assert bench.record(name).status == "done" and len(StoredSet(bench.out / name)) == 3
     assert find_sets(bench.out) == sorted(bench.out / name for name in done)
     # The summary names them for somebody who did not watch.
     summary = bench.said[bench.said.index(next(line for line in bench.said if "have their bases" in line)) :]
-    assert summary[0].startswith("7 of 12 sets have their bases; 12 were worked on now, in ")
-    expected = {name: f"  failed {name}: {reason}" for name, reason in wanted.items()}
+    assert summary[0].startswith("7 of 10 sets have their bases; 10 were worked on now, in ")
+    expected = {name: f"  failed {name}: {reason.format(3)}" for name, reason in FAILURES.items()}
     expected["open"] = "  done open, 0.1 s: a bit open"
     assert summary[1:] == [expected[name] for name in sorted(expected)]
-    scratch = bench.root.parent / "scratch"
-    assert list(scratch.iterdir()) == [], "temporary files are left"
-    # What a process has started is killed with it, which takes a moment where the machine is busy.
-    wait_until(lambda: not processes(str(scratch)), 10)
+    assert list((bench.root.parent / "scratch").iterdir()) == [], "temporary files are left"
 
 
 def test_names_that_are_no_text(bench: Bench) -> None:
@@ -148,16 +119,15 @@ def test_names_that_are_no_text(bench: Bench) -> None:
     assert bench.said[-1].startswith("  failed silent-\\udcff: ")
 
 
-def test_processes_have_one_thread_and_as_many_run_as_asked(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    alive, most, run = [], [], precompute.run_child
+def test_as_many_sets_run_at_a_time_as_asked(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    alive, most = [], []
 
-    def counting(*args: object) -> object:
+    def counting(*args: Any) -> None:
         alive.append(1)
         most.append(len(alive))
-        try:
-            return run(*args)  # type: ignore[arg-type]
-        finally:
-            alive.pop()
+        time.sleep(0.1)
+        bench.run_child(*args)
+        alive.pop()
 
     monkeypatch.setattr(precompute, "run_child", counting)
     bench.add(*(f"s{i}" for i in range(7)))
@@ -166,7 +136,6 @@ def test_processes_have_one_thread_and_as_many_run_as_asked(bench: Bench, monkey
     assert bench.said[0] == f"7 sets of key-frames in {bench.root}"
     assert bench.said[1].startswith("[1/7] done s") and bench.said[1].endswith(", 0.1 s")
     assert bench.run("--quiet") == 0 and bench.said == []
-    assert {line.split()[2] for line in bench.log.read_text().splitlines()} == {"1"}
 
 
 # --------------------------------------------------------------------------------------------- again

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from bodies import sheet_surface
 from conftest import Shapes
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
@@ -98,11 +99,8 @@ def test_fingers_keep_their_points() -> None:
 
 def test_anchors_decide_between_parts() -> None:
     """Two sheets on each other: points in the middle follow the one that they are said to belong to."""
-    n = torch.linspace(0, 1, 5, dtype=DOUBLE)
-    sheet = torch.stack([*torch.meshgrid(n, n, indexing="ij"), torch.zeros(5, 5, dtype=DOUBLE)], -1).view(-1, 3)
-    i = torch.arange(20).view(4, 5)[:, :4].flatten()
-    faces = torch.cat([torch.stack([i, i + 5, i + 1], 1), torch.stack([i + 1, i + 5, i + 6], 1)])
-    upper = torch.tensor([0.0, 0.0, 0.1])
+    sheet, faces = map(torch.from_numpy, sheet_surface((4, 4), (1, 1)))
+    upper = torch.tensor([0.0, 0.1, 0.0])
     x, both = torch.cat([sheet, sheet + upper]), torch.cat([faces, faces + 25])
     y = torch.cat([sheet, sheet + upper + 1])
     points = sheet[[6, 12]] + 0.4 * upper
@@ -209,14 +207,10 @@ def test_a_triangle_cut_in_two_has_the_same_say() -> None:
 @pytest.mark.parametrize("along", [0.0, 0.3, 0.55])
 def test_the_other_side_of_a_groove_fades_out(along: float) -> None:
     """Two walls at a right angle: that at twice the distance of the nearer one has no influence any more."""
-    y = torch.linspace(0, 4, 5, dtype=DOUBLE)
-    floor = torch.stack([*torch.meshgrid(y, y, indexing="ij"), torch.zeros(5, 5, dtype=DOUBLE)], -1).view(-1, 3)
-    wall = floor[:, [2, 1, 0]]
-    i = torch.arange(20).view(4, 5)[:, :4].flatten()
-    one = torch.cat([torch.stack([i, i + 5, i + 1], 1), torch.stack([i + 1, i + 5, i + 6], 1)])
-    vertices, number = torch.cat([floor, wall]).unique(dim=0, return_inverse=True)
+    floor, one = map(torch.from_numpy, sheet_surface((4, 4), (4, 4)))
+    vertices, number = torch.cat([floor, floor[:, [1, 0, 2]]]).unique(dim=0, return_inverse=True)
     height = 0.5
-    point = torch.tensor([[height * (1 + 2 * along), 2.1, height]], dtype=DOUBLE)
+    point = torch.tensor([[height * (1 + 2 * along), height, 0.1]], dtype=DOUBLE)
     weights = tm.Passengers(vertices, number[torch.cat([one, one + 25])], point).weights.toarray()[0]
-    share = float(weights[(vertices[:, 2] > 0).numpy()].sum())
+    share = float(weights[(vertices[:, 1] > 0).numpy()].sum())
     assert (share > 0) == (along < 0.5) and share < 0.51

@@ -10,7 +10,6 @@ from torch import Tensor
 
 import torch_modal as tm
 from torch_modal.data.samples import load_sample
-from torch_modal.geometry.rigid import best_fit
 from torch_modal.geometry.rotations import exp
 from torch_modal.statistics.fit import fit
 from torch_modal.statistics.local_weights import LocalWeights, Observations
@@ -28,6 +27,10 @@ def markers(x: Tensor, n: int = 20) -> Tensor:
     return torch.tensor(found)
 
 
+def mean_distance(x: Tensor, y: Tensor) -> float:
+    return float((x - y).norm(dim=-1).mean())
+
+
 @pytest.fixture(scope="module")
 def creature() -> tuple[tm.ShapeSpace, Tensor]:
     """All poses but one, and that one."""
@@ -36,26 +39,16 @@ def creature() -> tuple[tm.ShapeSpace, Tensor]:
     return tm.ShapeSpace([basis for k, basis in enumerate(bases) if k != 2], sample.faces), sample.keyframes[2]
 
 
-@pytest.fixture(scope="module")
-def space(bars: Shapes) -> tm.ShapeSpace:
-    return tm.ShapeSpace(bars.bases, bars.faces, dtype=DOUBLE)
-
-
 def test_a_pose_that_is_not_among_the_keyframes(creature: tuple[tm.ShapeSpace, Tensor]) -> None:
     space, truth = creature
     picked = markers(truth)
     turn = exp(torch.tensor([0.2, 2.0, -0.4], dtype=DOUBLE))
     moved = truth @ turn.mT + 5
     found = space.fit(moved[picked], picked)
-
-    def error(x: Tensor) -> float:
-        return float((x - moved).norm(dim=-1).mean())
-
     shapes = space.keyframes(truth)
-    nearest = min(error(best_fit(x, moved, torch.ones(len(x)).to(x)).apply(x)) for x in shapes)
-    linear = _linear(shapes, moved, picked)
-    assert error(found.shape) < 0.5 * error(linear)
-    assert error(found.shape) < 0.35 * nearest
+    nearest = min(mean_distance(x, moved) for x in tm.align(shapes, moved.expand_as(shapes)))
+    assert mean_distance(found.shape, moved) < 0.5 * mean_distance(_linear(shapes, moved, picked), moved)
+    assert mean_distance(found.shape, moved) < 0.35 * nearest
     assert float(found.misses.max()) < 0.01 * float((truth.amax(0) - truth.amin(0)).norm())
     torch.testing.assert_close(found.weights.sum(0), torch.ones(len(truth), dtype=DOUBLE))
 
@@ -72,8 +65,7 @@ def test_inference_mode_and_arrays(space: tm.ShapeSpace, bars: Shapes) -> None:
 
 def _linear(shapes: Tensor, moved: Tensor, picked: Tensor) -> Tensor:
     """The nearest shape of the linear span, seen at the picked vertices."""
-    pose = best_fit(shapes, moved.expand_as(shapes), torch.ones(len(moved), dtype=DOUBLE))
-    aligned = pose.apply(shapes)
+    aligned = tm.align(shapes, moved.expand_as(shapes))
     off = (aligned[1:] - aligned[0])[:, picked].flatten(1)
     ridge = 1e-4 * float(off.square().sum(1).mean()) * torch.eye(len(off), dtype=DOUBLE)
     right = off @ (moved[picked] - aligned[0, picked]).flatten()
@@ -179,7 +171,7 @@ def test_noise_that_is_known(space: tm.ShapeSpace, bars: Shapes, generator: torc
     points = truth[picked] + noise * torch.randn(20, 3, generator=generator, dtype=DOUBLE)
     plain, exact, known = (space.fit(points, picked, noise=own) for own in (None, 0, noise))
     assert torch.equal(plain.shape, exact.shape)
-    assert float((known.shape - truth).norm(dim=-1).mean()) < 0.85 * float((plain.shape - truth).norm(dim=-1).mean())
+    assert mean_distance(known.shape, truth) < 0.85 * mean_distance(plain.shape, truth)
 
 
 def test_outliers_are_ignored_if_asked(creature: tuple[tm.ShapeSpace, Tensor]) -> None:
@@ -189,11 +181,7 @@ def test_outliers_are_ignored_if_asked(creature: tuple[tm.ShapeSpace, Tensor]) -
     size = float((truth.amax(0) - truth.amin(0)).norm())
     points[[3, 17]] += torch.tensor([0.0, 0.4 * size, 0.0], dtype=DOUBLE)
     plain, robust = (space.fit(points, picked, robust=robust) for robust in (False, True))
-
-    def error(x: Tensor) -> float:
-        return float((x - truth).norm(dim=-1).mean())
-
-    assert error(robust.shape) < 0.3 * error(plain.shape)
+    assert mean_distance(robust.shape, truth) < 0.3 * mean_distance(plain.shape, truth)
     assert float(robust.trust[[3, 17]].max()) < 0.05 and float(robust.trust.median()) > 0.5
 
 

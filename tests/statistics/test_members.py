@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import pytest
 import torch
-from conftest import Shapes
+from conftest import Shapes, seeded
 from shapes import edge_lengths
 from test_coordinates import far
 
@@ -14,15 +14,6 @@ from torch_modal.elastic.backend import TorchBackend
 from torch_modal.elastic.steps import FineEnergy
 from torch_modal.elastic.term import Mesh, Term
 from torch_modal.geometry.connectivity import Connectivity
-
-
-@pytest.fixture(scope="module")
-def space(bars: Shapes) -> tm.ShapeSpace:
-    return tm.ShapeSpace(bars.bases, bars.faces, dtype=torch.float64)
-
-
-def seeded(seed: int = 0) -> torch.Generator:
-    return torch.Generator().manual_seed(seed)
 
 
 def test_the_same_seed_has_the_same_members(space: tm.ShapeSpace) -> None:
