@@ -131,11 +131,10 @@ class PairTables:
         return self._tables.get((i, j), lambda: read_or_compute(self.folder, f"between-{i}-{j}", content, compute))
 
     def _layer(self, i: int, j: int, like: Tensor) -> InBetween:
-        def make_layer() -> InBetween:
-            ends = [self.bases[i], self.bases[j]]
-            return InBetween(ends, self.faces, **self.settings._asdict()).to(like)
-
-        return self._solvers.get((i, j, like.dtype, like.device), make_layer)
+        return self._solvers.get(
+            (i, j, like.dtype, like.device),
+            lambda: InBetween([self.bases[i], self.bases[j]], self.faces, **self.settings._asdict()).to(like),
+        )
 
     def _span(self, i: int, j: int) -> tuple[float, float] | None:
         """Times of two key-frames, ``i < j``, that follow each other in a motion of three or more; otherwise None."""

@@ -224,9 +224,7 @@ class RandomRigidMotion(ShapeAugmentation):
         if self.degrees is None:
             # A normal vector of four has a uniform direction: a uniform quaternion.
             return {"rotation": quaternion_to_axis_angle(normalize(direction, dim=1)), "translation": move}
-        axis = direction[:, 1:]
-        if self.axis is not None:
-            axis = torch.as_tensor(self.axis).to(axis).expand_as(axis)
+        axis = direction[:, 1:] if self.axis is None else direction.new_tensor([self.axis])
         return {"rotation": angle[:, None] * normalize(axis, dim=1), "translation": move}
 
     def apply_transform(

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torch_modal.arrays import FloatArray, IntArray
-from torch_modal.data.tree import natural
+from torch_modal.data.tree import mesh_files, natural
 from torch_modal.errors import MeshError
 from torch_modal.io.formats import FPS
 from torch_modal.io.gltf import key_times
@@ -74,8 +74,7 @@ def sequence_files(paths: Paths) -> list[Path]:
         return files
     (start,) = files
     if start.is_dir():
-        meshes = [path for path in start.iterdir() if path.is_file() and path.suffix.lower() in SUFFIXES]
-        meshes = [path for path in meshes if any(map(str.isdigit, path.stem))] or meshes
+        meshes = [path for path in mesh_files(start) if any(map(str.isdigit, path.stem))] or mesh_files(start)
         kinds = sorted({path.suffix.lower() for path in meshes})
         if len(kinds) != 1:
             what, listed = ("meshes of several kinds", kinds) if kinds else ("no meshes", list(SUFFIXES))

@@ -119,17 +119,15 @@ class ShapeSpace:
         device, dtype = ("cpu", self.dtype) if like is None else (like.device, like.dtype)
         return self._keyframes.to(device, dtype, copy=True)
 
+    @torch.no_grad()
     def nearest(self, x: Tensor) -> Tensor:
         """Index of the closest key-frame, up to a rigid motion. *Shape:* ``(B, V, 3) -> (B,)``."""
-        if len(self) == 1:
-            return torch.zeros(len(x), dtype=torch.int64)
-        with torch.no_grad():
-            x = x.detach()
-            weights = self.reconstruction(x.device).areas.to(x)
-            distances = [
-                ((best_fit(key.expand_as(x), x, weights).apply(key) - x) ** 2).sum(-1) @ weights
-                for key in self._keyframes.to(x)
-            ]
+        x = x.detach()
+        weights = self.reconstruction(x.device).areas.to(x)
+        distances = [
+            ((best_fit(key.expand_as(x), x, weights).apply(key) - x) ** 2).sum(-1) @ weights
+            for key in self._keyframes.to(x)
+        ]
         return torch.stack(distances).argmin(0).cpu()
 
     def strain(self, x: Tensor, rest: Tensor) -> Tensor:
@@ -227,14 +225,13 @@ class ShapeSpace:
 
         Arguments and shape as for :meth:`sample`, in the dtype of the tables.
         """
-        settings = (n, concentration, locality)
+        settings, folder = (n, concentration, locality), self.in_betweens.folder
 
         def draw() -> tuple[Tensor, bool]:
             generator = torch.Generator().manual_seed(0)
             return self.sample(n, generator, concentration=concentration, locality=locality), True
 
         content = [self._keyframes, self.faces, str(self.dtype), settings]
-        folder = self.in_betweens.folder
         return self._made.get(settings, lambda: read_or_compute(folder, "between-all", content, draw))
 
     def fit(
