@@ -234,6 +234,17 @@ def test_weights_far_below_zero_come_nearer_to_even_ones() -> None:
     torch.testing.assert_close(found[:, 1:], weights[:, 1:])  # within the bound
 
 
+def test_what_no_mixture_meets_falls_back_to_a_keyframe(
+    space: tm.ShapeSpace, bars: Shapes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    variation = space.variation()
+    monkeypatch.setattr(variation, "relax", lambda x, *_: 3 * x)
+    picked = markers(bars.keyframes[1])
+    found = space.fit(bars.keyframes[1][picked], picked)
+    assert far(found.shape, bars.keyframes[1]) < 1e-9
+    assert torch.equal(found.weights[1], torch.ones(space.n_vertices, dtype=DOUBLE))
+
+
 @pytest.mark.parametrize(
     "points, vertices, near, words",
     [

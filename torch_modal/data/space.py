@@ -266,8 +266,9 @@ class ShapeSpace:
                 noisier they are, the closer the shape stays to what is likely.
 
         Returns:
-            The shapes with their weights, and their distance from each point. Points of weight zero have a trust of
-            zero; the shape's distance from them is a constant, and NaN where they are.
+            The shapes with their weights, and their distance from each point. If a rigidly moved key-frame is nearer to
+            the points, the result is that key-frame. Points of weight zero have a trust of zero; the shape's distance
+            from them is a constant, and NaN where they are.
 
         Raises:
             ValueError: There is only one key-frame, an argument does not fit, or the points are in other units.

@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import one_hot
 
 from torch_modal.autograd import is_transformed
 from torch_modal.contact.active import Pull
@@ -17,6 +18,9 @@ STIFFNESS, LARGEST_STIFFNESS = 2000.0, 100.0
 
 # Products in the Newton steps of the first elastic round, and of each of the next, with weights computed anew.
 FIRST_ROUND, NEXT_ROUND, N_ROUNDS = 6 * [40], 4 * [40], 3
+
+# Mean distance, in sizes, by which the result may be farther from the points than a given shape.
+DISTANCE_SLACK = 1e-3
 
 
 class Fitted(NamedTuple):
@@ -80,7 +84,7 @@ def fit(
 def _fit_one(variation: Variation, every: Observations, about: Tensor, robust: bool, noise: float) -> Fitted:
     """The shape that meets one set of points: of the weights of least cost, then after elastic steps of all vertices.
 
-    The steps are constants of the graph.
+    The steps are constants of the graph. Where a given shape is nearer to the points, it is the result.
     """
     observed = every.weights > 0
     to = Observations(*(column[observed] for column in every))
@@ -101,7 +105,14 @@ def _fit_one(variation: Variation, every: Observations, about: Tensor, robust: b
             mixed = variation.mixtures.weights(x)
             x = variation.relax(x, mixed, NEXT_ROUND, springs)
         step = x - assembled
-    shape = pose.apply(assembled + step)
+        missed = [to.distances_after_fit(shape) for shape in variation.shapes]
+        *errors, error = ((to.weights * each.square()).sum() for each in (*missed, to.distances(pose.apply(x))))
+        least, k = torch.stack(errors).min(0)
+    if error > least + to.weights.sum() * (DISTANCE_SLACK * variation.size) ** 2:
+        shape = to.pose(variation.shapes[k]).apply(variation.shapes[k])
+        mixed = one_hot(k, len(errors)).to(x)[:, None].expand_as(mixed)
+    else:
+        shape = pose.apply(assembled + step)
     misses, trust = every.distances(shape).detach(), torch.zeros_like(every.weights)
     misses[observed], trust[observed] = to.distances(shape), to.weights
     return Fitted(shape, mixed, misses, trust)
