@@ -115,20 +115,6 @@ def test_modes_of_each_body(alone: Shapes, both: Shapes) -> None:
         torch.testing.assert_close(whole.modes[~mine][:, n:], other.modes, rtol=0, atol=1e-9)
 
 
-def test_gradients_are_those_of_each_alone(alone: Shapes, both: Shapes) -> None:
-    n = alone.keyframes.shape[1]
-
-    def gradients(shapes: Shapes) -> list[Tensor]:
-        x, t = shapes.keyframes[:2].clone().requires_grad_(), TIMES.clone().requires_grad_()
-        found = tm.InBetween(shapes.bases[:2], shapes.faces)(*x, t)[:, :n]
-        return list(torch.autograd.grad((found * torch.linspace(1, 2, n, dtype=DOUBLE)[:, None]).sum(), [x, t]))
-
-    (x, t), (x_alone, t_alone) = gradients(both), gradients(alone)
-    torch.testing.assert_close(x[:, :n], x_alone, rtol=0, atol=1e-9)
-    torch.testing.assert_close(t, t_alone, rtol=0, atol=1e-9)
-    assert not x[:, n:].any()
-
-
 def test_results_of_bodies_are_put_together(alone: Shapes, both: Shapes) -> None:
     """The energies add up, the status is the worst, and a state makes a layer of other bodies."""
     layer, single = (tm.InBetween(s.bases[:2], s.faces) for s in (both, alone))
