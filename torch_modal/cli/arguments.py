@@ -1,10 +1,9 @@
 """Types of arguments, options that several commands share, and checks of output paths."""
 
 import argparse
-import inspect
 import os
 import re
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,70 +16,44 @@ REGISTRATION = ("landmarks", "same_subject", "cache", "progress")
 """Options of `register`, as `add_registration` and `add_cache` name them."""
 
 
-def adder(sub: argparse._ActionsContainer, function: Callable[..., object]) -> Callable[..., argparse.Action]:
-    """``sub.add_argument``, with the help of each argument from the lines below ``Options:`` in a docstring."""
-    text = inspect.cleandoc(function.__doc__ or "").partition("Options:\n")[2]
-    helps = {name: " ".join(words.split()) for name, words in re.findall(r"^    (\S+): (.*(?:\n {5,}.*)*)", text, re.M)}
-    return lambda name, **options: sub.add_argument(name, **{"help": helps.get(name), **options})
-
-
 def add_levels(sub: argparse.ArgumentParser) -> None:
-    """Add an option of subdivision.
-
-    Options:
-        --levels: how often the number of intervals doubles (default: %(default)s, 8 frames an interval)
-    """
-    adder(sub, add_levels)("--levels", type=int, metavar="L", default=3)
+    """Add ``--levels`` of subdivision."""
+    text = "how often the number of intervals doubles (default: %(default)s, 8 frames an interval)"
+    sub.add_argument("--levels", type=int, metavar="L", default=3, help=text)
 
 
 def add_modes(sub: argparse.ArgumentParser) -> None:
-    """Add options of `extract_bases`.
-
-    Options:
-        --modes: elastic modes of each key-frame; 20 to 100 are usual (default: %(default)s)
-        --method: modes of the solid inside, of the surface itself (sheets, thin and open bodies), or what fits
-            (default: %(default)s)
-        --mesher: what fills solids: a lattice of cubes (deterministic), fTetWild, or what fits (default: %(default)s)
-    """
-    add = adder(sub, add_modes)
-    add("--modes", dest="n_modes", type=int, default=30, metavar="N")
-    add("--method", choices=("auto", "solid", "shell"), default="auto")
-    add("--mesher", choices=("auto", "lattice", "tetwild"), default="auto")
+    """Add options of `extract_bases`."""
+    add, default = sub.add_argument, "(default: %(default)s)"
+    text = f"elastic modes of each key-frame; 20 to 100 are usual {default}"
+    add("--modes", dest="n_modes", type=int, default=30, metavar="N", help=text)
+    text = f"modes of the solid inside, of the surface itself (sheets, thin and open bodies), or what fits {default}"
+    add("--method", choices=("auto", "solid", "shell"), default="auto", help=text)
+    text = f"what fills solids: a lattice of cubes (deterministic), fTetWild, or what fits {default}"
+    add("--mesher", choices=("auto", "lattice", "tetwild"), default="auto", help=text)
 
 
 def add_forms(sub: argparse._ActionsContainer) -> None:
-    """Add forms of an animation as GLB.
-
-    Options:
-        --bones: GLB: a skin of at most N bones, a tenth of the size, for engines (40 are usual)
-        --targets: GLB: N principal shapes as morph targets
-    """
-    for name in ("--bones", "--targets"):
-        adder(sub, add_forms)(name, type=int, metavar="N")
+    """Add ``--bones`` and ``--targets``, forms of an animation as GLB."""
+    text = "GLB: a skin of at most N bones, a tenth of the size, for engines (40 are usual)"
+    sub.add_argument("--bones", type=int, metavar="N", help=text)
+    sub.add_argument("--targets", type=int, metavar="N", help="GLB: N principal shapes as morph targets")
 
 
 def add_registration(sub: argparse.ArgumentParser, optional: bool = False) -> None:
-    """Add options of the registration of meshes of different connectivity; ``--register`` if it is optional.
-
-    Options:
-        --register: the meshes have different connectivity: lay the first onto the others
-        --landmarks: lines of vertex numbers, counted from 0, or of coordinates: a column for each mesh
-        --across: the meshes are different subjects
-    """
-    add = adder(sub, add_registration)
+    """Add options of the registration of meshes of different connectivity, with ``--register`` if it is optional."""
     if optional:
-        add("--register", action="store_true")
-    add("--landmarks", type=Path, metavar="FILE")
-    add("--across", dest="same_subject", action="store_false")
+        text = "the meshes have different connectivity: lay the first onto the others"
+        sub.add_argument("--register", action="store_true", help=text)
+    text = "lines of vertex numbers, counted from 0, or of coordinates: a column for each mesh"
+    sub.add_argument("--landmarks", type=Path, metavar="FILE", help=text)
+    sub.add_argument("--across", dest="same_subject", action="store_false", help="the meshes are different subjects")
 
 
 def add_cache(sub: argparse.ArgumentParser) -> None:
-    """Add an option for tetrahedra, modes and registrations.
-
-    Options:
-        --no-cache: neither read the cache (the folder TORCH_MODAL_CACHE, or the user's cache folder) nor write to it
-    """
-    adder(sub, add_cache)("--no-cache", dest="cache", action="store_false")
+    """Add ``--no-cache``, for tetrahedra, modes and registrations."""
+    text = "neither read the cache (the folder TORCH_MODAL_CACHE, or the user's cache folder) nor write to it"
+    sub.add_argument("--no-cache", dest="cache", action="store_false", help=text)
 
 
 def pick_options(args: argparse.Namespace, *names: str) -> dict[str, Any]:

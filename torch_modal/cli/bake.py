@@ -10,23 +10,19 @@ from torch_modal.io.write import check_suffix
 
 
 def add_arguments(sub: argparse.ArgumentParser) -> None:
-    """Add the arguments of ``bake``.
-
-    Options:
-        meshes: meshes in their order, a folder or a quoted pattern of them, an animated GLB, or an NPZ file
-        --fps: frames a second (default: as in the file, or 24)
-        --cyclic: the last frame leads on to the first
-        --smooth: take out trembling: what has a period of X frames is halved, what is slower hardly changes
-        --every: keep each N-th frame and the last as key-frames, and fill in a smooth path through them
-    """
-    add = arguments.adder(sub, add_arguments)
-    add("meshes", nargs="+", type=Path, metavar="MESH")
-    add("--out", type=Path, required=True, metavar="FILE", help=f"the file: {', '.join(ANIMATION_FORMATS)}")
+    """Add the arguments of ``bake``."""
+    add = sub.add_argument
+    text = "meshes in their order, a folder or a quoted pattern of them, an animated GLB, or an NPZ file"
+    add("meshes", nargs="+", type=Path, metavar="MESH", help=text)
+    text = f"the file: {', '.join(ANIMATION_FORMATS)}"
+    add("--out", type=Path, required=True, metavar="FILE", help=text)
     arguments.add_forms(sub)
-    add("--fps", type=float, metavar="X")
-    add("--cyclic", action="store_true")
-    add("--smooth", type=float, metavar="X")
-    add("--every", type=int, metavar="N")
+    add("--fps", type=float, metavar="X", help="frames a second (default: as in the file, or 24)")
+    add("--cyclic", action="store_true", help="the last frame leads on to the first")
+    text = "take out trembling: what has a period of X frames is halved, what is slower hardly changes"
+    add("--smooth", type=float, metavar="X", help=text)
+    text = "keep each N-th frame and the last as key-frames, and fill in a smooth path through them"
+    add("--every", type=int, metavar="N", help=text)
     arguments.add_registration(sub, optional=True)
     arguments.add_cache(sub)
 

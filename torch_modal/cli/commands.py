@@ -6,7 +6,7 @@ import warnings
 from pathlib import Path
 
 from torch_modal.cli import arguments, subdivide
-from torch_modal.cli.arguments import adder, check_output, pick_options
+from torch_modal.cli.arguments import check_output, pick_options
 from torch_modal.io.formats import MESH_FORMATS, PICTURES
 from torch_modal.io.write import check_suffix
 
@@ -16,17 +16,11 @@ CROSSES = 3  # exit status of `check` when parts newly pass through each other
 
 
 def add_register(sub: argparse.ArgumentParser) -> None:
-    """Add the arguments of ``register``.
-
-    Options:
-        meshes: the template, and the target
-        --keep-doubtful: write a doubtful result too, with a warning
-    """
-    add = adder(sub, add_register)
-    add("meshes", nargs=2, type=Path, metavar="MESH")
+    """Add the arguments of ``register``."""
+    sub.add_argument("meshes", nargs=2, type=Path, metavar="MESH", help="the template, and the target")
     text = f"the template laid onto the target, {', '.join(MESH_FORMATS)}"
-    add("--out", type=Path, required=True, metavar="FILE", help=text)
-    add("--keep-doubtful", action="store_true")
+    sub.add_argument("--out", type=Path, required=True, metavar="FILE", help=text)
+    sub.add_argument("--keep-doubtful", action="store_true", help="write a doubtful result too, with a warning")
     arguments.add_registration(sub)
     arguments.add_cache(sub)
 
@@ -67,21 +61,15 @@ def register(args: argparse.Namespace) -> None:
 
 
 def add_check(sub: argparse.ArgumentParser) -> None:
-    """Add the arguments of ``check``.
-
-    Options:
-        meshes: meshes of one connectivity
-        --keyframes: meshes whose own crossings are known
-        --between: check the motion through the meshes: seven shapes between any two, with its shell energy and seconds
-        --contact: with --between: keep parts from passing through each other
-        --picture: draw the meshes with crossings in colour, as .png or .pdf
-    """
-    add = adder(sub, add_check)
-    add("meshes", nargs="+", type=Path, metavar="MESH")
-    add("--keyframes", nargs="+", type=Path, default=[], metavar="FILE")
-    add("--between", action="store_true")
-    add("--contact", action="store_true")
-    add("--picture", type=Path, metavar="FILE")
+    """Add the arguments of ``check``."""
+    add = sub.add_argument
+    add("meshes", nargs="+", type=Path, metavar="MESH", help="meshes of one connectivity")
+    add("--keyframes", nargs="+", type=Path, default=[], metavar="FILE", help="meshes whose own crossings are known")
+    text = "check the motion through the meshes: seven shapes between any two, with its shell energy and seconds"
+    add("--between", action="store_true", help=text)
+    add("--contact", action="store_true", help="with --between: keep parts from passing through each other")
+    text = "draw the meshes with crossings in colour, as .png or .pdf"
+    add("--picture", type=Path, metavar="FILE", help=text)
 
 
 def check(args: argparse.Namespace) -> int:
@@ -156,17 +144,11 @@ def check(args: argparse.Namespace) -> int:
 
 
 def add_carry(sub: argparse.ArgumentParser) -> None:
-    """Add the arguments of ``carry``.
-
-    Options:
-        meshes: meshes of one connectivity; the points lie on the first
-        --points: points, or splats
-        --out: for a PLY file for each mesh
-    """
-    add = adder(sub, add_carry)
-    add("meshes", nargs="+", type=Path, metavar="MESH")
-    add("--points", type=Path, required=True, metavar="FILE.ply")
-    add("--out", type=Path, required=True, metavar="FOLDER")
+    """Add the arguments of ``carry``."""
+    add, text = sub.add_argument, "meshes of one connectivity; the points lie on the first"
+    add("meshes", nargs="+", type=Path, metavar="MESH", help=text)
+    add("--points", type=Path, required=True, metavar="FILE.ply", help="points, or splats")
+    add("--out", type=Path, required=True, metavar="FOLDER", help="for a PLY file for each mesh")
 
 
 def carry(args: argparse.Namespace) -> None:
@@ -202,15 +184,10 @@ def carry(args: argparse.Namespace) -> None:
 
 
 def add_modes(sub: argparse.ArgumentParser) -> None:
-    """Add the arguments of ``modes``.
-
-    Options:
-        meshes: key-frames of one connectivity
-        --out: FILE.safetensors for one mesh, or a folder for a file of each mesh's name
-    """
-    add = adder(sub, add_modes)
-    add("meshes", nargs="+", type=Path, metavar="MESH")
-    add("--out", type=Path, required=True, metavar="FILE_OR_FOLDER")
+    """Add the arguments of ``modes``."""
+    sub.add_argument("meshes", nargs="+", type=Path, metavar="MESH", help="key-frames of one connectivity")
+    text = "FILE.safetensors for one mesh, or a folder for a file of each mesh's name"
+    sub.add_argument("--out", type=Path, required=True, metavar="FILE_OR_FOLDER", help=text)
     arguments.add_modes(sub)
     arguments.add_cache(sub)
 
@@ -250,23 +227,16 @@ def modes(args: argparse.Namespace) -> None:
 
 
 def add_precompute(sub: argparse.ArgumentParser) -> None:
-    """Add the arguments of ``precompute``.
-
-    Options:
-        root: the folder tree with the key-frames
-        --out: where the bases go
-        --workers: sets at a time, each in a process with one thread (default: one for each processor)
-        --scheduler: run on the Dask cluster with this scheduler instead
-        --timeout: for a set (default: 600)
-        --sequence: the meshes of a folder are a motion, in the order of their names, perhaps with a file times.txt
-    """
-    add = adder(sub, add_precompute)
-    add("root", type=Path, metavar="DIR")
-    add("--out", type=Path, required=True, metavar="DIR")
-    add("--workers", type=int, metavar="N")
-    add("--scheduler", metavar="ADDRESS")
-    add("--timeout", type=float, metavar="S", default=600.0)
-    add("--sequence", action="store_true")
+    """Add the arguments of ``precompute``."""
+    add = sub.add_argument
+    add("root", type=Path, metavar="DIR", help="the folder tree with the key-frames")
+    add("--out", type=Path, required=True, metavar="DIR", help="where the bases go")
+    text = "sets at a time, each in a process with one thread (default: one for each processor)"
+    add("--workers", type=int, metavar="N", help=text)
+    add("--scheduler", metavar="ADDRESS", help="run on the Dask cluster with this scheduler instead")
+    add("--timeout", type=float, metavar="S", default=600.0, help="for a set (default: 600)")
+    text = "the meshes of a folder are a motion, in the order of their names, perhaps with a file times.txt"
+    add("--sequence", action="store_true", help=text)
     arguments.add_modes(sub)
 
 
@@ -302,15 +272,10 @@ def precompute(args: argparse.Namespace) -> int:
 
 
 def add_demo(sub: argparse.ArgumentParser) -> None:
-    """Add the arguments of ``demo``.
-
-    Options:
-        --out: where the files go (default: %(default)s)
-        --sample: only this one (default: both)
-    """
-    add = adder(sub, add_demo)
-    add("--out", type=Path, default=Path("torch-modal-demo"), metavar="FOLDER")
-    add("--sample", choices=DEMO_SAMPLES)
+    """Add the arguments of ``demo``."""
+    add, folder = sub.add_argument, Path("torch-modal-demo")
+    add("--out", type=Path, default=folder, metavar="FOLDER", help="where the files go (default: %(default)s)")
+    add("--sample", choices=DEMO_SAMPLES, help="only this one (default: both)")
     arguments.add_levels(sub)
 
 

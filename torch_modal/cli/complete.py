@@ -5,39 +5,28 @@ import warnings
 from dataclasses import replace
 from pathlib import Path
 
-from torch_modal.cli.arguments import adder, pick_options
+from torch_modal.cli.arguments import pick_options
 from torch_modal.cli.subdivide import add_output, check_files, write_sequence
 
 
 def add_arguments(sub: argparse.ArgumentParser) -> None:
-    """Add the arguments of ``complete``.
-
-    Options:
-        mesh: a whole mesh: the template, or the first key-frame
-        observations: clouds (PLY), meshes of any connectivity as clouds, markers (CSV with time,vertex,x,y,z)
-        --times: when the clouds were seen, in their order (default: 0 1 2 ...)
-        --keyframes: further whole, exact meshes
-        --keyframe-times: when the whole meshes are, the first included (default: that is a template of no time)
-        --noise: standard deviation of the points (default: estimated)
-        --estimate-times: times between the first and the last are not exact
-        --contact: keep parts from passing through each other (extra contact)
-        --view: direction to the camera of the clouds
-        --frames: evenly in time (default: 1 to 8 for each interval)
-        --fps: frames a second (default: %(default)g)
-    """
-    add = adder(sub, add_arguments)
-    add("mesh", type=Path, metavar="MESH")
-    add("observations", nargs="+", type=Path, metavar="SEEN")
-    add("--times", nargs="+", type=float, metavar="T")
-    add("--keyframes", nargs="+", type=Path, default=[], metavar="MESH")
-    add("--keyframe-times", nargs="+", type=float, metavar="T")
-    add("--noise", type=float, metavar="X")
-    add("--estimate-times", action="store_true")
-    add("--contact", action="store_true")
-    add("--view", nargs=3, type=float, metavar=("X", "Y", "Z"))
+    """Arguments of ``complete``."""
+    add = sub.add_argument
+    add("mesh", type=Path, metavar="MESH", help="a whole mesh: the template, or the first key-frame")
+    text = "clouds (PLY), meshes of any connectivity as clouds, markers (CSV with time,vertex,x,y,z)"
+    add("observations", nargs="+", type=Path, metavar="SEEN", help=text)
+    text = "when the clouds were seen, in their order (default: 0 1 2 ...)"
+    add("--times", nargs="+", type=float, metavar="T", help=text)
+    add("--keyframes", nargs="+", type=Path, default=[], metavar="MESH", help="further whole, exact meshes")
+    text = "when the whole meshes are, the first included (default: that is a template of no time)"
+    add("--keyframe-times", nargs="+", type=float, metavar="T", help=text)
+    add("--noise", type=float, metavar="X", help="standard deviation of the points (default: estimated)")
+    add("--estimate-times", action="store_true", help="times between the first and the last are not exact")
+    add("--contact", action="store_true", help="keep parts from passing through each other (extra contact)")
+    add("--view", nargs=3, type=float, metavar=("X", "Y", "Z"), help="direction to the camera of the clouds")
     add_output(sub, "what was seen above the result, coloured by its confidence")
-    add("--frames", type=int, metavar="N")
-    add("--fps", type=float, metavar="X", default=24.0)
+    add("--frames", type=int, metavar="N", help="evenly in time (default: 1 to 8 for each interval)")
+    add("--fps", type=float, metavar="X", default=24.0, help="frames a second (default: %(default)g)")
 
 
 def run(args: argparse.Namespace) -> None:

@@ -17,6 +17,21 @@ from torch_modal.version import __version__
 
 PROGRAM = "torch-modal"
 
+DESCRIPTION = """\
+Fill key-frame meshes with physically plausible shapes in between.
+
+Key-frames are triangle meshes (OBJ, PLY, OFF, GLB, GLTF) with the same faces and
+the same vertex order, in any units. Results are in the same units and coordinates."""
+
+EXAMPLES = """\
+start here:
+  torch-modal demo                                        try it on the samples that come with it
+  torch-modal subdivide a.obj b.obj --out between.glb     from your meshes to an animation
+  torch-modal subdivide a.obj scan.ply --register --out between.glb   of different connectivity
+  torch-modal bake frames/*.obj --bones 40 --out x.glb                from a sequence to one file
+  torch-modal complete a.obj scans/*.ply --out motion.glb             from scans and a template
+  torch-modal subdivide --help                            all that can be set"""
+
 COMMANDS: dict[str, tuple[Callable[[Any], None], Callable[[Any], int | None]]] = {
     "subdivide": (subdivide.add_arguments, subdivide.run),
     "bake": (bake.add_arguments, bake.run),
@@ -37,28 +52,17 @@ EXPECTED = (ValueError, OSError, MemoryError, ImportError)
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """All commands and their options.
-
-    Fill key-frame meshes with physically plausible shapes in between.
-
-    Key-frames are triangle meshes (OBJ, PLY, OFF, GLB, GLTF) with the same faces and
-    the same vertex order, in any units. Results are in the same units and coordinates.
-
-    start here:
-      torch-modal demo                                        try it on the samples that come with it
-      torch-modal subdivide a.obj b.obj --out between.glb     from your meshes to an animation
-      torch-modal subdivide a.obj scan.ply --register --out between.glb   of different connectivity
-      torch-modal bake frames/*.obj --bones 40 --out x.glb                from a sequence to one file
-      torch-modal complete a.obj scans/*.ply --out motion.glb             from scans and a template
-      torch-modal subdivide --help                            all that can be set
-    """
-    parser = argparse.ArgumentParser(prog=PROGRAM, **_texts(build_parser)[1])
+    """All commands and their options."""
+    formatter = functools.partial(argparse.RawDescriptionHelpFormatter, max_help_position=30, width=100)
+    parser = argparse.ArgumentParser(prog=PROGRAM, description=DESCRIPTION, epilog=EXAMPLES, formatter_class=formatter)
     parser.add_argument("--version", action="version", version=f"{PROGRAM} {__version__}")
     subparsers = parser.add_subparsers(title="commands", required=True, metavar="COMMAND ...")
     for name, (add_arguments, run) in COMMANDS.items():
-        summary, texts = _texts(run)
+        summary, _, rest = inspect.cleandoc(run.__doc__ or "").partition("\n\n")
+        description, _, examples = rest.rpartition("\n\n")
+        texts = {"description": description, "epilog": examples, "formatter_class": formatter}
         short = summary[:1].lower() + summary[1:].removesuffix(".")
-        sub = subparsers.add_parser(name, help=short, allow_abbrev=False, **texts)
+        sub = subparsers.add_parser(name, help=short, allow_abbrev=False, **texts)  # type: ignore[arg-type]
         add_arguments(sub)
         group = sub.add_argument_group("files and messages")
         group.add_argument("--overwrite", action="store_true", help="replace files that exist (default: refuse)")
@@ -67,14 +71,6 @@ def build_parser() -> argparse.ArgumentParser:
         # Arguments that contradict each other end with the usage and status 2, like all that argparse refuses.
         sub.set_defaults(command=run, fail=sub.error, parse=parser.parse_args)
     return parser
-
-
-def _texts(function: Callable[..., object]) -> tuple[str, dict[str, Any]]:
-    """Summary of a docstring; the rest, whose last paragraph has examples, as options of a parser."""
-    formatter = functools.partial(argparse.RawDescriptionHelpFormatter, max_help_position=30, width=100)
-    summary, _, rest = inspect.cleandoc(function.__doc__ or "").partition("\n\n")
-    description, _, examples = rest.rpartition("\n\n")
-    return summary, {"description": description, "epilog": examples, "formatter_class": formatter}
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -15,15 +15,12 @@ ANIMATION = ("cyclic", "duration", "fps", "ping_pong", "ease")
 
 
 def add_output(sub: argparse.ArgumentParser, picture: str) -> None:
-    """Add ``--out``, ``--format`` and ``--picture`` of a sequence.
-
-    Options:
-        --format: format of the numbered frames (default: as the first mesh, with everything else in its file)
-    """
-    add = arguments.adder(sub, add_output)
+    """Add ``--out``, ``--format`` and ``--picture`` of a sequence."""
+    add = sub.add_argument
     text = f"the animation alone: {', '.join(ANIMATION_FORMATS)}; a folder: numbered frames and animation.glb"
     add("--out", type=Path, required=True, metavar="FILE_OR_FOLDER", help=text)
-    add("--format", choices=[suffix[1:] for suffix in MESH_FORMATS])
+    text = "format of the numbered frames (default: as the first mesh, with everything else in its file)"
+    add("--format", choices=[suffix[1:] for suffix in MESH_FORMATS], help=text)
     add("--picture", type=Path, metavar="FILE", help=f"also draw {picture}, .png or .pdf")
 
 
@@ -58,39 +55,29 @@ def write_sequence(
 
 
 def add_arguments(sub: argparse.ArgumentParser) -> None:
-    """Add the arguments of ``subdivide``.
-
-    Options:
-        meshes: key-frames, two or more, in their order
-        --frames: of the result (default: by the levels)
-        --cyclic: the last key-frame leads on to the first
-        --times: times of the key-frames, ascending, in any unit; of a cycle, also the time when it begins again
-        --no-smooth: interpolate each pair of key-frames alone, without its neighbours in time
-        --contact: keep parts from passing through each other (extra contact)
-        --proxy: a coarser mesh of N vertices moves and carries the detail; 0: none (default: 20000 for large meshes)
-        --preset: accurate; fast, without steps on the fine mesh; paper, its method whole (default: %(default)s)
-        --duration: of the sequence once (default: 1 for a cycle, 2 for two key-frames, 1 an interval of more)
-        --fps: frames a second; with --duration, pictures or samples a second of videos and point caches (default: 24)
-        --ping-pong: there and back again
-        --ease: slow at both ends
-    """
-    add = arguments.adder(sub, add_arguments)
-    add("meshes", nargs="+", type=Path, metavar="MESH")
+    """Add the arguments of ``subdivide``."""
+    add = sub.add_argument
+    add("meshes", nargs="+", type=Path, metavar="MESH", help="key-frames, two or more, in their order")
     add_output(sub, "the sequence next to linear interpolation")
     arguments.add_levels(sub)
-    add("--frames", dest="n_frames", type=int, metavar="N")
-    add("--cyclic", action="store_true")
-    add("--times", nargs="+", type=float, metavar="T")
-    add("--no-smooth", dest="smooth", action="store_const", const=False)
-    add("--contact", action="store_true")
-    add("--proxy", type=int, metavar="N")
-    add("--preset", choices=("accurate", "fast", "paper"), default="accurate")
+    add("--frames", dest="n_frames", type=int, metavar="N", help="of the result (default: by the levels)")
+    add("--cyclic", action="store_true", help="the last key-frame leads on to the first")
+    text = "times of the key-frames, ascending, in any unit; of a cycle, also the time when it begins again"
+    add("--times", nargs="+", type=float, metavar="T", help=text)
+    text = "interpolate each pair of key-frames alone, without its neighbours in time"
+    add("--no-smooth", dest="smooth", action="store_const", const=False, help=text)
+    add("--contact", action="store_true", help="keep parts from passing through each other (extra contact)")
+    text = "a coarser mesh of N vertices moves and carries the detail; 0: none (default: 20000 for large meshes)"
+    add("--proxy", type=int, metavar="N", help=text)
+    text = "accurate; fast, without steps on the fine mesh; paper, its method whole (default: %(default)s)"
+    add("--preset", choices=("accurate", "fast", "paper"), default="accurate", help=text)
     group = sub.add_argument_group("animation")
-    add = arguments.adder(group, add_arguments)
-    add("--duration", type=float, metavar="SECONDS")
-    add("--fps", type=float, metavar="X")
-    add("--ping-pong", action="store_true")
-    add("--ease", action="store_true")
+    text = "of the sequence once (default: 1 for a cycle, 2 for two key-frames, 1 an interval of more)"
+    group.add_argument("--duration", type=float, metavar="SECONDS", help=text)
+    text = "frames a second; with --duration, pictures or samples a second of videos and point caches (default: 24)"
+    group.add_argument("--fps", type=float, metavar="X", help=text)
+    group.add_argument("--ping-pong", action="store_true", help="there and back again")
+    group.add_argument("--ease", action="store_true", help="slow at both ends")
     arguments.add_forms(group)
     arguments.add_registration(sub, optional=True)
     arguments.add_modes(sub)

@@ -9,7 +9,7 @@ from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from torch_modal.cli.arguments import adder, check_output
+from torch_modal.cli.arguments import check_output
 from torch_modal.io.formats import PAGES
 from torch_modal.io.write import check_suffix
 
@@ -18,29 +18,22 @@ if TYPE_CHECKING:
 
 
 def add_arguments(sub: argparse.ArgumentParser) -> None:
-    """Add the arguments of ``view``.
-
-    Options:
-        meshes: shapes in their order, a folder, or one animated GLB or NPZ
-        --compare: another sequence of as many shapes, of the same faces; may be given several times
-        --linear: also show linear interpolation of the key-frames of the first sequence
-        --keyframes: which frames are key-frames, from 0 (default: the GLB's, or the first and the last)
-        --cyclic: the last frame leads on to the first
-        --fps: frames a second (default: the GLB's, or 24)
-        --up: what is up (default: Y, unless the first shape is flat in Y)
-        --page: write the page there, as .html (default: a temporary file, opened)
-        --landmarks: a page to pick landmarks of two meshes or more; it starts with the landmarks of FILE, if given
-    """
-    add = adder(sub, add_arguments)
-    add("meshes", nargs="+", type=Path, metavar="MESH")
-    add("--compare", nargs="+", type=Path, action="append", default=[], metavar="FILE")
-    add("--linear", action="store_true")
-    add("--keyframes", nargs="+", type=int, metavar="N")
-    add("--cyclic", action="store_true")
-    add("--fps", type=float, metavar="X")
-    add("--up", choices=("y", "z"))
-    add("--page", type=Path, metavar="FILE")
-    add("--landmarks", nargs="?", const=True, metavar="FILE")
+    """Add the arguments of ``view``."""
+    add = sub.add_argument
+    text = "shapes in their order, a folder, or one animated GLB or NPZ"
+    add("meshes", nargs="+", type=Path, metavar="MESH", help=text)
+    text = "another sequence of as many shapes, of the same faces; may be given several times"
+    add("--compare", nargs="+", type=Path, action="append", default=[], metavar="FILE", help=text)
+    add("--linear", action="store_true", help="also show linear interpolation of the key-frames of the first sequence")
+    text = "which frames are key-frames, from 0 (default: the GLB's, or the first and the last)"
+    add("--keyframes", nargs="+", type=int, metavar="N", help=text)
+    add("--cyclic", action="store_true", help="the last frame leads on to the first")
+    add("--fps", type=float, metavar="X", help="frames a second (default: the GLB's, or 24)")
+    add("--up", choices=("y", "z"), help="what is up (default: Y, unless the first shape is flat in Y)")
+    text = "write the page there, as .html (default: a temporary file, opened)"
+    add("--page", type=Path, metavar="FILE", help=text)
+    text = "a page to pick landmarks of two meshes or more; it starts with the landmarks of FILE, if given"
+    add("--landmarks", nargs="?", const=True, metavar="FILE", help=text)
 
 
 def run(args: argparse.Namespace) -> None:
