@@ -93,15 +93,20 @@ class _RightHandSide(Operation):
         args = [rotations.triangles, shapes.shape[2], quaternions, sign, frames, weights, self._stiffness(), right]
         launch(kernels("rotations").right_hand_side, (len(shapes), len(rotations.faces)), args)
         if kept is not None:
-            kept.append(sign)
+            kept += [quaternions, sign, frames]
         return (right,)
 
     def back(self, kept: list[Any], grads: Sequence[Tensor], shapes: Tensor, weights: Tensor) -> tuple[Tensor, ...]:
-        rotations, gradients = self.rotations, (torch.zeros_like(shapes), torch.zeros_like(weights))
-        sign = kept[0] if kept else rotations.signed_quaternions(shapes)[1]
-        args = [rotations.triangles, shapes.shape[2], shapes, weights, sign, self._stiffness(), grads[0], *gradients]
-        launch(kernels("rotations_adjoint").right_hand_side, (len(shapes), len(rotations.faces)), args)
-        return gradients
+        rotations, module, dim = self.rotations, kernels("rotations_adjoint"), (len(shapes), len(self.rotations.faces))
+        quaternions, sign, frames = kept or rotations.signed_quaternions(shapes)
+        to_shapes, to_weights, to_quaternions, to_frames = map(torch.zeros_like, (shapes, weights, quaternions, frames))
+        sizes = rotations.triangles, shapes.shape[2]
+        values = [*sizes, quaternions, sign, frames, weights, self._stiffness(), torch.empty_like(grads[0])]
+        adjoints = [None, None, to_quaternions, None, to_frames, to_weights, None, *grads]
+        launch(module.right_hand_side, dim, values, adjoints)
+        values = [*sizes, shapes, quaternions, torch.empty_like(sign), frames]
+        launch(module.turns, dim, values, [None, None, to_shapes, to_quaternions, None, to_frames])
+        return to_shapes, to_weights
 
     def by_torch(self, shapes: Tensor, weights: Tensor) -> tuple[Tensor, ...]:
         return (LocalRotations.right_hand_side(self.rotations, shapes, weights, self.poisson),)

@@ -39,6 +39,17 @@ def half_rotation(q: vec4):
     return (wp.atan2(root, q[0]) / root) * axis
 
 
+@wp.func_grad(half_rotation)
+def half_rotation_adjoint(q: vec4, to_half: vec3):
+    """Of a unit quaternion, in closed form: the series or the arc is not differentiated."""
+    axis = vec3(q[1], q[2], q[3])
+    square = wp.max(wp.dot(axis, axis), TINIEST)
+    scale = wp.where(square > TINIEST, wp.dot(half_rotation(q), axis) / square, real(1.0))
+    along = wp.dot(axis, to_half)
+    to_axis = scale * to_half + ((q[0] - scale) / square * along) * axis
+    wp.adjoint[q] += vec4(-along, to_axis[0], to_axis[1], to_axis[2])
+
+
 @wp.func
 def about(half: vec3):
     """The rotation about an axis by twice its length."""
@@ -98,13 +109,15 @@ def triangle(at: wp.mat33d):
     return wp.matrix_from_rows(e1, per * (other + wp.cross(normal, one)), normal), stretch
 
 
-@wp.func
-def to_corners(axes: wp.mat33d, u: vec3, torque: vec3, to_u: vec3):
-    """Gradients of a triangle's corners, from the torque on its axes and the gradient of its stretch.
+@wp.func_grad(triangle)
+def triangle_adjoint(at: wp.mat33d, to_axes: wp.mat33d, to_u: vec3):
+    """Gradients of a triangle's corners, by the torque on its axes.
 
     With the axes ``Q`` and the stretch ``U``, the columns ``Q U`` change by ``dQ U + Q dU``. In the plane, what is
     antisymmetric of the change over the trace of ``U`` is the rotation; across it, the change is a rotation of ``U``.
     """
+    axes, u = triangle(at)
+    torque = wp.cross(axes[0], to_axes[0]) + wp.cross(axes[1], to_axes[1]) + wp.cross(axes[2], to_axes[2])
     along = axes @ torque
     mean = HALF * to_u[1]
     area = u[0] * u[2] - u[1] * u[1]
@@ -114,7 +127,7 @@ def to_corners(axes: wp.mat33d, u: vec3, torque: vec3, to_u: vec3):
     one = vec3(to_u[0], mean + spin, -lift * (u[2] * along[1] + u[1] * along[0])) @ axes
     other = PER_HEIGHT * vec3(mean - spin, to_u[2], lift * (u[1] * along[1] + u[0] * along[0])) @ axes
     one -= HALF * other
-    return wp.matrix_from_rows(-one - other, one, other)
+    wp.adjoint[at] += wp.matrix_from_rows(-one - other, one, other)
 
 
 @wp.func
@@ -177,11 +190,6 @@ def corner_values(at: packed_rotation, half: vec3, w: wp.vec2d, c: vec3):
     fraction = about(w[1] * half)
     s = sides(wp.quat_rotate(fraction, at[0]), wp.quat_rotate(fraction, at[1]), w[0] * at[2] + w[1] * at[3])
     return wp.matrix_from_rows(c[2] * s[2] - c[0] * s[0], c[0] * s[0] - c[1] * s[1], c[1] * s[1] - c[2] * s[2])
-
-
-@wp.func
-def work_of(at: packed_rotation, half: vec3, w: wp.vec2d, stiffness: vec3, to: wp.mat33d):
-    return wp.ddot(corner_values(at, half, w, stiffness), to)
 
 
 @wp.kernel(enable_backward=False)
