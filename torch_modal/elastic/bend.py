@@ -243,6 +243,11 @@ def kernel_functions() -> KernelFunctions:
             result = wp.matrix_from_rows(to_e, wp.cross(to_n1, e) + to_part_a * e, wp.cross(e, to_n2) + to_part_b * e)
         return result
 
+    @wp.func_grad(measure)
+    def measure_adjoint(x: mat33, to_phase: vec2):
+        q, g = linearise(x)
+        wp.adjoint[x] += (q[0] * to_phase[1] - q[1] * to_phase[0]) * g
+
     @wp.func_grad(linearise)
     def linearise_adjoint(x: mat33, to_phase: vec2, to_gradient: mat33):
         q, g = linearise(x)
@@ -251,11 +256,16 @@ def kernel_functions() -> KernelFunctions:
 
     @wp.func
     def weight(x: mat33, q: vec2, mean: real):
-        h = hinge_of(x)
+        e = x[0]  # without hinge_of(), whose adjoint would be computed, too
+        n1 = wp.cross(e, x[1])
+        n2 = wp.cross(x[2], e)
+        base = wp.dot(e, e)
+        square1 = wp.dot(n1, n1)
+        square2 = wp.dot(n2, n2)
+        bound = flatness * base
         result = real(0.0)
-        if not h.flat:
-            area = real(0.5) * (wp.length(h.n1) + wp.length(h.n2))
-            result = wp.min(wp.dot(x[0], x[0]) / area, ratio)
+        if wp.min(square1, square2) > bound * bound + tiny_square:
+            result = wp.min(real(2.0) * base / (wp.sqrt(square1) + wp.sqrt(square2)), ratio)
         return result
 
     @wp.func

@@ -170,7 +170,9 @@ class _Relaxation(Operation):
                 turned = at.normal, inverse, b, *common
                 launch(module.turn, (b, n), turned, [to_normal, to_inverse, None, *received])
             moved = at.normal, inverse, at.stiffness, *common, solution
-            launch(module.advance, (b, n), moved, [to_normal, to_inverse, to_stiffness, *received, to_solution])
+            # A solution gives its gradient to the one before, which the adjoint of an update in place adds to it.
+            to_moved = to_normal, to_inverse, to_stiffness, *received, to_solution.clone()
+            launch(module.advance, (b, n), moved, to_moved)
             first, out = ((kind * n_products + k) * b * n for kind in (1, 2))
             for one, factors, to_own in zip(self.kernels.passes, at.factors, to_factors, strict=True):
                 values = n, fields, first, *factors, fields, out, scalars, k * b

@@ -41,7 +41,7 @@ def half_rotation(q: vec4):
 
 @wp.func_grad(half_rotation)
 def half_rotation_adjoint(q: vec4, to_half: vec3):
-    """Of a unit quaternion, in closed form: the series or the arc is not differentiated."""
+    """Closed form for a unit quaternion: neither the series nor the arc is differentiated."""
     axis = vec3(q[1], q[2], q[3])
     square = wp.max(wp.dot(axis, axis), TINIEST)
     scale = wp.where(square > TINIEST, wp.dot(half_rotation(q), axis) / square, real(1.0))

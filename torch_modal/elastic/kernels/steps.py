@@ -97,7 +97,7 @@ def advance(
     last = (m + 2) * n_samples == scalars.shape[0]
     for k in range(i - s * threads, n, threads):
         v = place(s * n, k)
-        wp.atomic_add(solution, v, step * fields[place(direction, k)])
+        solution[v] = solution[v] + step * fields[place(direction, k)]
         if not last:
             r = fields[place(residual, k)] - step * (fields[place(product, k)] + push * normal[v])
             fields[place(following, k)] = r
