@@ -269,20 +269,43 @@ def kernel_functions() -> KernelFunctions:
         return result
 
     @wp.func
-    def fullness(x: mat33, altitude: real):
-        e = x[0]
-        base = wp.dot(e, e)
-        longest1 = wp.max(base, wp.max(wp.dot(x[1], x[1]), wp.dot(x[1] - e, x[1] - e)))
-        longest2 = wp.max(base, wp.max(wp.dot(x[2], x[2]), wp.dot(x[2] - e, x[2] - e)))
-        n1 = wp.cross(e, x[1])
-        n2 = wp.cross(e, x[2])
-        square1 = wp.dot(n1, n1)
-        square2 = wp.dot(n2, n2)
-        both = (square1 + altitude * longest1 * longest1) * (square2 + altitude * longest2 * longest2)
+    def fullness_of(e: vec3, tip: vec3, altitude: real):
+        longest = wp.max(wp.dot(e, e), wp.max(wp.dot(tip, tip), wp.dot(tip - e, tip - e)))
+        normal = wp.cross(e, tip)
+        square = wp.dot(normal, normal)
+        whole = square + altitude * longest * longest
         result = real(0.0)
-        if both > real(0.0):
-            result = square1 * square2 / both
+        if whole > real(0.0):
+            result = square / whole
         return result
+
+    @wp.func_grad(fullness_of)
+    def fullness_adjoint(e: vec3, tip: vec3, altitude: real, received: real):
+        """By hand: few hinges are softened, and nothing is computed of the others."""
+        side = tip - e
+        longest = wp.max(wp.dot(e, e), wp.max(wp.dot(tip, tip), wp.dot(side, side)))
+        normal = wp.cross(e, tip)
+        square = wp.dot(normal, normal)
+        whole = square + altitude * longest * longest
+        if received != real(0.0) and whole > real(0.0):
+            factor = real(2.0) * received * altitude * longest / (whole * whole)
+            to_normal = (factor * longest) * normal
+            to_longest = -real(2.0) * factor * square
+            to_e = wp.cross(tip, to_normal)
+            to_tip = wp.cross(to_normal, e)
+            if wp.dot(e, e) >= longest:
+                to_e += to_longest * e
+            elif wp.dot(tip, tip) >= longest:
+                to_tip += to_longest * tip
+            else:
+                to_tip += to_longest * side
+                to_e -= to_longest * side
+            wp.adjoint[e] += to_e
+            wp.adjoint[tip] += to_tip
+
+    @wp.func
+    def fullness(x: mat33, altitude: real):
+        return fullness_of(x[0], x[1], altitude) * fullness_of(x[0], x[2], altitude)
 
     values = measure, linearise
     return KernelFunctions(
