@@ -215,9 +215,11 @@ class AugmentationSequential(ShapeAugmentation):
     """Random transforms in sequence; named after kornia's.
 
     Args:
-        transforms: The transforms, in order; their own ``data_keys`` and ``keepdim`` have no effect.
-        options: ``data_keys`` and ``keepdim`` as for :class:`ShapeAugmentation`; a ``generator`` and a ``space`` for
-            all transforms, which by default have their own.
+        transforms: The transforms, in order.
+        data_keys: As for :class:`ShapeAugmentation`; the transforms' own data keys have no effect.
+        keepdim: Likewise.
+        generator: Source of random numbers of all transforms; by default each has its own.
+        space: Key-frames and modes, for all transforms; by default each has its own.
 
     Raises:
         ValueError: A data key is unknown or doubled, there are no shapes, or an argument is no transform.
@@ -225,8 +227,15 @@ class AugmentationSequential(ShapeAugmentation):
 
     uses_keyframes = False
 
-    def __init__(self, *transforms: ShapeAugmentation, **options: Any) -> None:
-        super().__init__(1.0, **options)
+    def __init__(
+        self,
+        *transforms: ShapeAugmentation,
+        data_keys: Sequence[str] = ("shapes",),
+        keepdim: bool = False,
+        generator: torch.Generator | None = None,
+        space: ShapeSpace | None = None,
+    ) -> None:
+        super().__init__(1.0, keepdim=keepdim, data_keys=data_keys, generator=generator, space=space)
         others = [type(one).__name__ for one in transforms if not isinstance(one, ShapeAugmentation)]
         if others:
             raise ValueError(f"pass the transforms one by one, AugmentationSequential(*transforms); got {others}")
