@@ -22,8 +22,8 @@ import torch
 import torch_modal as tm
 
 BOUNDS = {
-    "lines of code": 16596,
-    "functions": 1501,
+    "lines of code": 16689,
+    "functions": 1510,
     "docstrings that begin with no noun": 0,
     "functions of in-between": 142,
     "files of in-between": 34,

@@ -143,7 +143,7 @@ def _complete(
     check_observations(observations, shapes.shape[1])
     exact = np.zeros(0) if is_template else check_times(times, len(shapes)).numpy()
     problem = CompletionProblem(shapes, torch.from_numpy(indices), exact, observations)
-    with ProgressReport(len(problem.frames) * (3 + ROUNDS), "completing", progress) as report:
+    with ProgressReport(len(problem.frames) * (4 + ROUNDS), "completing", progress) as report:
         poses = FramePoses(problem).search(report)
         if estimate_times:
             when = times_between(problem, poses)

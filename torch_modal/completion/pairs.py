@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from torch_modal.arrays import BoolArray, FloatArray, IntArray
 from torch_modal.geometry.closest import closest_on_triangles, dot
-from torch_modal.geometry.connectivity import Connectivity
+from torch_modal.geometry.connectivity import Connectivity, label_pieces
 from torch_modal.registration.surface import MeshSurface, places_between
 
 # Places of each triangle that are candidates: its middle, and one near each corner.
@@ -22,6 +22,8 @@ CLOUD_NORMAL_WEIGHT = 3.0
 LEAST_COSINE = 0.3
 # Cells of the picture in which surfaces hide others, the depth below which they do not, cosine of grazing sight.
 CELL, DEPTH, GRAZING = 2.0, 3.0, 0.15
+# Neighbours of a point of a cloud, and how many of their usual distances are a gap.
+N_NEIGHBOURS, GAP = 8, 3.0
 # Distance, in standard deviations of the noise, at which a point loses three quarters of its weight.
 OUTLIERS = 4.0
 # Least noise, and the largest that is estimated, at a size of 100.
@@ -77,13 +79,35 @@ class ObservedPoints(NamedTuple):
             return self.distances(surface.vertices), np.ones(len(self.points), bool)
         return surface.most_alike(self.points, self.normals)[2:]
 
-    def pair(self, surface: "SampledSurface") -> "ObservedPoints":
-        """The points with their places; of a cloud, those whose normals do not agree weigh nothing."""
+    def pair(self, surface: "SampledSurface", released: BoolArray | None = None) -> "ObservedPoints":
+        """The points with their places; of a cloud, released vertices and normals that do not agree weigh nothing."""
         if self.places is not None:
             return self
         face, barycentric, _, agree = surface.most_alike(self.points, self.normals)
+        if released is not None:
+            agree = agree & ~released[surface.faces[face]].any(1)
         places = places_between(surface.faces[face], barycentric, len(surface.vertices))
         return self._replace(weights=self.weights * agree, places=places)
+
+    def pairs(self, surface: "SampledSurface", released: BoolArray | None = None) -> "list[ObservedPoints]":
+        """The points with their places, and, where the view is known, the visible places with points."""
+        pairs = [self.pair(surface, released)]
+        if self.view is None or self.normals is None:
+            return pairs
+        seen = surface.visible(self.view)
+        seen = seen[:: max(1, len(seen) // len(self.points))]
+        faces = surface.sample_faces[seen]
+        tree = cKDTree(join_features(self.points, self.normals))
+        nearest = tree.query(join_features(surface.samples[seen], surface.face_normals[faces]))[1]
+        agree = dot(surface.face_normals[faces], self.normals[nearest]) > LEAST_COSINE
+        if released is not None:
+            agree &= ~released[surface.faces[faces]].any(1)
+        seen, faces, nearest = seen[agree], faces[agree], nearest[agree]
+        if len(seen):
+            places = places_between(surface.faces[faces], _PLACES[seen % len(_PLACES)], len(surface.vertices))
+            points, normals, weights = self.points[nearest], self.normals[nearest], np.full(len(seen), 1 / len(seen))
+            pairs.append(ObservedPoints(points, normals, weights, self.numbers[nearest], self.noise, places))
+        return pairs
 
     def score(self, surface: "SampledSurface", unit: float) -> float:
         """Fraction of the points that the surface leaves out, and of the visible surface that a cloud leaves out."""
@@ -94,6 +118,18 @@ class ObservedPoints(NamedTuple):
             gap = (cKDTree(self.points).query(seen)[0] / (3 * unit)) ** 2
             total += float((gap / (1 + gap)).mean()) if len(seen) else 1.0
         return total
+
+    def find_unexplained(self, surface: "SampledSurface", reach: float, least: int) -> list[IntArray]:
+        """Connected groups of points that are far from the surface, the largest first."""
+        distances, agree = self.misses(surface)
+        off = np.flatnonzero(~agree | (distances > reach))
+        if len(off) < least:
+            return []
+        neighbours = cKDTree(self.points).query(self.points, min(N_NEIGHBOURS, len(self.points)))[0]
+        gap = GAP / 2 * float(np.median(neighbours[:, -1]))
+        pieces = label_pieces(cKDTree(self.points[off]).query_pairs(gap, output_type="ndarray"), len(off))
+        sizes = np.bincount(pieces)
+        return [off[pieces == k] for k in np.argsort(-sizes, kind="stable") if sizes[k] >= least]
 
 
 def robust_weights(distances: FloatArray, noise: float) -> FloatArray:

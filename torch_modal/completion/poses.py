@@ -13,7 +13,8 @@ from torch import Tensor
 from torch_modal.completion.bending import ModalBending, ModalPose
 from torch_modal.completion.frames import CompletionProblem
 from torch_modal.completion.search import PoseSearch
-from torch_modal.geometry.rigid import best_fit
+from torch_modal.geometry.rigid import align, best_fit
+from torch_modal.geometry.triangle_frames import frames_of, mirror_sides
 from torch_modal.modes.coarsening import coarsen
 from torch_modal.modes.extract import extract_bases
 from torch_modal.motion.decoder import scale_modes
@@ -26,8 +27,8 @@ COARSE_FACES = 2500
 """Faces of the mesh on which they are searched; of fewer, it is the caller's."""
 SHIFTS = (-0.17, 0.17)
 """Times at which a motion may be instead of where its neighbours say, in parts of the gap between these."""
-N_ALIKE = 2
-"""Shapes of other times from which a search starts where there are no key-frames."""
+TRUSTED, N_ALIKE = 0.34, 2
+"""Part of the frames, those that explain most, from which the others are searched again; starts from their shapes."""
 TIME_ROUNDS, LATEST, UNCHANGED = 6, 0.5, 10.0
 """Rounds in which times are estimated; the largest change, in parts of the gap between neighbours, and its weight."""
 
@@ -68,17 +69,16 @@ class FramePoses:
             first = int(np.argmin([score for _, score in rigid]))
             fits[first] = self._search(first, [(template, rigid[first][0])])
             report.update()
-        while left := [i for i in range(len(frames)) if i not in fits]:  # those near in time to what is known first
-            known = self._knots(fits)
-            i = min(left, key=lambda i: min(abs(frames[i].time - t) for t, _ in known))
-            fits[i] = self._search(i, self._starts(frames[i].time, known))
-            report.update()
+        self._outward(fits, {}, report)
+        if not self.whole:
+            before, bound = fits, float(np.quantile([one.score for one in fits.values()], TRUSTED))
+            fits = {i: one for i, one in before.items() if one.score <= bound}
+            report.update(len(fits))
+            self._outward(fits, before, report)
         for i in sorted(fits, key=lambda i: -fits[i].score):
             if known := self._knots({j: one for j, one in fits.items() if j != i}):
-                starts = self._starts(frames[i].time, known)
-                if not self.whole:
-                    starts += self._alike(i, [x for _, x in known])
-                fits[i] = min(fits[i], self._search(i, starts), key=lambda one: one.score)
+                again = self._search(i, self._starts(frames[i].time, known))
+                fits[i] = min(fits[i], again, key=lambda one: one.score)
             report.update()
         shapes = []
         for i, frame in enumerate(frames):
@@ -86,6 +86,19 @@ class FramePoses:
             shapes.append(self.bending.shape(fits[i].base, pose))
             report.update()
         return shapes
+
+    def _outward(self, fits: dict[int, ModalFit], before: dict[int, ModalFit], report: ProgressReport) -> None:
+        """Add all other frames, those near in time to what is known first; none is worse than it was before."""
+        while left := [i for i in range(len(self.frames)) if i not in fits]:
+            known = self._knots(fits)
+            i = min(left, key=lambda i: min(abs(self.frames[i].time - t) for t, _ in known))
+            starts = self._starts(self.frames[i].time, known)
+            if before:
+                starts += self._alike(i, [x for _, x in known])
+            fits[i] = self._search(i, starts)
+            if i in before:
+                fits[i] = min(fits[i], before[i], key=lambda one: one.score)
+            report.update()
 
     def _knots(self, fits: dict[int, ModalFit]) -> list[tuple[float, Tensor]]:
         """Times and shapes of frames, and of whole ones, in the order of time."""
@@ -110,9 +123,15 @@ class FramePoses:
                 other = path(shapes, float(np.clip(t + shift * gap, times[0], times[-1])))
                 bases.append(best_fit(other, bases[0]).apply(other))
         elif t not in times and len(known) > 1:
-            last, before = shapes[nearest[:2], None]
-            bases.append(self.bending.reconstruction.extrapolate(last, before)[0])
+            bases.append(self._beyond(shapes[nearest[1], None], shapes[nearest[0], None])[0])
         return [(x, self.bending.still()) for x in bases]
+
+    def _beyond(self, before: Tensor, last: Tensor) -> Tensor:
+        """The shape as far after the last one as that is after the one before. *Shape:* ``(1, V, 3)``."""
+        motion = best_fit(before, last)
+        sides = mirror_sides(frames_of(last, self.faces), frames_of(motion.apply(before), self.faces))
+        x = align(self.bending.reconstruction(sides, last), last)
+        return motion._replace(source=motion.target, target=2 * motion.target - motion.source).apply(x)
 
     def _search(self, i: int, starts: Sequence[tuple[Tensor, ModalPose]]) -> ModalFit:
         """The best pose of a frame from several starts, or one of these."""
@@ -122,6 +141,7 @@ class FramePoses:
             for pose in (self.poses.descend(coarse, start, frame), start):
                 fits.append((base, pose, self.poses.score(coarse, pose, frame)))
         base, pose, score = min(fits, key=lambda one: one[2])
+        pose, score = self.poses.move_limbs(self._coarsen(base), pose, frame, score)
         return ModalFit(self.bending.shape(base, pose), base, pose, score)
 
     def _coarsen(self, x: Tensor) -> Tensor:

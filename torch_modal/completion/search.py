@@ -1,18 +1,23 @@
 """Poses and amplitudes of modes that bring a shape near to what was seen, from far to near."""
 
+from collections.abc import Callable
+
 import numpy as np
 import torch
+from scipy import sparse
+from scipy.spatial import cKDTree
 from torch import Tensor
 
+from torch_modal.arrays import BoolArray, FloatArray
 from torch_modal.completion.bending import ModalBending, ModalPose
 from torch_modal.completion.frames import Frame
 from torch_modal.completion.pairs import SLIDE, ObservedPoints, SampledSurface
-from torch_modal.geometry.connectivity import Connectivity
+from torch_modal.geometry.connectivity import Connectivity, edge_graph, farthest_apart
 
 # Steps, and the distance from which on pairs lose weight at the first and the last; stiffness of the modes likewise.
 STEPS, FAR, NEAR = 12, 20.0, 2.0
 # Points of a cloud, and visible places of a surface, that take part in a step, and in one of the pose alone.
-N_POINTS, N_RIGID = 1500, 200
+N_POINTS, N_RIGID = 800, 200
 STIFF, STIFFER = 1e-2, (1e-4, 1e-3, 1e-2)
 # Stiffness of a turn and a move of the whole.
 OF_MOTIONS = 1e-2
@@ -21,8 +26,13 @@ LARGEST_STEP = 6.0
 
 # Weight of the modes' energy next to what is left unexplained: limbs that crossed explain points as well.
 PRIOR = 3e-5
-# Loss of score that stiffer modes may have.
-GAIN = 1e-3
+# Distance at which points are unexplained; part of a cloud that makes a group.
+REACH, PART_OF_GROUP = 2.0, 300
+# Ends of limbs that are tried for a group, of how many, how far away, with which weight; rounds of such trials; and the
+# gain that they need, which stiffer modes may lose.
+N_TRIED, N_TIPS, MOST_AWAY, WEIGHT, ROUNDS, GAIN = 3, 12, 40.0, 3.0, 3, 1e-3
+# Smallest and largest length of a limb that is tried.
+LIMBS = 8.0, 30.0
 
 
 class PoseSearch:
@@ -38,10 +48,17 @@ class PoseSearch:
         self.mesh = Connectivity(bending.faces.numpy(), len(bending.reference))
         relative = eigenvalues / eigenvalues[:1]
         self.stiffness = torch.cat([relative, relative.new_full((6,), OF_MOTIONS)])
+        graph = edge_graph(bending.reference.numpy(), self.mesh.edges)
+        #: Ends of limbs, and the distances along the surface from each. *Shape:* ``(n,), (n, V)``.
+        self.tips, self.from_tips = farthest_apart(graph, self.mesh.used, N_TIPS)
+
+    def surface(self, base: Tensor, pose: ModalPose) -> SampledSurface:
+        """The deformed shape."""
+        return SampledSurface(self.bending.shape(base, pose).numpy(), self.mesh)
 
     def score(self, base: Tensor, pose: ModalPose, frame: Frame) -> float:
         """Part that is left unexplained, and a little of the energy of the modes; 0 or more."""
-        surface = SampledSurface(self.bending.shape(base, pose).numpy(), self.mesh)
+        surface = self.surface(base, pose)
         total = PRIOR * float(self.stiffness[:-6] @ pose.amplitudes**2)
         return total + sum(seen.score(surface, frame.unit) for seen in frame.seen)
 
@@ -60,6 +77,8 @@ class PoseSearch:
         distances: tuple[float, float] = (FAR, NEAR),
         stiff: float = STIFF,
         n_steps: int = STEPS,
+        released: BoolArray | None = None,
+        springs: Callable[[FloatArray, int], ObservedPoints] | None = None,
         rigid: bool = False,
     ) -> ModalPose:
         """Gauss-Newton steps, each with new pairs, from far to near and from stiff to soft; no vertex moves far."""
@@ -70,7 +89,8 @@ class PoseSearch:
                 x, fields = self.bending.linearise(base, pose, rigid)
             else:  # the derivatives of the step before do nearly as well
                 x = self.bending.shape(base, pose)
-            rows = self._rows(x, fields, seen, float(far))
+            pulled = [*seen, springs(x.numpy(), k)] if springs else seen
+            rows = self._rows(x, fields, pulled, float(far), released)
             products, n = (rows.mT @ rows).double(), fields.shape[-1]
             amplitudes = torch.cat([pose.amplitudes, pose.amplitudes.new_zeros(6)])[-n:]
             prior = float(stiffness) * self.stiffness[-n:]
@@ -93,11 +113,52 @@ class PoseSearch:
                 best, pose = min(best, score), other
         return pose
 
-    def _rows(self, x: Tensor, fields: Tensor, seen: list[ObservedPoints], far: float) -> Tensor:
+    def move_limbs(self, base: Tensor, pose: ModalPose, frame: Frame, best: float) -> tuple[ModalPose, float]:
+        """The pose, and its score, after limbs were moved to points that nothing explained, where that helps."""
+        for _ in range(ROUNDS):
+            others = [self._try_limb(base, pose, frame, *limb) for limb in self._limbs(base, pose, frame)]
+            scores = [self.score(base, other, frame) for other in others]
+            if not others or min(scores) > best - GAIN:
+                break
+            best, pose = min(scores), others[int(np.argmin(scores))]
+        return pose, best
+
+    def _limbs(self, base: Tensor, pose: ModalPose, frame: Frame) -> list[tuple[FloatArray, float, int]]:
+        """Groups of points that nothing explains, the weight of a point, and the end of a limb that might."""
+        surface, limbs = self.surface(base, pose), []
+        for cloud in [one for one in frame.seen if one.places is None]:
+            for group in cloud.find_unexplained(surface, REACH, max(4, len(cloud.points) // PART_OF_GROUP))[:2]:
+                points = cloud.points[group]
+                away = np.linalg.norm(surface.vertices[self.tips] - points.mean(0), axis=1)
+                nearest = np.argsort(away)[:N_TRIED]
+                limbs += [(points, WEIGHT / len(cloud.points), int(tip)) for tip in nearest if away[tip] < MOST_AWAY]
+        return limbs
+
+    def _try_limb(
+        self, base: Tensor, pose: ModalPose, frame: Frame, points: FloatArray, weight: float, tip: int
+    ) -> ModalPose:
+        """A pose in which a limb explains points that nothing explained; its former pairs are released."""
+        extent = 2 * float(np.percentile(np.linalg.norm(points - points.mean(0), axis=1), 90))
+        limb = self.from_tips[tip] < np.clip(extent, *LIMBS)
+        vertices = np.flatnonzero(limb)
+
+        def springs(x: FloatArray, k: int) -> ObservedPoints:
+            shift = 0 if k else points.mean(0) - x[vertices].mean(0)
+            nearest = vertices[cKDTree(x[vertices] + shift).query(points)[1]]
+            places = sparse.identity(len(limb), format="csr")[nearest]
+            return ObservedPoints(points, None, np.full(len(points), weight), np.arange(len(points)), 0.0, places)
+
+        distances = MOST_AWAY, MOST_AWAY
+        pose = self.descend(base, pose, frame, distances, frame.soft, STEPS // 2, released=limb, springs=springs)
+        return self.descend(base, pose, frame, (FAR / 3, NEAR), 10 * frame.soft, STEPS // 2)
+
+    def _rows(
+        self, x: Tensor, fields: Tensor, seen: list[ObservedPoints], far: float, released: BoolArray | None
+    ) -> Tensor:
         """Derivatives of the weighted offsets of all pairs, and last the offsets. *Shape:* ``(m, n + 1)``."""
         n, surface, rows = fields.shape[-1], SampledSurface(x.numpy(), self.mesh), []
         columns = fields.flatten(1).float().numpy()  # products of float32: half the time
-        for pairs in [one.pair(surface) for one in seen]:
+        for pairs in [pairs for one in seen for pairs in one.pairs(surface, released)]:
             off = pairs.places @ surface.vertices - pairs.points
             root = (pairs.weights**0.5 / (1 + (off**2).sum(1) / far**2)).astype(np.float32)
             moved = (pairs.places.astype(np.float32) @ columns).reshape(-1, 3, n)
