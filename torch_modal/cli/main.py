@@ -129,6 +129,7 @@ def _print_messages(quiet: bool) -> Iterator[None]:
             _print_error(f"warning: {message}")
 
     logger, handler = logging.getLogger("torch_modal"), logging.StreamHandler()
+    level = logger.level
     handler.setFormatter(logging.Formatter(f"{PROGRAM}: %(message)s"))
     logger.setLevel(logging.WARNING if quiet else logging.INFO)
     logger.addHandler(handler)
@@ -139,3 +140,4 @@ def _print_messages(quiet: bool) -> Iterator[None]:
             yield
     finally:
         logger.removeHandler(handler)
+        logger.setLevel(level)
