@@ -1,6 +1,7 @@
 """What long work says, and how errors of writing name files."""
 
 import errno
+import logging
 import os
 import signal
 import sys
@@ -95,3 +96,10 @@ def test_loops_of_links_and_long_names_are_one_line(
         assert cli.main(["subdivide", *map(str, inputs), "--out", str(out), "--quiet"]) == 1
         (line,) = capsys.readouterr().err.splitlines()
         assert line.startswith(f"torch-modal: error: {str(path)[:200]}") and len(line) < 600
+
+
+def test_a_quiet_command_leaves_the_level_of_the_log(tmp_path: Path) -> None:
+    logger = logging.getLogger("torch_modal")
+    level = logger.level
+    assert cli.main(["check", str(tmp_path / "missing.obj"), "--quiet"]) == 1
+    assert logger.level == level

@@ -81,8 +81,8 @@ def complete(
     """A motion through whole key-frames and partial, noisy samples.
 
     Modal poses of all frames are found first, by pairs of points and places on the surface, from far to near, outward
-    in time from what is known, and again between all others. Then all vertices minimise the distances together with
-    Eq. 5 towards neighbours in time and whole shapes (docs/completion.md).
+    in time from what is known; points that nothing explains are tried on the limbs nearby. Then all vertices minimise
+    the distances together with Eq. 5 towards neighbours in time and whole shapes (docs/completion.md).
 
     Args:
         keyframes: Whole shapes, which are exact, *shape* ``(K, V, 3)``, or one rest shape of no time, ``(V, 3)``.

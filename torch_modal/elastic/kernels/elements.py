@@ -292,11 +292,9 @@ def convex(f: KernelFunctions, rider: KernelFunctions | None) -> SimpleNamespace
 @cache
 def convex_adjoint(f: KernelFunctions, rider: KernelFunctions | None) -> SimpleNamespace:
     """Adjoints of :func:`convex`, which Warp generates."""
-    kernels, module = (
-        convex(f, rider),
-        _module(f, "convex_adjoint" if rider is None else f"convex_adjoint.{rider.name}"),
-    )
-    return SimpleNamespace(**{name: wp.kernel(kernel.func, module=module) for name, kernel in vars(kernels).items()})
+    module = _module(f, f"convex_adjoint.{rider.name if rider else None}")
+    kernels = vars(convex(f, rider))
+    return SimpleNamespace(**{name: wp.kernel(kernel.func, module=module) for name, kernel in kernels.items()})
 
 
 @cache
