@@ -32,13 +32,12 @@ def decoder_of(mean: Tensor) -> nn.Module:
 def training_set(arm: str, poses: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
     """The poses and more shapes, and the codes of all as mixtures of those that are learned."""
     one, generator = torch.eye(len(poses)), torch.Generator().manual_seed(0)
-    bases = tm.extract_bases(poses, faces, n_modes=15)
     if arm == "members":
-        return torch.cat([poses, tm.ShapeSpace(bases, faces).sample(N_MORE, generator)]), torch.eye(len(poses) + N_MORE)
+        return torch.cat([poses, tm.ShapeSpace(poses, faces).sample(N_MORE, generator)]), torch.eye(len(poses) + N_MORE)
     if arm == "in-betweens":
         t = len(poses) * torch.rand(N_MORE, generator=generator, dtype=poses.dtype)
         mixtures = torch.lerp(one[t.long()], one.roll(1, 1)[t.long()], t.frac()[:, None].float())
-        return torch.cat([poses, tm.Path(bases, faces, cyclic=True)(poses, t)]), torch.cat([one, mixtures])
+        return torch.cat([poses, tm.Path(poses, faces, cyclic=True)(poses, t)]), torch.cat([one, mixtures])
     return poses, one
 
 

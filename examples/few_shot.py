@@ -53,7 +53,7 @@ def main(out: Path, n: int = 500, rounds: int = 1) -> dict[str, float]:
     faces = torch.from_numpy(hand.faces).long()
     x = (x / (x[0].amax(0) - x[0].amin(0)).norm()).float()
     given, truth = x[:N_GIVEN], x[N_GIVEN:]
-    space = tm.ShapeSpace(tm.extract_bases(given, faces, n_modes=15), faces)
+    space = tm.ShapeSpace(given, faces)
     generator = torch.Generator().manual_seed(0)
     mixed = -torch.rand(n, N_GIVEN, generator=generator, dtype=x.dtype).log()
     between = tm.RandomInBetween(p=1.0, space=space, generator=generator)

@@ -37,14 +37,13 @@ class Morph(NamedTuple):
     folder: Path
 
 
-def main(out: Path, levels: int = 3, cell: float | None = None, n_modes: int = 30) -> Morph:
+def main(out: Path, levels: int = 3, cell: float | None = None) -> Morph:
     """Sculpt, register, morph and write.
 
     Args:
         out: Folder for the files; it is made if missing.
         levels: Of `subdivide`: ``2**levels`` frames from one to the other.
         cell: Length of the edges of the slender animal; 1.15 times that of the stout one.
-        n_modes: Modes of each.
     """
     out.mkdir(parents=True, exist_ok=True)
     cells = {"slender": cell, "stout": cell and 1.15 * cell}
@@ -60,7 +59,7 @@ def main(out: Path, levels: int = 3, cell: float | None = None, n_modes: int = 3
     print(registration.summary())
 
     keyframes = torch.stack([torch.from_numpy(slender), registration.positions])
-    frames = tm.subdivide(keyframes, faces, levels, n_modes=n_modes)
+    frames = tm.subdivide(keyframes, faces, levels)
     places = tm.keyframe_places(2, levels)
     tm.save_animation(frames, faces, out / "morph.glb", keyframe_indices=places, ping_pong=True, overwrite=True)
     rows = {"torch_modal": frames, "linear": tm.linear_sequence(keyframes, places)}

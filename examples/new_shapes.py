@@ -48,12 +48,11 @@ def with_dots(x: Tensor, faces: Tensor, points: Tensor, radius: float) -> tuple[
     return torch.cat([x, many]), torch.cat([faces, own])
 
 
-def main(out: Path, n_modes: int = 15) -> dict[str, list[float]]:
+def main(out: Path) -> dict[str, list[float]]:
     """Draw members, fit poses, and draw them.
 
     Args:
         out: Folder of the pictures.
-        n_modes: Modes of each key-frame.
 
     Returns:
         Mean distances of all vertices of the poses that were left out, in % of the diagonal, by method.
@@ -61,8 +60,7 @@ def main(out: Path, n_modes: int = 15) -> dict[str, list[float]]:
     out.mkdir(parents=True, exist_ok=True)
     sample = load_sample("creature")
     poses, faces = sample.keyframes, sample.faces
-    bases = tm.extract_bases(poses, faces, n_modes)
-    members = tm.ShapeSpace(bases, faces).sample(4 * len(poses), torch.Generator().manual_seed(0))
+    members = tm.ShapeSpace(poses, faces).sample(4 * len(poses), torch.Generator().manual_seed(0))
     tm.render_sequence(
         {"given": poses, **{f"new{' ' * i}": row for i, row in enumerate(members.split(len(poses)))}},
         faces,
@@ -83,7 +81,7 @@ def main(out: Path, n_modes: int = 15) -> dict[str, list[float]]:
         rest = [i for i in range(len(poses)) if i != k]
         vertices = farthest_points(poses[k], N_MARKERS, first=0)
         points = poses[k, vertices]
-        space = tm.ShapeSpace([bases[i] for i in rest], faces)
+        space = tm.ShapeSpace(poses[rest], faces)
         fitted = {"fitted": space.fit(points, vertices).shape, "linear span": linear_fit(poses[rest], points, vertices)}
         for name, x in {"20 markers": poses[k], **fitted}.items():
             shown, all_faces = with_dots(x, faces, points, 0.012 * diagonal)

@@ -181,8 +181,7 @@ def main(steps: int = 60, seed: int = 0) -> Result:
     """
     data = load_data(seed=seed)
     x_a, x_b = data.keyframes
-    bases = tm.extract_bases(data.keyframes, data.faces, n_modes=30)
-    layer = tm.InBetween(bases, data.faces, "fast")  # with gradients, solved to its tolerance of 1e-5
+    layer = tm.InBetween(data.keyframes, data.faces, "fast")
 
     def through_layer(t: Tensor) -> Tensor:
         return layer(x_a, x_b, t)

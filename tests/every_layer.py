@@ -118,7 +118,7 @@ def of_two_bodies(shapes: Shapes) -> tm.InBetween:
         parts = torch.cat([one.modes, 0 * one.modes], 1), torch.cat([0 * other.modes, other.modes], 1)
         values = torch.cat([one.eigenvalues, other.eigenvalues])
         bases.append(tm.ModalBasis(shape, values, torch.cat(parts), one.rigid_eigenvalues))
-    layer = tm.InBetween(bases, torch.cat([shapes.faces, shapes.faces + shapes.keyframes.shape[1]]))
+    layer = tm.InBetween(bases, torch.cat([shapes.faces, shapes.faces + shapes.keyframes.shape[1]]), "modal")
     assert len(layer.cores) == 2
     return layer
 
@@ -148,20 +148,22 @@ def blended(layer: Any, x: Tensor) -> Tensor:
     return layer(x, torch.tensor([[0.2, 0.3, 0.5], [0.334, 0.333, 0.333]]).to(x))
 
 
-COARSE = replace(tm.PRESETS["fast"].objective, coarse_faces=30)
+COARSE = replace(tm.PRESETS["modal"].objective, coarse_faces=30)
 
 LAYERS: dict[str, Case] = {
     "InBetween": Case(in_between, pair_in_time),
     "InBetween, torch": Case(partial(in_between, solver=tm.Solver(backend="torch")), pair_in_time),
-    "InBetween, fast": Case(partial(in_between, preset="fast", objective=COARSE), pair_in_time),
-    "InBetween, no modes": Case(lambda s: tm.InBetween(s.keyframes[:2], s.faces), pair_in_time),
+    "InBetween, fast": Case(partial(in_between, preset="fast"), pair_in_time),
+    "InBetween, modal": Case(partial(in_between, objective=COARSE), pair_in_time),
+    "InBetween, modal, torch": Case(
+        partial(in_between, objective=COARSE, solver=tm.Solver(backend="torch")), pair_in_time
+    ),
     "InBetween, own term": Case(with_own_term, pair_in_time),
     "InBetween, contact": Case(partial(in_between, contact=True), pair_in_time),
     "InBetween, bodies": Case(of_two_bodies, lambda layer, x: pair_in_time(layer, two_bodies(x))),
     "MidShape, paper": Case(lambda s: tm.MidShape(s.bases[:2], s.faces, preset="paper"), pair),
     "Blend": Case(lambda s: tm.Blend(s.bases, s.faces), blended),
     "Path": Case(lambda s: tm.Path(s.bases, s.faces), set_in_time),
-    "Path, no modes": Case(lambda s: tm.Path(s.keyframes, s.faces), set_in_time),
     "Path, pairs": Case(lambda s: tm.Path(s.bases, s.faces, smooth=False), set_in_time),
     "Path, contact": Case(lambda s: tm.Path(s.bases, s.faces, contact=True), set_in_time),
     "ModalDecoder": Case(decoder, decoded, "other", batched=False),

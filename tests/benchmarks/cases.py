@@ -124,6 +124,19 @@ def animal(name: str) -> tuple[torch.Tensor, torch.Tensor, list[tuple[str, int, 
         return torch.tensor(given["frames"]).double(), torch.tensor(given["faces"]).long(), clips
 
 
+def clips() -> Iterator[Case]:
+    """Pairs of frames of each clip of the animals, 6, 10 and 16 frames apart about its middle, with the true one."""
+    for file in sorted((DATA / "animals").glob("*.npz")):
+        frames, faces, parts = animal(file.stem)
+        for name, start, end in parts:
+            for n in (n for n in (6, 10, 16) if n < end - start):
+                first = start + (end - start - 1 - n) // 2
+                if torch.allclose(frames[first], frames[first + n]):  # there and back again
+                    continue
+                shapes = KeyframeSet(frames[[first, first + n]], faces)
+                yield Case(f"{file.stem} {name} {n}", shapes, 0, 1, {HALF: frames[first + n // 2]})
+
+
 def divided(x: torch.Tensor, faces: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Shapes whose triangles are divided in four. *Shape:* ``(K, V, 3), (F, 3)``."""
     mesh = Connectivity(faces.numpy(), x.shape[1])

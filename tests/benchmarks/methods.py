@@ -70,9 +70,10 @@ def paper(case: Case) -> Outcome:
     return Outcome(shape[None], seconds)
 
 
-def by_layer(case: Case, preset: Literal["accurate", "fast"]) -> Outcome:
+def by_layer(case: Case, preset: Literal["accurate", "fast", "modal"]) -> Outcome:
     """All times in one call of the layer."""
-    layer, times = tm.InBetween(case.bases(30), case.faces, preset), torch.tensor(case.times, dtype=torch.float64)
+    ends = case.bases(30) if preset == "modal" else torch.stack([case.x_a, case.x_b])
+    layer, times = tm.InBetween(ends, case.faces, preset), torch.tensor(case.times, dtype=torch.float64)
     with torch.no_grad():
         return Outcome(*timed(lambda: layer(case.x_a, case.x_b, times)))
 
@@ -154,6 +155,7 @@ METHODS: dict[str, Callable[[Case], Outcome]] = {
     "paper": paper,
     "fast": partial(by_layer, preset="fast"),
     "accurate": partial(by_layer, preset="accurate"),
+    "modal": partial(by_layer, preset="modal"),
     "optimum": optimum,
     "Froehlich-Botsch": example_based,
     "geodesic": isometric_geodesic,

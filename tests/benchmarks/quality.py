@@ -2,6 +2,7 @@
 
     python tests/benchmarks/quality.py [FOLDER ...] [--only TEXT ...] [--methods NAME ...] [--peer-python FILE]
     python tests/benchmarks/quality.py --bodies
+    python tests/benchmarks/quality.py --presets
 
 A folder holds the frames of a motion: the first and the last are the key-frames, the others the truth at their places.
 Without one, pairs of the samples and of the data beside the repository are compared. *Edge error* is the mean of
@@ -10,7 +11,8 @@ the fine mesh. Means are geometric, over the pairs that both methods have. Times
 one thread. Morphomatics joins where it is installed (``pip install morphomatics``), or with ``--peer-python``.
 
 ``--bodies`` compares bodies in closed form (tests/bodies.py) with their true shapes. *Folds* are hinges bent by more
-than a right angle beyond both key-frames.
+than a right angle beyond both key-frames. ``--presets`` compares the presets, on pairs of frames of animated animals
+and on bodies that modes know better: *vertices* is the mean distance from the truth.
 """
 
 import argparse
@@ -31,6 +33,7 @@ from timing import limit_threads
 FEW = ["hand-path", "hand 00/04", "woman 00/02", "face 00/01", "cube 1/2", "creature 1", "creature 2", "sample hand"]
 BODIES = ["limb bent 120", "bar bent 360", "bar twisted 270", "bar twisted 360", "vessel bent 60", "gutter rolled 270"]
 OURS = "accurate"
+PRESETS = ["fast", "accurate", "modal"]
 
 
 def half_way(case: Case, names: list[str]) -> dict[str, Outcome]:
@@ -88,6 +91,31 @@ def compare_bodies(names: list[str], table: Table) -> None:
         )
 
 
+def compare_presets(table: Table) -> None:
+    """Add a row for each measure, the mean over pairs of clips, and one for each body."""
+    found = {measure: [] for measure in ("vertices", "edges", "energy of Eq. 5", "time")}
+    for case in cases.clips():
+        outcomes, yardstick, truth = half_way(case, PRESETS), Yardstick(case), case.truths[HALF]
+        shapes = {name: outcome.frames[0] for name, outcome in outcomes.items()}
+        rows = {
+            "vertices": {
+                name: float((yardstick.laid(x, truth) - truth).norm(dim=1).mean()) for name, x in shapes.items()
+            },
+            "edges": {name: yardstick.edge_error(x, HALF) for name, x in shapes.items()},
+            "energy of Eq. 5": {name: yardstick.energy(x) for name, x in shapes.items()},
+            "time": {name: outcome.seconds for name, outcome in outcomes.items()},
+        }
+        for measure, row in rows.items():
+            found[measure].append([row[name] / row["modal"] for name in PRESETS])
+    for measure, ratios in found.items():
+        means = (number(geometric_mean(each), ".3f") for each in zip(*ratios, strict=True))
+        table.add(f"{measure}, over `modal`", f"mean of {len(ratios)} pairs of clips", *means)
+    for case in cases.bodies(BODIES):
+        outcomes, yardstick = half_way(case, PRESETS), Yardstick(case)
+        errors = (percent(yardstick.edge_error(x.frames[0], HALF)) for x in outcomes.values())
+        table.add("edge error", case.name, *errors)
+
+
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -95,6 +123,7 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", metavar="TEXT", help="cases with one of these in their names")
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS), metavar="NAME")
     parser.add_argument("--bodies", action="store_true", help="bodies in closed form; --only names others")
+    parser.add_argument("--presets", action="store_true", help="the presets on animated animals and on bodies")
     parser.add_argument("--sheet", type=Path, metavar="FILE.png", help="draw the shapes, coloured by their edge errors")
     add_peer(parser)
     add_keep(parser)
@@ -105,6 +134,11 @@ def main() -> None:
         columns = ["body", "edge error, linear", "edge error", *ratios, "folds"]
         with Table("bodies", columns, given.keep, check="--bodies --only 'limb bent 120'") as table:
             compare_bodies(given.only or BODIES, table)
+        return
+    if given.presets:
+        heads = [f"`{name}`" for name in PRESETS]
+        with Table("presets", ["", "of", *heads], given.keep, labels=2) as table:
+            compare_presets(table)
         return
     found = {case: half_way(case, given.methods) for case in chosen(given.folders, given.only or FEW)}
     methods = [name for name in given.methods if any(name in outcomes for outcomes in found.values())]

@@ -133,7 +133,7 @@ def test_wrong_settings(make: Callable[[], Any], message: str) -> None:
 def test_wrong_calls(bars: Shapes, space: tm.ShapeSpace) -> None:
     x = bars.keyframes
     deformation = tm.RandomModalDeformation(p=1.0)
-    with pytest.raises(ValueError, match="needs key-frames and modes"):
+    with pytest.raises(ValueError, match="needs key-frames"):
         deformation(x)
     with pytest.raises(ValueError, match=r"\(B, 164, 3\).*got \(3, 163, 3\)"):
         deformation(x[:, 1:], space=space)
@@ -512,7 +512,7 @@ def test_composition_says_what_does_not_fit(bars: Shapes, space: tm.ShapeSpace) 
     with pytest.raises(ValueError, match="one connectivity"):
         smaller = replace(bars.bases[1], reference=bars.bases[1].reference[1:], modes=bars.bases[1].modes[:, 1:])
         tm.ShapeSpace([bars.bases[0], smaller], bars.faces)
-    for wrong, got in ((bars.keyframes, "Tensor"), (None, "NoneType"), ([], "none")):
+    for wrong, got in (([bars.bases[0], None], "NoneType"), ([], "none")):
         with pytest.raises(ValueError, match=f"bases, one or more, come from extract_bases; got {got}"):
             tm.ShapeSpace(wrong, bars.faces)  # type: ignore[arg-type]
 

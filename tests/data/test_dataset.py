@@ -297,12 +297,12 @@ def test_what_does_not_converge_is_warned_of(bars: Shapes, tmp_path: Path) -> No
     hasty = tm.Solver(max_steps=1, tolerance=1e-12, local_steps=0)
     tm.write_set(tmp_path / "set", *bars, ["0", "1", "2"])
     between = tm.RandomInBetween(t=(0.4, 0.6), p=1.0)
-    data = tm.ShapeDataset(tmp_path, between, solver=hasty, samples_per_set=3)
+    data = tm.ShapeDataset(tmp_path, between, preset="modal", solver=hasty, samples_per_set=3)
     with pytest.warns(tm.ConvergenceWarning, match=r"of 17 in-betweens near the key-frames . and . "):
         data[0]
     # It is not kept, so that the next run hears of it too.
     assert not list(tmp_path.rglob("between-*"))
-    space = tm.ShapeSpace(bars.bases, bars.faces, solver=hasty, times=None)
+    space = tm.ShapeSpace(bars.bases, bars.faces, preset="modal", solver=hasty, times=None)
     with pytest.warns(tm.ConvergenceWarning, match=r"1 of 1 in-betweens near the key-frames 0 and 1"):
         space.in_betweens.of_keyframes(1, 0, torch.tensor([0.5], dtype=torch.float64))
     x = bars.keyframes + 0.01 * torch.sin(bars.keyframes)

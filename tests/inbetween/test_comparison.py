@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 import torch
-from conftest import Shapes
+from conftest import Shapes, modal
 from torch import Tensor
 from torch.autograd import gradcheck
 
@@ -16,14 +16,8 @@ from torch_modal.elastic.implicit import ConvergenceWarning
 from torch_modal.elastic.minimise import Status
 from torch_modal.elastic.term import Mesh
 from torch_modal.inbetween.comparison import blend_by_distortion
-from torch_modal.inbetween.settings import PRESETS
 
 INF, NAN = torch.inf, torch.nan
-
-
-def preset(name: str, **solver: Any) -> dict[str, Any]:
-    objective, given = PRESETS[name]
-    return {"objective": replace(objective, coarse_faces=200), "solver": replace(given, **solver)}
 
 
 @pytest.mark.parametrize(
@@ -68,7 +62,7 @@ class TestFallBack:
     """A result that is worse than its start."""
 
     def test_the_start_is_returned_and_the_status_says_so(self, bars: Shapes, backend: str, monkeypatch: Any) -> None:
-        layer = tm.InBetween(bars.bases[1:], bars.faces, **preset("fast", backend=backend))
+        layer = tm.InBetween(bars.bases[1:], bars.faces, **modal(coarse_faces=200, backend=backend))
         space, x_a, x_b = layer.core.space, *bars.keyframes[1:]
         spoiled = type(space).lift
 
@@ -97,7 +91,7 @@ class TestFallBack:
 
     def test_not_where_nobody_sees_a_difference(self, bars: Shapes, monkeypatch: Any) -> None:
         """Key-frames that are the same, and a minimiser with strains of some thousandths."""
-        layer = tm.InBetween(bars.bases[1:], bars.faces, **preset("fast"))
+        layer = tm.InBetween(bars.bases[1:], bars.faces, **modal(coarse_faces=200))
         space, x = layer.core.space, bars.keyframes[1]
         spoiled = type(space).lift
         monkeypatch.setattr(type(space), "lift", lambda *given: spoiled(*given) * (1 + 3e-3))
@@ -105,7 +99,7 @@ class TestFallBack:
         assert found.solution.status == Status.CONVERGED and 0 < float(found.solution.distortion_ratio) < 0.5
 
     def test_gradients_are_those_of_what_is_returned(self, small_bars: Shapes, backend: str, monkeypatch: Any) -> None:
-        layer = tm.InBetween(small_bars.bases[1:], small_bars.faces, **preset("fast", backend=backend))
+        layer = tm.InBetween(small_bars.bases[1:], small_bars.faces, **modal(coarse_faces=200, backend=backend))
         space, (x_a, x_b) = layer.core.space, small_bars.keyframes[1:]
         spoiled = type(space).lift
         monkeypatch.setattr(type(space), "lift", lambda *given: 10 * torch.sin(37 * spoiled(*given)))

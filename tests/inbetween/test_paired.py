@@ -98,7 +98,7 @@ def test_small_mu_is_linear_interpolation(bars: Shapes) -> None:
 
 
 def test_knows_the_middle_only(bars: Shapes) -> None:
-    with pytest.raises(ValueError, match="t = 1/2 only; use space='joint'"):
+    with pytest.raises(ValueError, match="t = 1/2 only; other presets have all times"):
         x_a, x_b = bars.keyframes[:2]
         InBetween(bars.bases[:2], bars.faces, **modal(space="paired", coarse_faces=200))(
             x_a, x_b, torch.tensor([0.5, 0.25])

@@ -199,7 +199,7 @@ def test_mu_and_regions_are_of_the_paired_space(bars: Shapes) -> None:
     given: Any = bars.bases[:2], bars.faces
     with pytest.raises(ValueError, match=r"mu weighs the similarity of the two shapes of Eq\. 4"):
         MidShape(*given, mu=2.0)
-    with pytest.raises(ValueError, match=r"regions=3 are interpolated.*preset='paper' has two"):
+    with pytest.raises(ValueError, match=r"regions=3 are interpolated.*which only preset='paper' has"):
         MidShape(*given, regions=3)
     with pytest.raises(ValueError, match="regions is a whole number, 0 or more; got -1"):
         MidShape(*given, preset="paper", regions=-1)

@@ -8,7 +8,7 @@ import pytest
 import torch
 import trimesh
 from bodies import body
-from conftest import Shapes
+from conftest import Shapes, modal
 from shapes import edge_lengths
 
 import torch_modal as tm
@@ -20,7 +20,7 @@ from torch_modal.modes.coarsening import FACES_OF_PIECE, coarsen
 
 
 @pytest.mark.parametrize("name, most", [("wire bent 60", 0.1), ("bar twisted 60", 0.05)])
-def test_fast_resolves_thin_limbs(name: str, most: float) -> None:
+def test_a_coarse_modal_solve_resolves_thin_limbs(name: str, most: float) -> None:
     """With 300 faces, the edges of a ball with a thin leg were 26 times as far off as by linear interpolation."""
     shape = body(name)
     first, middle, last = (torch.from_numpy(shape.pose(t)) for t in (0.0, 0.5, 1.0))
@@ -30,7 +30,7 @@ def test_fast_resolves_thin_limbs(name: str, most: float) -> None:
         return float((edge_lengths(x, faces) - edge_lengths(middle, faces)).norm())
 
     bases = tm.extract_bases(torch.stack([first, last]), faces, 30, mesher="lattice", progress=False)
-    layer = tm.InBetween(bases, faces, "fast")
+    layer = tm.InBetween(bases, faces, **modal(coarse_faces=300, anchor=30_000.0))
     with torch.no_grad():
         found = layer(first, last, 0.5)
     assert error(found) < most * error((first + last) / 2)

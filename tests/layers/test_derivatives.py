@@ -61,7 +61,8 @@ def strained(bars: Shapes, **options: Any) -> Case:
     x_a, x_b = bars.keyframes[1:]
     x_b = x_b * numbers(1.5, 0.7, 1.2) + 0.1 * like(x_b, 5)
     x_b = x_b @ random_rotation(torch.Generator().manual_seed(0)).mT + 1
-    objective = tm.Objective(coarse_faces=200, alpha=numbers(400.0)[0], beta=numbers(20.0)[0], gamma=numbers(5e4)[0])
+    stiffness = {"alpha": numbers(400.0)[0], "beta": numbers(20.0)[0], "gamma": numbers(5e4)[0]}
+    objective = tm.Objective(space="joint", coarse_faces=200, **stiffness)
     layer = tm.InBetween(bars.bases[1:], bars.faces, objective=objective, solver=tm.Solver(tolerance=1e-13, **options))
     return with_state(layer, x_a, x_b, numbers(0.37))
 
@@ -110,6 +111,7 @@ def path(bars: Shapes, **options: Any) -> Case:
 
 CASES: dict[str, Callable[[Shapes], Case]] = {
     "in_between": in_between,
+    "in_between, modal": lambda bars: in_between(bars, preset="modal", solver=tm.Solver(tolerance=1e-12)),
     "in_between, torch": lambda bars: in_between(bars, solver=tm.Solver(backend="torch")),
     "strained": lambda bars: strained(bars, local_steps=0),
     "strained, torch": lambda bars: strained(bars, local_steps=0, backend="torch"),
@@ -189,7 +191,7 @@ def test_backward_is_the_limit_of_differences(name: str, small_bars: Shapes) -> 
         assert float((gradient * tangent).sum()) == pytest.approx(expected, rel=1e-5, abs=1e-6), (name, i)
 
 
-@pytest.mark.parametrize("name", ["in_between", "blend", "decoder", "path"])
+@pytest.mark.parametrize("name", ["in_between", "in_between, modal", "blend", "decoder", "path"])
 def test_jacfwd_of_a_layer_that_nothing_has_used_before(small_bars: Shapes, name: str) -> None:
     """Of a decoder of two numbers: what layers keep is made within the transforms, and is good outside of them."""
     case, z, directions = CASES[name](small_bars), numbers(0.1, -0.2), numbers(1, -0.5)
@@ -218,15 +220,16 @@ def test_at_key_frames_the_tangent_is_that_of_the_in_between(small_bars: Shapes,
 
 
 def test_no_tangent_goes_through_amplitudes_that_did_not_converge(bars: Shapes) -> None:
-    case = in_between(bars, solver=tm.Solver(max_steps=1))
+    case = in_between(bars, preset="modal", solver=tm.Solver(max_steps=1))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", tm.ConvergenceWarning)
         assert not bool(case.layer.solve(*bars.keyframes[:2], 0.3).solution.converged)  # type: ignore[attr-defined]
         require_transposed(case)
 
 
-def test_second_derivatives(small_bars: Shapes) -> None:
-    case = in_between(small_bars)
+@pytest.mark.parametrize("preset", ["accurate", "modal"])
+def test_second_derivatives(small_bars: Shapes, preset: Any) -> None:
+    case = in_between(small_bars, preset=preset)
     x_a, x_b, _ = small_bars.keyframes
     z, v, weights, along = numbers(0.1, -0.2), numbers(1, 2), like(x_a, 2), like(x_a)
 

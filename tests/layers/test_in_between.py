@@ -4,6 +4,7 @@ import copy
 import math
 import warnings
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -75,12 +76,14 @@ class TestValues:
 
     def test_key_frames_in_the_place_of_bases_leave_out_the_modal_solve(self, bars: Shapes) -> None:
         x = bars.keyframes[1:]
-        plain, modal_steps = InBetween(x, bars.faces), InBetween(bars.bases[1:], bars.faces, solver=Solver(max_steps=0))
+        plain, given_bases = InBetween(x, bars.faces), InBetween(bars.bases[1:], bars.faces)
         found = plain.solve(*x, times(0.0, 0.3, 1.0))
         assert torch.equal(found.shapes[::2], x) and bool(found.solution.converged.all())
-        truth = modal_steps.solve(*x, times(0.3)).shapes[0]
+        torch.testing.assert_close(given_bases.solve(*x, times(0.0, 0.3, 1.0)).shapes, found.shapes, rtol=0, atol=0)
+        no_steps = InBetween(bars.bases[1:], bars.faces, "modal", solver=Solver(max_steps=0))
+        truth = no_steps.solve(*x, times(0.3)).shapes[0]
         torch.testing.assert_close(found.shapes[1], truth, rtol=0, atol=1e-12)
-        with pytest.raises(ValueError, match="is one of modes; pass bases"):
+        with pytest.raises(ValueError, match="act through modes, and there are none: pass bases"):
             InBetween(x, bars.faces, "paper")
 
     def test_where_the_blend_is_far_worse_than_straight_lines_they_are_returned(
@@ -317,7 +320,7 @@ def test_what_a_call_refuses(call: Any, message: str, layer: InBetween, bars: Sh
         (lambda: modal(coarse_faces=3), "coarse_faces is a whole number, 4 or more"),
         (lambda: modal(polish=-1), "polish is a whole number"),
         (lambda: modal(polish=1.5), "polish is a whole number"),
-        (lambda: {"preset": "best"}, "preset is one of 'accurate', 'fast', 'paper'; got 'best'"),
+        (lambda: {"preset": "best"}, "preset is one of 'accurate', 'fast', 'modal', 'paper'; got 'best'"),
         (lambda: modal(space="both"), "space is one of 'joint', 'paired'; got 'both'"),
     ],
 )
@@ -341,7 +344,7 @@ def test_bases_that_do_not_fit(bars: Shapes, small_bars: Shapes) -> None:
             InBetween(bases, bars.faces)
 
 
-@pytest.mark.parametrize("kind", [InBetween, tm.Blend, tm.MidShape, tm.Path])
+@pytest.mark.parametrize("kind", [InBetween, tm.Blend, partial(tm.MidShape, preset="accurate"), tm.Path])
 def test_key_frames_in_the_place_of_bases_are_arrays_or_lists(kind: Any, bars: Shapes) -> None:
     x = bars.keyframes[:2]
     wanted = kind(x, bars.faces).state_dict()
@@ -353,7 +356,7 @@ def test_key_frames_in_the_place_of_bases_are_arrays_or_lists(kind: Any, bars: S
 @pytest.mark.parametrize("wrong", ["not finite", "shape"])
 @pytest.mark.parametrize("kind", [InBetween, tm.Path])
 def test_a_state_that_is_refused_changes_nothing(kind: Any, wrong: str, bars: Shapes) -> None:
-    layer = kind(bars.bases[:2], bars.faces)
+    layer = kind(bars.bases[:2], bars.faces, preset="modal", **({"smooth": False} if kind is tm.Path else {}))
     before = {name: value.clone() for name, value in layer.state_dict().items()}
     state = {name: 2 * value for name, value in before.items()}
     if wrong == "not finite":
@@ -370,13 +373,13 @@ def test_a_state_that_is_refused_changes_nothing(kind: Any, wrong: str, bars: Sh
 
 def test_other_bases_in_functional_call_are_refused(bars: Shapes) -> None:
     """What a layer computes from its bases is not computed again."""
-    layer, x = InBetween(bars.bases[:2], bars.faces), bars.keyframes
+    layer, x = InBetween(bars.bases[:2], bars.faces, "modal"), bars.keyframes
     own = torch.func.functional_call(layer, layer.state_dict(), (x[0], x[1], 0.4))
     torch.testing.assert_close(own, layer(x[0], x[1], 0.4))
     modes = [bars.bases[0], replace(bars.bases[1], modes=2 * bars.bases[1].modes)]
     for bases in (bars.bases[1:], modes):
-        state = InBetween(bases, bars.faces).state_dict()
-        for one in (layer, InBetween(bars.bases[:2], bars.faces).float()):
+        state = InBetween(bases, bars.faces, "modal").state_dict()
+        for one in (layer, InBetween(bars.bases[:2], bars.faces, "modal").float()):
             with pytest.raises(RuntimeError, match="bases of this InBetween were replaced"):
                 torch.func.functional_call(one, state, (x[0], x[1], 0.4))
 
@@ -390,9 +393,8 @@ def test_modes_that_span_all_shapes() -> None:
     found = []
     for method in ("solid", "shell"):
         bases = tm.extract_bases(torch.stack([first, second]), faces, 30, method=method, cache=False)
-        for preset in ("accurate", "fast"):
-            free = replace(tm.PRESETS[preset].objective, anchor=0.0)
-            found.append(tm.InBetween(bases, faces, preset, objective=free)(first, second, 0.5))
+        free = replace(tm.PRESETS["modal"].objective, anchor=0.0)
+        found.append(tm.InBetween(bases, faces, objective=free)(first, second, 0.5))
     for one in found:
         torch.testing.assert_close(one, found[0], rtol=0, atol=1e-4)
 

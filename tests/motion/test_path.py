@@ -172,7 +172,7 @@ def test_no_modes_are_needed(bars: Shapes, monkeypatch: pytest.MonkeyPatch) -> N
         torch.testing.assert_close(frames, path(x, torch.linspace(0, 2, 9, dtype=DOUBLE)), rtol=0, atol=1e-12)
     pairs = tm.subdivide(x, faces, 1, n_modes=0, smooth=False, progress=False)
     for i in (0, 1):
-        truth = tm.MidShape(x[i : i + 2], faces)(x[i], x[i + 1])
+        truth = tm.MidShape(x[i : i + 2], faces, preset="accurate")(x[i], x[i + 1])
         torch.testing.assert_close(pairs[2 * i + 1], truth, rtol=0, atol=1e-12)
         torch.testing.assert_close(Path(x, faces, smooth=False)(x, i + 0.5), truth, rtol=0, atol=1e-9)
 

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 import torch
-from conftest import Shapes, random_rotation
+from conftest import Shapes, modal, random_rotation
 from shapes import edge_lengths, largest
 from torch import Tensor
 
@@ -139,6 +139,7 @@ def test_regions_are_those_of_the_key_frames_in_all_levels(scattered: Shapes) ->
 
 def test_makes_bases_where_none_are_given(scattered: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
     pair = scattered.pick(0, 1)
+    options: dict[str, Any] = modal(local=True, coarse_faces=200)
     asked: list[Any] = []
     loaded: list[bool] = []
 
@@ -149,17 +150,19 @@ def test_makes_bases_where_none_are_given(scattered: Shapes, monkeypatch: pytest
     monkeypatch.setattr(sequence, "bases_of_checked", extract)
     monkeypatch.setattr(TorchBackend, "load", lambda self: loaded.append(True))
     monkeypatch.setattr(WarpBackend, "load", TorchBackend.load)
-    frames = subdivide(pair.keyframes, pair.faces, 1, n_modes=7, progress=False, **COARSE)
+    frames = subdivide(pair.keyframes, pair.faces, 1, n_modes=7, progress=False, **options)
     assert asked == [(2, 7)]
     assert loaded == [True]
     for bases in (pair.bases, lambda *_: pair.bases):
-        given = subdivide(pair.keyframes, pair.faces, 1, bases=bases, progress=False, **COARSE)
+        given = subdivide(pair.keyframes, pair.faces, 1, bases=bases, progress=False, **options)
         assert torch.equal(frames, given)
+    asked.clear()
+    plain = subdivide(pair.keyframes, pair.faces, 1, progress=False)
+    assert not asked and not torch.equal(frames, plain)
+    assert torch.equal(plain, subdivide(pair.keyframes, pair.faces, 1, bases=pair.bases, progress=False))
 
 
-# -------------------------------------------------------------------------------------------- linear, for comparison
-
-
+# ----------------------------------------------------------------------------------------------- linear, for comparison
 def test_linear_sequence(scattered: Shapes) -> None:
     x = scattered.keyframes
     straight = linear_sequence(x, [0, 4, 6])
@@ -182,7 +185,7 @@ def test_linear_sequence(scattered: Shapes) -> None:
         ({"n_frames": 2}, "n_frames=2 leaves no room for 3 key-frames"),
         ({"bases": []}, "got 0 bases for 3 key-frames"),
         ({"mu": 0.5}, "mu weighs the similarity of the two shapes"),
-        ({"regions": 2}, "the joint space has one"),
+        ({"regions": 2}, "which only preset='paper' has"),
         *(({"preset": "paper"} | more, "the middle of a pair only") for more in ({"smooth": True}, {"n_frames": 9})),
     ],
 )

@@ -73,7 +73,7 @@ def test_few_shot_comes_nearer_than_mixtures_of_vertices(tmp_path: Path) -> None
 @pytest.mark.slow
 def test_morph_animals_goes_from_one_body_to_another(tmp_path: Path) -> None:
     """The short form, on coarse meshes: legs that swing keep their lengths, which linear interpolation cuts short."""
-    found, frames, faces, _ = load_example("morph_animals").main(tmp_path, levels=1, cell=0.042, n_modes=8)
+    found, frames, faces, _ = load_example("morph_animals").main(tmp_path, levels=1, cell=0.042)
     assert not found.doubtful and found.flipped_area < 0.02
     assert found.to_target.mean < 0.12 and found.from_target.mean < 0.12
     assert frames.shape == (3, len(found.positions), 3)
@@ -101,7 +101,7 @@ def test_complete_is_nearer_than_the_path(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_new_shapes_are_drawn_and_poses_follow_their_markers(tmp_path: Path) -> None:
-    errors = load_example("new_shapes").main(tmp_path, n_modes=8)
+    errors = load_example("new_shapes").main(tmp_path)
     assert max(errors["fitted"]) < 0.3 * min(errors["linear span"])
     assert all((tmp_path / f"{name}.png").stat().st_size > 50_000 for name in ("shapes", "markers"))
 

@@ -69,8 +69,8 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
     add("--contact", action="store_true", help="keep parts from passing through each other (extra contact)")
     text = "a coarser mesh of N vertices moves and carries the detail; 0: none (default: 20000 for large meshes)"
     add("--proxy", type=int, metavar="N", help=text)
-    text = "accurate; fast, without steps on the fine mesh; paper, its method whole (default: %(default)s)"
-    add("--preset", choices=("accurate", "fast", "paper"), default="accurate", help=text)
+    text = "accurate; fast, no elastic steps; modal, in vibration modes; paper, its method whole (default: %(default)s)"
+    add("--preset", choices=("accurate", "fast", "modal", "paper"), default="accurate", help=text)
     group = sub.add_argument_group("animation")
     text = "of the sequence once (default: 1 for a cycle, 2 for two key-frames, 1 an interval of more)"
     group.add_argument("--duration", type=float, metavar="SECONDS", help=text)

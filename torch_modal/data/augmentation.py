@@ -194,7 +194,7 @@ class ShapeAugmentation(nn.Module):
         out = self.transform(batch, self.params, space, pool)
         if "normals" in named:
             if space is None:
-                raise ValueError("normals need faces: pass space=ShapeSpace(bases, faces) when it is made or called")
+                raise ValueError("normals need faces: pass space=ShapeSpace(keyframes, faces) when it is made or called")
             normals = vertex_normals(out.shapes, space.faces)
         results = [normals if name == "normals" else getattr(out, name) for name in named]
         if single and self.keepdim:
@@ -205,7 +205,7 @@ class ShapeAugmentation(nn.Module):
         space = self.space if space is None else space
         if space is None and self.uses_keyframes:
             raise ValueError(
-                f"{type(self).__name__} needs key-frames and modes: pass space=ShapeSpace(bases, faces) when it is "
+                f"{type(self).__name__} needs key-frames: pass space=ShapeSpace(keyframes, faces) when it is "
                 "made or called"
             )
         return space

@@ -1,4 +1,4 @@
-"""Key-frames of one connectivity with their modes: a space of shapes with a mean, components, new members and fits."""
+"""Key-frames of one connectivity: a space of shapes with a mean, components, new members and fits."""
 
 import os
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ from torch_modal.geometry.vectors import norm, pick
 from torch_modal.inbetween.settings import Objective, Preset, Solver, settings
 from torch_modal.keyframes.check import check_keyframes
 from torch_modal.layers.blend import Blend
-from torch_modal.modes.basis import ModalBasis, check_bases
+from torch_modal.modes.basis import ModalBasis, as_bases
 from torch_modal.statistics.components import Components
 from torch_modal.statistics.fit import Fitted, fit
 from torch_modal.statistics.variation import Variation
@@ -28,19 +28,17 @@ from torch_modal.times import Times
 # Range of sizes for which squares of lengths and of areas are normal numbers in float32.
 _FLOAT32_SIZES = 1e-3, 1e6
 
-# Largest number of key-frames whose modes span the mean.
-_BASES_OF_MEAN = 6
-
 
 class ShapeSpace:
-    """Key-frames of one connectivity with their modes; random shapes are drawn from it.
+    """Key-frames of one connectivity; random shapes are drawn from it.
 
     Results that take long and that not every use needs (in-betweens of a pair, scales of the modes of a key-frame, the
     variation of the key-frames) are computed once, when they are needed. Copies and pickles leave them out, so that
     worker processes can receive a space.
 
     Args:
-        bases: The basis of each key-frame (:func:`torch_modal.extract_bases`).
+        bases: The key-frames, *shape* ``(K, V, 3)``; or their bases (:func:`torch_modal.extract_bases`), which
+            :class:`RandomModalDeformation` and ``preset="modal"`` need.
         faces: Vertex indices. *Shape:* ``(F, 3)``.
         preset: Preset of the in-betweens, as for :class:`torch_modal.InBetween`.
         objective: Their objective; replaces the preset's.
@@ -63,7 +61,7 @@ class ShapeSpace:
     @outside_inference_mode
     def __init__(
         self,
-        bases: ModalBasis | Sequence[ModalBasis],
+        bases: ModalBasis | Sequence[ModalBasis] | Tensor,
         faces: Tensor,
         *,
         preset: Preset = "fast",
@@ -76,7 +74,7 @@ class ShapeSpace:
         cyclic: bool = False,
         contact: bool | None = None,
     ) -> None:
-        self.bases = [basis.to("cpu") for basis in check_bases(bases)]
+        self.bases = [basis.to("cpu") for basis in as_bases(bases)]
         # Checks and repairs the faces.
         self.faces = check_keyframes([self.bases[0].reference.double()], faces, warn=False).faces.cpu()
         self.settings = settings(preset, objective, solver, contact=contact)
@@ -143,7 +141,13 @@ class ShapeSpace:
         return self._made.get(device, lambda: Reconstruction(self._keyframes[0], self.faces).to(device))
 
     def mode_scales(self, index: int) -> Tensor:
-        """Scales of the modes of a key-frame (:func:`~torch_modal.data.strain.mode_scales`). *Shape:* ``(k,)``."""
+        """Scales of the modes of a key-frame (:func:`~torch_modal.data.strain.mode_scales`). *Shape:* ``(k,)``.
+
+        Raises:
+            ValueError: The space was made of key-frames, without modes.
+        """
+        if not self.n_modes:
+            raise ValueError("a space of key-frames has no modes: make it of bases, extract_bases(keyframes, faces)")
         return self._made.get(index, lambda: mode_scales(self.bases[index], self.faces))
 
     # ----------------------------------------------------------------------------------------------------- statistics
@@ -159,9 +163,7 @@ class ShapeSpace:
         """
         even = torch.full((len(self),), 1 / len(self), dtype=torch.float64)
         objective, solver = self.settings
-        # Modes of a few key-frames suffice; more cost time and hardly change the mean.
-        few = self.bases[:: max(1, len(self) // _BASES_OF_MEAN)][:_BASES_OF_MEAN]
-        blend = Blend(few, self.faces, objective=replace(objective, contact=False), solver=solver)
+        blend = Blend(self.bases, self.faces, objective=replace(objective, contact=False), solver=solver)
         return blend(self._keyframes, even if weights is None else weights.to(even))
 
     def components(self, n: int | None = None) -> Components:

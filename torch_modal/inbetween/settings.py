@@ -30,11 +30,13 @@ def _whole(name: str, value: int, lowest: int) -> None:
 
 @dataclass(frozen=True)
 class Objective:
-    r"""The objective, with Eq. 5 for ``d``: Eq. 4, or :math:`(1-t) d(x_a, x) + t d(x_b, x) + \tfrac{1}{2} \rho |a|^2`.
+    r"""The objective, with Eq. 5 for ``d``: :math:`(1-t) d(x_a, x) + t d(x_b, x)`, in modes with a term more, or Eq. 4.
 
     Attributes:
-        space: ``"joint"`` (one shape in the sum of both modal spaces) or ``"paired"`` (Eq. 4 of the paper: one near
-            each key-frame, pulled together, and the mean of both; t = 1/2 only).
+        space: None (no modes: the blend by local rotations, then steps of all vertices), ``"joint"`` (before these
+            steps, one shape in the sum of both modal spaces, with :math:`\tfrac{1}{2} \rho |a|^2`) or ``"paired"``
+            (Eq. 4 of the paper: one near each key-frame, pulled together, and the mean of both; t = 1/2 only). Further
+            terms act through modes: with them, None is ``"joint"`` (:attr:`modal_space`).
         alpha: Stretching stiffness of Eq. 5: a number, or a tensor or parameter whose last dimension counts the edges,
             or is 1, and whose others broadcast against the samples. *Shape:* ``()``, ``(..., E)`` or ``(..., 1)``.
         beta: Bending stiffness, likewise with the hinges. *Shape:* ``()``, ``(..., H)`` or ``(..., 1)``.
@@ -47,13 +49,13 @@ class Objective:
             shapes jump.
         coarse_faces: Faces of the mesh that the energy is evaluated on in the modal space.
         contact: True to keep parts from passing through each other (docs/contact.md). It needs the extra
-            ``contact``, and the joint space.
+            ``contact``.
 
     Raises:
         ValueError: A choice that does not exist, or a number out of range.
     """
 
-    space: Literal["joint", "paired"] = "joint"
+    space: Literal["joint", "paired"] | None = None
     alpha: float | Tensor = ALPHA
     beta: float | Tensor = BETA
     gamma: float | Tensor = GAMMA
@@ -64,15 +66,21 @@ class Objective:
     contact: bool = False
 
     def __post_init__(self) -> None:
-        _choice("space", self.space, ("joint", "paired"))
+        if self.space is not None:
+            _choice("space", self.space, ("joint", "paired"))
         _whole("coarse_faces", self.coarse_faces, 4)
         if not 0 <= self.anchor < math.inf:
             raise ValueError(f"anchor is a finite number, 0 or more; got {self.anchor!r}")
         if self.contact and self.space == "paired":
-            raise ValueError("contact needs one shape for each in-between: space='joint', not 'paired'")
+            raise ValueError("contact needs one shape for each in-between; space='paired' has two")
         wrong = [term for term in self.terms if not isinstance(term, Term)]
         if wrong:
             raise ValueError(f"terms holds a {type(wrong[0]).__name__}; each is an instance of torch_modal.Term")
+
+    @property
+    def modal_space(self) -> Literal["joint", "paired"] | None:
+        """The modal space that is minimised in, if any."""
+        return self.space or ("joint" if self.terms else None)
 
     def all_terms(self) -> list[Term]:
         """The terms of Eq. 5 and the further terms."""
@@ -93,8 +101,7 @@ class Solver:
         unconverged: What happens when samples did not converge: ``"warn"`` warns and lets no gradient flow through
             their amplitudes, ``"raise"`` raises where gradients are recorded. With ``gradient="unroll"`` only ``solve``
             tells.
-        local_steps: Newton steps of all vertices on the fine mesh after the modal solve, for what the modes cannot
-            reach: fingertips, hooves, creases. Gradients go through them; they cost memory in proportion to V.
+        local_steps: Newton steps of all vertices. Gradients go through them; they cost memory in proportion to V.
         polish: Further steps on the fine mesh, each four times as long; two come within 2 % of the optimum.
         regions: In the paired space, the segments that are interpolated once more on the fine mesh, the rest fixed:
             of 24, the worst reached by the modes (section 3.2 of the paper). They are chosen once, by the references of
@@ -134,11 +141,12 @@ class Settings(NamedTuple):
     solver: Solver
 
 
-Preset = Literal["accurate", "fast", "paper"]
+Preset = Literal["accurate", "fast", "modal", "paper"]
 
 PRESETS = {
     "accurate": Settings(Objective(), Solver()),
-    "fast": Settings(Objective(anchor=30_000.0, coarse_faces=300), Solver(tolerance=1e-5, local_steps=0)),
+    "fast": Settings(Objective(), Solver(local_steps=0)),
+    "modal": Settings(Objective(space="joint"), Solver()),
     "paper": Settings(Objective(space="paired"), Solver(max_steps=10, local_steps=0, regions=8)),
 }
 """The presets; docs/layer.md compares them."""
@@ -163,9 +171,9 @@ def settings(
     objective, solver = objective or chosen.objective, solver or chosen.solver
     objective = replace(objective, **changes) if changes else objective
     solver = solver if regions is None else replace(solver, regions=regions)
-    if objective.space == "joint" and ("mu" in changes or solver.regions):
+    if objective.modal_space != "paired" and ("mu" in changes or solver.regions):
         what = "mu weighs the similarity" if "mu" in changes else f"regions={solver.regions} are interpolated"
-        raise ValueError(f"{what} of the two shapes of Eq. 4; the joint space has one: preset='paper' has two")
+        raise ValueError(f"{what} of the two shapes of Eq. 4, which only preset='paper' has")
     if objective.contact:
         require_contact()
     return Settings(objective, solver)

@@ -31,15 +31,14 @@ POLISH_PRODUCTS = 20
 
 
 class InBetweenSolver(nn.Module):
-    r"""Shapes of least :math:`\sum_k w_k\, d(x_k, x)` in the sum of the modal spaces of some bases.
+    r"""Shapes of little :math:`\sum_k w_k\, d(x_k, x)`: a blend by local rotations, perhaps a modal solve, local steps.
 
     The result depends on the key-frames and their weights as on a set of weighted points: not on their order, nor on
     key-frames without a weight, nor on whether one stands there twice with half of its weight.
 
     Args:
         references: Of the bases, float64 on the CPU. *Shape:* ``(K, V, 3)``.
-        modes: Of the bases; without any, the shapes are the base and the steps of all vertices alone. *Shape of each:*
-            ``(k, V, 3)``.
+        modes: Of the bases, if the objective has a modal space, or contact. *Shape of each:* ``(k, V, 3)``.
         mesh: The caller's mesh.
         terms: The terms of the energy, Eq. 5 first; the layer owns them.
         objective: What is minimised.
@@ -61,8 +60,9 @@ class InBetweenSolver(nn.Module):
         self.alignment = KeyframeAlignment(references, mesh.connectivity, backend)
         self.fine = backend.fine_energy(mesh, terms)
         self.distortion = backend.distortion(mesh, Energy(mesh, others) if others else None)
-        joint = objective.space == "joint"
-        self.blend = RotationBlend(mesh.connectivity, self.alignment.references, backend) if joint else None
+        paired, self.modal = objective.modal_space == "paired", objective.modal_space is not None
+        self.blend = None if paired else RotationBlend(mesh.connectivity, self.alignment.references, backend)
+        #: The space of the modal solve, or of the displacements that separate contacts.
         self.space: Any = self._space(modes, objective) if any(len(each) for each in modes) else None
         self.local: LocalInterpolation | None = None
         if solver.regions and isinstance(self.space, PairedSpace):
@@ -75,9 +75,9 @@ class InBetweenSolver(nn.Module):
         aligned_modes = [basis @ rotation.mT for basis, rotation in zip(modes, rotations, strict=True)]
         coarse = CoarseMesh(alignment.references, self.mesh, objective.coarse_faces, alignment.weights, aligned_modes)
         # The paired space, and steps that are unrolled, are differentiated like any other expression: by torch.
-        by_kernels = objective.space == "joint" and self.solver.gradient == "implicit"
+        by_kernels = self.blend is not None and self.solver.gradient == "implicit"
         args = coarse, self.fine, self.backend if by_kernels else TorchBackend()
-        if objective.space == "joint":
+        if self.blend is not None:
             return JointSpace(*args, elastic_subspace(aligned_modes, alignment, coarse), objective.anchor)
         first, second = (JointSpace(*args, elastic_subspace([basis], alignment, coarse)) for basis in aligned_modes)
         return PairedSpace(first, second)
@@ -99,7 +99,7 @@ class InBetweenSolver(nn.Module):
         solution = self.minimise_amplitudes(base, rests, samples.mu, usable)
         if self.blend is None:
             return self.finish_paired(rests, solution, pose)
-        x = base if self.space is None else self.space.lift(solution.amplitudes, base)
+        x = self.space.lift(solution.amplitudes, base) if self.modal else base
         x = self.relax(x, rests)
         # No shape is better for being far from a key-frame with a weight below zero.
         compared = rests._replace(weights=weights.clamp_min(0))
@@ -121,7 +121,7 @@ class InBetweenSolver(nn.Module):
 
     def minimise_amplitudes(self, base: Tensor, rests: RestShapes, mu: Tensor, usable: Tensor) -> Solution:
         """Amplitudes of least energy in the modal space. *Shape:* of ``mu`` and ``usable`` ``(B,)``."""
-        if self.space is None:
+        if not self.modal:
             return trivial_solution(base, usable)
         arguments = self.space, self.space.place(base, rests, mu), usable, self.solver.max_steps, self.solver.tolerance
         if self.solver.gradient == "unroll":

@@ -1,5 +1,6 @@
 """The common part of all layers of in-betweens: bases, settings, the solver, and the border."""
 
+import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
@@ -9,16 +10,16 @@ from torch import Tensor, nn
 from torch_modal.arrays import FloatArray
 from torch_modal.autograd import full_precision, is_eager, outside_inference_mode, require_numbers
 from torch_modal.contact.in_between import ContactSolver
-from torch_modal.elastic.term import Mesh, register_weight
+from torch_modal.elastic.term import Mesh, Term, register_weight
 from torch_modal.elastic.volume import encloses
 from torch_modal.geometry.bodies import bodies
 from torch_modal.geometry.canonical import own_order
 from torch_modal.inbetween.results import InBetweenResult, Samples, join_bodies
 from torch_modal.inbetween.settings import Settings, expand_to_samples, stiffnesses
 from torch_modal.inbetween.solver import InBetweenSolver
-from torch_modal.keyframes.arrays import as_faces, as_positions, check_tensor
+from torch_modal.keyframes.arrays import as_faces, check_tensor
 from torch_modal.keyframes.check import check_surface
-from torch_modal.modes.basis import ModalBasis, check_bases
+from torch_modal.modes.basis import ModalBasis, as_bases
 from torch_modal.threads import alone, by_chunks
 
 
@@ -39,18 +40,28 @@ Bases = ModalBasis | Sequence[ModalBasis | BasisBuffers] | Tensor | FloatArray |
 """Bases of one connectivity, or key-frames without modes, *shape* ``(K, V, 3)``."""
 
 
-def basis_buffers(bases: Bases) -> list[BasisBuffers]:
-    """The buffers of each basis, or of key-frames, whose modes are none.
+def basis_buffers(bases: Bases, required: bool, kept: bool = False) -> list[BasisBuffers]:
+    """The buffers of each basis, or of key-frames, which have no modes.
+
+    Args:
+        bases: Bases or key-frames.
+        required: Whether modes are minimised in.
+        kept: Whether modes serve for something else where there are some. Otherwise they are left out.
 
     Raises:
-        ValueError: There is nothing, or neither bases of one mesh nor key-frames.
+        ValueError: There is nothing, neither bases of one mesh nor key-frames, or there are no modes where required.
     """
-    several: list[Any] = list(bases) if isinstance(bases, Iterable) else [bases]
-    if several and not any(hasattr(basis, "modes") for basis in several):
-        x = as_positions(several)
-        check_tensor("key-frames without modes", x, "K", "V", 3)
-        return [BasisBuffers(shape, shape.new_zeros(0, *shape.shape)) for shape in x]
-    return [b if isinstance(b, BasisBuffers) else BasisBuffers(b.reference, b.modes) for b in check_bases(several)]
+    n = None if required or kept else 0
+    buffers = [
+        basis if isinstance(basis, BasisBuffers) else BasisBuffers(basis.reference, basis.modes[:n])
+        for basis in as_bases(bases)
+    ]
+    if required and not any(len(each.modes) for each in buffers):
+        raise ValueError(
+            'preset="modal" and "paper", and energy terms of your own, act through modes, and there are none: pass '
+            'bases (tm.extract_bases) instead of key-frames, or take preset="accurate" or "fast" without such terms'
+        )
+    return buffers
 
 
 class PreciseModule(nn.Module):
@@ -107,7 +118,7 @@ class PreciseModule(nn.Module):
 
 
 class InBetweenLayer(PreciseModule):
-    """A layer that solves in-betweens in the modal spaces of its bases (:func:`basis_buffers`)."""
+    """A layer that solves in-betweens of shapes near the references of its bases (:func:`basis_buffers`)."""
 
     terms: Any
     cores: Any
@@ -119,6 +130,8 @@ class InBetweenLayer(PreciseModule):
         super().__init__()
         self.objective, self.solver = chosen
         self.terms = nn.ModuleList(self.objective.all_terms())
+        if self.objective.modal_space is None:
+            _warn_of_stiffness(self.terms)
         register_weight(self, "mu", self.objective.mu)
         self.bases = nn.ModuleList(bases)
         self.faces = torch.from_numpy(as_faces(faces))
@@ -137,7 +150,7 @@ class InBetweenLayer(PreciseModule):
         self.faces = torch.tensor(connectivity.faces)
         chosen, several = self.objective, [(slice(None), connectivity)]
         numbers = all(torch.as_tensor(term.stiffness).shape[-1:] in ((), (1,)) for term in self.terms)
-        if self.separate and chosen.space == "joint" and numbers and not (chosen.contact or chosen.terms):
+        if self.separate and chosen.space != "paired" and numbers and not (chosen.contact or chosen.terms):
             several = bodies(torch.stack(references).numpy(), connectivity)
         #: Vertices of each body, and its solver.
         self.vertices, self.cores = [vertices for vertices, _ in several], nn.ModuleList()
@@ -146,7 +159,7 @@ class InBetweenLayer(PreciseModule):
         kind = ContactSolver if chosen.contact else InBetweenSolver
         for vertices, mesh in several:
             shapes, moves = torch.stack(references)[:, vertices], [each[:, vertices] for each in modes]
-            if chosen.space == "joint":  # nothing depends on the caller's order
+            if chosen.space != "paired":  # nothing depends on the caller's order
                 order = own_order([x.numpy() for x in shapes], mesh.faces)
                 shapes, moves = shapes[order], [moves[i] for i in order]
             if len(several) > 1:  # without the modes of other bodies
@@ -188,3 +201,14 @@ class InBetweenLayer(PreciseModule):
     def stiffness_of(self, like: Tensor, lead: torch.Size, body: int = 0) -> list[Tensor]:
         """Stiffnesses of a body in a flat batch, of each term. *Shape of each:* ``(B, M)`` or ``(B, 1)``."""
         return stiffnesses(self.terms, self.core.fine.energy, like, lead, self.encloses[body])
+
+
+def _warn_of_stiffness(terms: Iterable[Term]) -> None:
+    """Warn of stiffnesses of single elements, or to be learned, where only the local steps depend on them."""
+    values = [torch.as_tensor(term.stiffness) for term in terms]
+    if any(value.requires_grad or value.shape[-1:] not in ((), (1,)) for value in values):
+        warnings.warn(
+            'stiffnesses act on the local steps alone, which reach a few edges far: preset="modal" minimises with them',
+            UserWarning,
+            stacklevel=4,
+        )

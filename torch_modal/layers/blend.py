@@ -22,7 +22,7 @@ SUM_TOLERANCE = 1e-5
 
 
 class Blend(InBetweenLayer):
-    r"""Shapes in between several key-frames, by weights: the minimiser of :math:`\sum_k w_k\, d(x_k, x)`.
+    r"""Shapes in between several key-frames, by weights: of little :math:`\sum_k w_k\, d(x_k, x)`.
 
     ``d`` is Eq. 5. The key-frames may be any shapes of this connectivity near those that the bases were made from, as
     many or as few as are wanted. Their order does not matter, nor do key-frames of weight 0. Two key-frames of a layer
@@ -33,10 +33,9 @@ class Blend(InBetweenLayer):
     Precision, warnings and statuses are as for :class:`InBetween`.
 
     Args:
-        bases: The bases, one or more, in any order (:func:`torch_modal.extract_bases`). Instead, key-frames,
-            *shape* ``(K, V, 3)``, as for :class:`InBetween`.
+        bases: Key-frames, one or more, in any order, *shape* ``(K, V, 3)``; or bases, as for :class:`InBetween`.
         faces: Vertex indices. *Shape:* ``(F, 3)``.
-        preset: ``"accurate"`` or ``"fast"``, as for :class:`InBetween`.
+        preset: ``"accurate"``, ``"fast"`` or ``"modal"``, as for :class:`InBetween`.
         objective: What is minimised, instead of the preset's objective.
         solver: How it is solved, instead of the preset's solver.
 
@@ -56,8 +55,8 @@ class Blend(InBetweenLayer):
     ) -> None:
         chosen = settings(preset, objective, solver)
         if chosen.objective.space == "paired" or chosen.objective.contact:
-            raise ValueError("contact and space='paired' are of two key-frames; a blend has space='joint' alone")
-        several = basis_buffers(bases)
+            raise ValueError("contact and space='paired' are of two key-frames; a blend has neither")
+        several = basis_buffers(bases, chosen.objective.modal_space is not None)
         super().__init__(several * 2 if len(several) == 1 else several, faces, chosen)
 
     @disable_compile

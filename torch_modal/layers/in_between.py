@@ -11,24 +11,24 @@ from torch_modal.layers.base import Bases, InBetweenLayer, basis_buffers
 
 
 class InBetween(InBetweenLayer):
-    r"""Shapes :math:`x(t)` that are cheapest to reach from both key-frames, in a space of vibration modes.
+    r"""Shapes :math:`x(t)` that are cheap to reach from both key-frames: local rotations, then steps of all vertices.
 
     The key-frames may be any shapes of this connectivity near those that the bases were made from. They are given in
     the caller's coordinates and units, and so is the result. A rigid motion between them is taken out first and then
     followed along its geodesic; a rigid motion of both moves the result along. At half a turn, where both senses are
     equally short, one is taken.
 
-    Gradients reach the key-frames, the times, ``mu`` and the stiffnesses. The modes are constants.
+    Gradients reach the key-frames, the times, ``mu`` and the stiffnesses. Modes, with ``preset="modal"`` and
+    ``"paper"``, are constants.
 
     It computes in its own dtype, float64 unless ``.to(torch.float32)`` says otherwise, and never below float32: under
     ``autocast``, ``.half()`` and ``.bfloat16()`` it stays there. Results have the dtype of the key-frames.
 
     Args:
-        bases: Two bases (:func:`torch_modal.extract_bases`), or one that serves for both ends. Instead,
-            key-frames, *shape* ``(2, V, 3)``: then nothing is minimised in modal space, and the shapes are the blend by
-            local rotations with the steps of all vertices alone.
+        bases: Key-frames, *shape* ``(2, V, 3)``, or one that serves for both ends, ``(1, V, 3)``. Instead, their bases
+            (:func:`torch_modal.extract_bases`), which ``preset="modal"``, ``"paper"`` and further terms need.
         faces: Vertex indices. *Shape:* ``(F, 3)``.
-        preset: ``"accurate"``, ``"fast"`` or ``"paper"``: docs/layer.md says what each costs and gives.
+        preset: ``"accurate"``, ``"fast"``, ``"modal"`` or ``"paper"``: docs/layer.md says what each costs and gives.
         objective: What is minimised, instead of the preset's objective.
         solver: How it is solved, instead of the preset's solver.
         contact: True to keep parts from passing through each other; overrides the objective
@@ -51,15 +51,13 @@ class InBetween(InBetweenLayer):
         solver: Solver | None = None,
         contact: bool | None = None,
     ) -> None:
-        ends = basis_buffers(bases)
+        chosen = settings(preset, objective, solver, contact=contact)
+        ends = basis_buffers(bases, chosen.objective.modal_space is not None, chosen.objective.contact)
         if not 1 <= len(ends) <= 2:
             raise ValueError(
                 f"an in-between lies between two bases, got {len(ends)}; Path and Blend take more: pass "
                 "[basis_a, basis_b]"
             )
-        chosen = settings(preset, objective, solver, contact=contact)
-        if chosen.objective.space == "paired" and not len(ends[0].modes):
-            raise ValueError("the paired space (Eq. 4) is one of modes; pass bases, not key-frames")
         super().__init__(ends * 2 if len(ends) == 1 else ends, faces, chosen)
 
     @disable_compile
@@ -112,4 +110,4 @@ def _check_times(t: Tensor) -> None:
 
 def _check_half(t: Tensor) -> None:
     if bool((t != 0.5).any()):
-        raise ValueError("the paired space (Eq. 4) is defined at t = 1/2 only; use space='joint' for other times")
+        raise ValueError("the paired space (Eq. 4) is defined at t = 1/2 only; other presets have all times")

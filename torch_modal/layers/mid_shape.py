@@ -16,10 +16,11 @@ class MidShape(nn.Module):
     Args:
         bases: The basis at each end (:func:`torch_modal.extract_bases`), or one that serves for both.
         faces: Vertex indices. *Shape:* ``(F, 3)``.
-        space: ``"joint"`` (one shape in the sum of both spaces) or ``"paired"`` (Eq. 4 of the paper). Default: the
+        space: ``"joint"`` (one shape in the sum of both spaces) or ``"paired"`` (Eq. 4 of the paper), instead of the
             objective's.
         mu: Weight of the similarity of Eq. 4, in the paired space. Default: the objective's.
-        preset: As for :class:`InBetween`; ``"paper"`` is its method, whole: Eq. 4, local interpolation, the mean.
+        preset: As for :class:`InBetween`. ``"modal"``: one shape in the sum of both modal spaces, then steps of all
+            vertices. ``"paper"``: its method, whole: Eq. 4, local interpolation, the mean. Others need no modes.
         objective: What is minimised, instead of the preset's objective.
         solver: How it is solved, instead of the preset's solver.
         regions: Segments that local interpolation takes, in the paired space. Default: the solver's.
@@ -35,7 +36,7 @@ class MidShape(nn.Module):
         space: Literal["joint", "paired"] | None = None,
         mu: float | Tensor | None = None,
         *,
-        preset: Preset = "accurate",
+        preset: Preset = "modal",
         objective: Objective | None = None,
         solver: Solver | None = None,
         regions: int | None = None,

@@ -11,18 +11,23 @@ import torch
 from torch_modal.autograd import as_normal_tensor, outside_inference_mode
 from torch_modal.geometry.rigid import infinitesimal_motions
 from torch_modal.io.tensors import TensorFile, write_tensors
+from torch_modal.keyframes.arrays import as_positions, check_tensor
 
 FORMAT = "torch_modal.basis"
 VERSION = "2"
 
 
-def check_bases(bases: Any) -> "list[ModalBasis]":
-    """One basis or several of one mesh, as a list.
+def as_bases(bases: Any) -> "list[ModalBasis]":
+    """One basis or several of one mesh as a list; key-frames, *shape* ``(K, V, 3)``, as bases without modes.
 
     Raises:
         ValueError: There are none, they are something else, or belong to meshes of different sizes.
     """
     several = list(bases) if isinstance(bases, Iterable) else [bases]
+    if several and not any(hasattr(basis, "modes") for basis in several):
+        keyframes = as_positions(several).detach()
+        check_tensor("key-frames without modes", keyframes, "K", "V", 3)
+        return [ModalBasis(x, x.new_zeros(0), x.new_zeros(0, *x.shape), x.new_zeros(6)) for x in keyframes]
     others = sorted({type(basis).__name__ for basis in several if not hasattr(basis, "modes")})
     if others or not several:
         raise ValueError(f"bases, one or more, come from extract_bases; got {', '.join(others) or 'none'}")

@@ -1,5 +1,6 @@
 """Motion through many key-frames: smooth in time, at any time, differentiable."""
 
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
 
@@ -38,10 +39,10 @@ class Path(PreciseModule):
     """Shapes at any time of a motion through key-frames.
 
     With three key-frames or more, the rotations and sizes of triangles and the rigid motion follow splines
-    (:mod:`torch_modal.motion.spline`): nothing is minimised, and no modes are needed, unless there are contacts or
-    terms beyond Eq. 5. Velocities are continuous at the key-frames, which are reproduced exactly. They are limited to
-    three times the slower one of both sides, triangle by triangle, so that what stops does stop. The ends have no
-    acceleration. Two key-frames alone give the shapes of :class:`torch_modal.InBetween`.
+    (:mod:`torch_modal.motion.spline`): nothing is minimised unless there are contacts or terms beyond Eq. 5. Velocities
+    are continuous at the key-frames, which are reproduced exactly. They are limited to three times the slower one of
+    both sides, triangle by triangle, so that what stops does stop. The ends have no acceleration. Two key-frames alone
+    give the shapes of :class:`torch_modal.InBetween`.
 
     Args:
         bases: The key-frames, *shape* ``(K, V, 3)``, or, where modes are needed or wanted, the basis of each
@@ -52,7 +53,7 @@ class Path(PreciseModule):
         cyclic: True where the last key-frame leads on to the first. Times are then taken modulo the period.
         smooth: False treats each pair of key-frames alone. A function is another path scheme:
             :data:`torch_modal.motion.cubics.Scheme` (docs/extending.md).
-        preset: As for :class:`torch_modal.InBetween`; not ``"paper"``, which knows the middle of a pair only.
+        preset: As for :class:`torch_modal.InBetween`; not ``"paper"``, which has the middle of a pair only.
         objective: What is minimised, instead of the preset's objective. With further terms, the shapes on the spline
             are minimised with these, each compared with itself.
         solver: How it is solved, instead of the preset's solver.
@@ -85,13 +86,16 @@ class Path(PreciseModule):
         contact: bool | None = None,
     ) -> None:
         super().__init__()
-        buffers = basis_buffers(bases)
-        n = len(buffers)
-        if n < 2:
-            raise ValueError(f"a path needs two key-frames or more, got {n}")
         objective, self.solver = settings(preset, objective, solver, contact=contact)
         if objective.space == "paired":
-            raise ValueError("the paired space (Eq. 4) knows the middle of a pair only; a path needs space='joint'")
+            raise ValueError("the paired space (Eq. 4) has the middle of a pair only; a path needs another preset")
+        several = list(bases) if isinstance(bases, Iterable) else [bases]
+        n = len(several)
+        if n < 2:
+            raise ValueError(f"a path needs two key-frames or more, got {n}")
+        self.cyclic, self.smooth = cyclic, bool(smooth) and (n > 2 or cyclic)
+        in_modes = objective.modal_space is not None and not self.smooth
+        buffers = basis_buffers(several, in_modes or bool(objective.terms), objective.contact)
         #: True where shapes are pushed apart: per interval, not per time as in a layer, to stay continuous.
         self.contact = objective.contact
         self.objective = replace(objective, contact=False)
@@ -102,7 +106,6 @@ class Path(PreciseModule):
         #: The key-frames of each interval.
         self.pairs = [(i, (i + 1) % n) for i in range(len(self.times) - 1)]
         self.faces = torch.from_numpy(as_faces(faces))
-        self.cyclic, self.smooth = cyclic, bool(smooth) and (n > 2 or cyclic)
         #: The path scheme; None for the default.
         self.scheme = smooth if callable(smooth) else None
         options: dict[str, Any] = {"objective": self.objective, "solver": self.solver}

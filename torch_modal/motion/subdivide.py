@@ -50,10 +50,11 @@ def subdivide(
 ) -> Tensor:
     """Fill a sequence of key-frames with physically plausible shapes.
 
-    With three key-frames or more, the result follows a :class:`torch_modal.Path`, smooth in time: a spline, which
-    needs no modes unless there are contacts or terms beyond Eq. 5. Two key-frames give the shapes of
-    :class:`torch_modal.InBetween`. With ``preset="paper"`` each level inserts a mid-shape between all neighbours, which
-    then serves as a key-frame of the next level with the modes of the nearest key-frame (section 3.3 of the paper).
+    With three key-frames or more, the result follows a :class:`torch_modal.Path`, smooth in time. Two key-frames give
+    the shapes of :class:`torch_modal.InBetween`. Neither needs modes unless there are contacts or terms beyond Eq. 5,
+    or with ``preset="modal"`` for pairs. With ``preset="paper"`` each level inserts a mid-shape between all neighbours,
+    which then serves as a key-frame of the next level with the modes of the nearest key-frame (section 3.3 of the
+    paper).
 
     Args:
         keyframes: Vertex positions, two key-frames or more, in any units. *Shape:* ``(K, V, 3)``.
@@ -61,16 +62,14 @@ def subdivide(
         levels: How often the number of intervals doubles.
         bases: The basis of each key-frame; or a function that makes them of key-frames and faces, where modes are
             needed. Default: :func:`torch_modal.extract_bases`, cached on disk.
-        n_modes: Modes of each key-frame where the bases are not given. 0: none; mid-shapes are then the blend by local
-            rotations, with the steps of all vertices alone.
+        n_modes: Modes of each key-frame where modes are needed and the bases are not given.
         cyclic: True where the last key-frame leads on to the first. The sequence then ends one frame before it would
             repeat the first key-frame.
         n_frames: Number of frames of the result, evenly in time. The key-frames keep their places in it
             (:func:`keyframe_places`): frames are even within each interval. Not with ``preset="paper"``. Default:
             ``2**levels`` to each interval.
         times: When the key-frames are, as for :class:`torch_modal.Path`. Default: evenly.
-        smooth: False treats each pair of key-frames alone. Default: True where there are three key-frames or more, in
-            the joint space.
+        smooth: False treats each pair of key-frames alone. Default: True where there are three key-frames or more.
         preset: As for :class:`torch_modal.InBetween`.
         objective: What is minimised, instead of the preset's objective.
         solver: How it is solved, instead of the preset's solver.
@@ -110,10 +109,11 @@ def subdivide(
     chosen = settings(preset, objective, solver, regions, contact=contact, mu=mu)
     recursive = chosen.objective.space == "paired"
     if recursive and (smooth or n_frames is not None):
-        raise ValueError("the paired space (Eq. 4) knows the middle of a pair only: leave out smooth and n_frames")
+        raise ValueError("the paired space (Eq. 4) has the middle of a pair only: leave out smooth and n_frames")
     smooth = not recursive and n_keys > 2 if smooth is None else smooth
-    needs_modes = chosen.objective.contact or bool(chosen.objective.terms) or not (smooth and n_keys > 2)
-    if made is None and n_modes and needs_modes:
+    objective = chosen.objective
+    in_modes = bool(objective.terms) or (objective.modal_space is not None and not (smooth and n_keys > 2))
+    if made is None and n_modes and (in_modes or objective.contact):
         if callable(bases):
             made = bases(keyframes, faces)
         else:
