@@ -12,8 +12,7 @@ Torch's private names are used here alone, and only where no public one exists:
 """
 
 from collections import OrderedDict
-from collections.abc import Callable, Hashable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Hashable, Sequence
 from functools import partial, wraps
 from typing import Any, ParamSpec, TypeVar
 
@@ -168,19 +167,6 @@ class Recent:
         return self._kept[key]  # type: ignore[no-any-return]
 
 
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """One thread for torch: sums are then split the same way everywhere, and give the same bits."""
-    threads = torch.get_num_threads()
-    if threads > 1:  # MKL would be slower for some time after each setting, also of the same number
-        torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        if threads > 1:
-            torch.set_num_threads(threads)
-
-
 def as_normal_tensor(x: Tensor) -> Tensor:
     """The tensor, or a copy if it is an inference tensor; within :func:`outside_inference_mode`."""
     return x.clone() if x.is_inference() else x
@@ -300,15 +286,6 @@ def apply_transpose(
         )
     known = (torch.zeros_like(x) if tangent is None else tangent for x, tangent in zip(inputs, tangents, strict=True))
     return torch.func.vjp(lambda to: tuple(linear(to)), zeros)[1](tuple(known))[0]
-
-
-def broadcast_shapes(*shapes: Sequence[int]) -> torch.Size:
-    """``torch.broadcast_shapes`` without its import of SymPy, which takes a third of a second.
-
-    Raises:
-        RuntimeError: They do not broadcast.
-    """
-    return torch.broadcast_tensors(*(torch.empty((), device="meta").expand(shape) for shape in shapes))[0].shape
 
 
 def merge_vmapped(n: int, in_dims: Sequence[int | None], tensors: Sequence[Any]) -> list[Tensor]:

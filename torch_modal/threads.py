@@ -19,7 +19,7 @@ from threadpoolctl import OpenBLASController, ThreadpoolController
 from torch import Tensor
 
 from torch_modal import trees
-from torch_modal.autograd import current_dispatch_mode, is_eager, one_thread, within_transforms
+from torch_modal.autograd import current_dispatch_mode, is_eager, within_transforms
 
 Result = TypeVar("Result")
 
@@ -66,13 +66,16 @@ def n_threads() -> int:
 @contextmanager
 def alone() -> Iterator[None]:
     """One thread for torch, so that no bit depends on their number, and for :func:`run` as many as torch had."""
-    before = _HERE.n_threads
-    _HERE.n_threads = n_threads()
+    before, threads = _HERE.n_threads, torch.get_num_threads()
+    _HERE.n_threads = before or threads
+    if threads > 1:  # MKL would be slower for some time after each setting, also of the same number
+        torch.set_num_threads(1)
     try:
-        with one_thread():
-            yield
+        yield
     finally:
         _HERE.n_threads = before
+        if threads > 1:
+            torch.set_num_threads(threads)
 
 
 class _OneBlasThread:

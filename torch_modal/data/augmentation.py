@@ -194,7 +194,7 @@ class ShapeAugmentation(nn.Module):
         out = self.transform(batch, self.params, space, pool)
         if "normals" in named:
             if space is None:
-                raise ValueError("normals need faces: pass space=ShapeSpace(keyframes, faces) when it is made or called")
+                raise ValueError("normals need faces: pass space=ShapeSpace(keyframes, faces), here or before")
             normals = vertex_normals(out.shapes, space.faces)
         results = [normals if name == "normals" else getattr(out, name) for name in named]
         if single and self.keepdim:

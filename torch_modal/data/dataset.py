@@ -10,13 +10,14 @@ import torch
 from torch import Tensor
 from torch.utils.data import BatchSampler, Dataset, Sampler
 
-from torch_modal.autograd import Recent, one_thread
+from torch_modal.autograd import Recent
 from torch_modal.data.augmentation import AugmentationSequential, ShapeAugmentation
 from torch_modal.data.random_transforms import RandomInBetween
 from torch_modal.data.shape_batch import ShapeBatch, check_labels
 from torch_modal.data.space import ShapeSpace
 from torch_modal.data.stored import StoredSet, find_sets
 from torch_modal.geometry.vectors import vertex_normals
+from torch_modal.threads import alone
 
 Labels = Mapping[str, Tensor]
 Sample = dict[str, Any]
@@ -116,7 +117,7 @@ class ShapeDataset(Dataset[Sample]):
             if not -len(self) <= index < len(self):
                 raise IndexError(f"index {index} of {len(self)} samples")
             by_set.setdefault(index % len(self) // self.samples_per_set, []).append(place)
-        with torch.no_grad(), one_thread():
+        with torch.no_grad(), alone():
             for number, places in by_set.items():
                 of_set = self._make_samples(number, [indices[place] % len(self) for place in places])
                 samples.update(zip(places, of_set, strict=True))

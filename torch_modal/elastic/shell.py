@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from torch_modal.autograd import broadcast_shapes, outside_inference_mode
+from torch_modal.autograd import outside_inference_mode
 from torch_modal.elastic.bend import SquaredBend
 from torch_modal.elastic.energy import Energy, Reference, Rest
 from torch_modal.elastic.stretch import Stretch
@@ -106,7 +106,7 @@ class ShellEnergy(nn.Module):
             (factor * weights).sqrt() * summand.term.difference(summand.measures(summand.edge_vectors(rows)), measures)
             for summand, measures, weights, factor in zip(self.energy.parts, *rest, self.stiffness, strict=True)
         ]
-        lead = broadcast_shapes(*(summand.shape[:-1] for summand in parts))
+        lead = torch.broadcast_tensors(*(summand[..., :1] for summand in parts))[0].shape[:-1]
         return torch.cat([summand.expand(*lead, -1) for summand in parts], -1)
 
     def forward(self, x: Tensor, x_rest: Tensor) -> Tensor:

@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 
 from torch_modal.arrays import IntArray
-from torch_modal.autograd import broadcast_shapes
 from torch_modal.errors import MeshError
 
 LARGEST_UNIT_RATIO = 8.0
@@ -108,8 +107,9 @@ def broadcast_leading(hint: str = "", **leading: torch.Size) -> torch.Size:
     Raises:
         ValueError: They do not broadcast.
     """
-    try:
-        return broadcast_shapes(*leading.values())
+    try:  # torch.broadcast_shapes imports SymPy, which takes a third of a second
+        blank = (torch.empty((), device="meta").expand(shape) for shape in leading.values())
+        return torch.broadcast_tensors(*blank)[0].shape
     except RuntimeError:
         got = ", ".join(f"{name} {tuple(shape)}" for name, shape in leading.items())
         raise ValueError(f"leading dimensions do not broadcast: {got}{hint and '; '}{hint}") from None

@@ -176,7 +176,7 @@ class InBetweenLayer(PreciseModule):
     @property
     def dtype(self) -> torch.dtype:
         """The dtype of the computation."""
-        return self.core.alignment.scale.dtype
+        return self.cores[0].alignment.scale.dtype
 
     @full_precision
     def solve_samples(self, keyframes: Tensor, weights: Tensor, lead: torch.Size) -> InBetweenResult:
@@ -200,7 +200,7 @@ class InBetweenLayer(PreciseModule):
 
     def stiffness_of(self, like: Tensor, lead: torch.Size, body: int = 0) -> list[Tensor]:
         """Stiffnesses of a body in a flat batch, of each term. *Shape of each:* ``(B, M)`` or ``(B, 1)``."""
-        return stiffnesses(self.terms, self.core.fine.energy, like, lead, self.encloses[body])
+        return stiffnesses(self.terms, self.cores[body].fine.energy, like, lead, self.encloses[body])
 
 
 def _warn_of_stiffness(terms: Iterable[Term]) -> None:
