@@ -38,7 +38,10 @@ from timing import limit_threads, timed
 import torch_modal as tm
 from torch_modal.data.samples import load_sample
 
-WORK = ("whole", "no local steps", "fast", "torch alone", "forward and backward", "making a layer")
+WORK = (
+    *("whole", "fast", "modal", "torch alone"),
+    *("forward and backward", "fast, forward and backward", "making a layer"),
+)
 DIVIDED = ("sample creature", "mh-hand", "mh-woman")
 
 
@@ -59,8 +62,8 @@ def layers(case: Case) -> dict[str, Callable[[], tm.InBetween]]:
     bases = case.bases()
     options: dict[str, dict[str, Any]] = {
         "whole": {},
-        "no local steps": {"solver": tm.Solver(local_steps=0)},
         "fast": {"preset": "fast"},
+        "modal": {"preset": "modal"} if "modal" in tm.PRESETS else {},  # the former default
         "torch alone": {"solver": tm.Solver(backend="torch")},
     }
     return {name: partial(tm.InBetween, bases, case.faces, **own) for name, own in options.items()}
@@ -71,14 +74,18 @@ def worker(name: str, answer: str) -> None:
     limit_threads()
     case = all_cases()[name]
     makes, half = layers(case), torch.tensor(0.5, dtype=torch.float64)
-    whole = makes["whole"]()
 
-    def backward() -> torch.Tensor:
+    def backward(layer: tm.InBetween) -> torch.Tensor:
         leaf = case.x_a.clone().requires_grad_()
-        (found,) = torch.autograd.grad(whole(leaf, case.x_b, half).square().sum(), leaf)
+        (found,) = torch.autograd.grad(layer(leaf, case.x_b, half).square().sum(), leaf)
         return found
 
-    found = {"forward and backward": timed(backward)[1], "making a layer": timed(makes["whole"])[1]}
+    whole, fast = makes["whole"](), makes["fast"]()
+    found = {
+        "forward and backward": timed(lambda: backward(whole))[1],
+        "fast, forward and backward": timed(lambda: backward(fast))[1],
+        "making a layer": timed(makes["whole"])[1],
+    }
     for part, make in makes.items():
         layer = make()
         with torch.no_grad():

@@ -143,8 +143,8 @@ def test_import_loads_nothing_heavy() -> None:
     heavy += ["scipy.interpolate", "sympy", "warp"]
     code = (
         "import sys, torch_modal; torch_modal.extract_bases, torch_modal.subdivide, torch_modal.InBetween; "
-        "from torch_modal.autograd import broadcast_shapes; "
-        "assert broadcast_shapes((2, 1), [3], ()) == (2, 3); "
+        "from torch_modal.keyframes.arrays import broadcast_leading; "
+        "assert broadcast_leading(x=(2, 1), y=(3,), t=()) == (2, 3); "
         f"print([name for name in {heavy} if name in sys.modules])"
     )
     command = [sys.executable, "-c", code]
