@@ -83,7 +83,8 @@ class LocalRotations(nn.Module):
         self.register_buffer("faces", torch.tensor(mesh.faces), persistent=False)
         every = [frames_of(x[None], self.faces) for x in references]
         slenderness = reduce(torch.minimum, [x.slenderness for x in every]).squeeze(0)
-        parents, piece = self._tree(_quaternions_from_first(every), slenderness, mesh)
+        quaternions = quaternions_from_first(every)
+        parents, piece = self._tree(quaternions, slenderness, mesh)
         ancestors = [parents]
         while 2 ** len(ancestors) < len(parents):
             ancestors.append(ancestors[-1][ancestors[-1]])
@@ -97,8 +98,8 @@ class LocalRotations(nn.Module):
         self.register_buffer("ancestors", torch.stack(ancestors), persistent=False)
         self.register_buffer("piece", piece, persistent=False)
         self.n_edges, self.n_pieces = len(mesh.edges), int(piece.max()) + 1
-        self._warn_of_tears(_quaternions_from_first(every), mesh)
-        off = self.off_mean(every)
+        self._warn_of_tears(quaternions, mesh)
+        off = self.off_mean(quaternions)
         #: True where parts turn by more than a full turn from each other.
         self.beyond_a_turn = self.turns_beyond(off)
         order = np.lexsort((off, piece))
@@ -205,9 +206,12 @@ class LocalRotations(nn.Module):
         total = torch.bincount(self.piece, self.areas)
         return bool((torch.bincount(self.piece, self.areas * (off > BEYOND)) > PART_BEYOND * total).any())
 
-    def off_mean(self, every: Sequence[Frames]) -> Tensor:
-        """Largest angle of each triangle from the mean of its piece, between any two shapes. *Shape:* ``(F,)``."""
-        winding = 2 * arc(self._from_parents(_quaternions_from_first(every)))
+    def off_mean(self, quaternions: Tensor) -> Tensor:
+        """Largest angle of each triangle from the mean of its piece, between any two shapes.
+
+        *Shape:* of :func:`quaternions_from_first`, ``(4, K, F) -> (F,)``.
+        """
+        winding = 2 * arc(self._from_parents(quaternions))
         for ancestors in self.ancestors:
             winding = winding + pick(winding, ancestors)
         total = torch.bincount(self.piece, self.areas)
@@ -280,7 +284,7 @@ def weights_per_length(mesh: Connectivity, references: Tensor) -> Tensor:
     return 1 / lengths.clamp_min(SHORTEST_PART * lengths.mean())
 
 
-def _quaternions_from_first(every: Sequence[Frames]) -> Tensor:
+def quaternions_from_first(every: Sequence[Frames]) -> Tensor:
     """Quaternions of the rotations from the first shape to each. *Shape:* ``(4, K, F)``."""
     return torch.cat([_quaternion_between(every[0], x) for x in every], 1)
 

@@ -11,7 +11,7 @@ from torch_modal.elastic.backend import TorchBackend
 from torch_modal.elastic.minimise import Solution
 from torch_modal.geometry.canonical import own_order
 from torch_modal.geometry.connectivity import Connectivity
-from torch_modal.geometry.local_rotations import Trajectory, weights_per_length
+from torch_modal.geometry.local_rotations import Trajectory, quaternions_from_first, weights_per_length
 from torch_modal.geometry.poisson import Poisson
 from torch_modal.geometry.rigid import best_rotation, centroid
 from torch_modal.geometry.rotations import exp, log
@@ -108,7 +108,7 @@ class Spline(nn.Module):
         for i in range(1, len(times) - 1):
             ends = references[[i, (i + 1) % n]]
             frames = [frames_of(x[None], first.faces) for x in ends]
-            plain = not first.beyond_a_turn and not first.turns_beyond(first.off_mean(frames))
+            plain = not first.beyond_a_turn and not first.turns_beyond(first.off_mean(quaternions_from_first(frames)))
             if plain:
                 turns = first.quaternions(*frames)[:, 0]
                 plain = bool(((pick(turns, one) * pick(turns, other)).sum(0) >= 0).all())
