@@ -90,9 +90,10 @@ class Distortion(nn.Module):
         pairs = zip(stiffness, (self.edge, self.hinge), strict=False)
         return [values if values.shape[-1] == 1 else values[:, chosen] for values, chosen in pairs]
 
-    def slight(self, stiffness: Sequence[Tensor], like: Tensor) -> Tensor:
+    def visibility_threshold(self, stiffness: Sequence[Tensor], like: Tensor) -> Tensor:
         """The distortion of a shape whose edges are all strained by :data:`VISIBLE_STRAIN`. *Shape:* ``(B,)``."""
-        lengths = norm(edge_vectors_of(like.detach().movedim(-1, 0), self.edges.T)[0]).sum(-1)
+        ends = like.detach()[:, self.edges]
+        lengths = (ends[:, :, 1] - ends[:, :, 0]).norm(dim=-1).sum(-1)
         return self.shares[0] * stiffness[0].detach().mean(-1) * lengths * VISIBLE_STRAIN**2
 
 

@@ -1,6 +1,7 @@
 """Steps of all vertices by kernels, tested against those in torch."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -60,17 +61,13 @@ class KernelFineEnergy(FineEnergy):
         return descend(problem, x.double().contiguous(), products).to(x)
 
 
+@dataclass(frozen=True, eq=False)
 class KernelProblem:
-    """The terms towards a reference, for :func:`torch_modal.elastic.steps.descend`, in float64.
+    """The terms towards a reference, for :func:`torch_modal.elastic.steps.descend`, in float64."""
 
-    Args:
-        kernels: The terms.
-        to: The reference.
-        extra: Other energies.
-    """
-
-    def __init__(self, kernels: KernelEnergy, to: Reference, extra: Sequence[FreeEnergy] = ()) -> None:
-        self.kernels, self.to, self.extra = kernels, to, extra
+    kernels: KernelEnergy
+    to: Reference
+    extra: Sequence[FreeEnergy] = ()
 
     def value(self, x: Tensor) -> Tensor:
         """*Shape:* ``(B, V, 3) -> (B,)``."""
@@ -123,11 +120,12 @@ class KernelProblem:
         return solution, fields, scalars, inverse
 
 
+@dataclass(frozen=True, eq=False)
 class _Relaxation(Operation):
     """Steps of all vertices from shapes, towards the records of a reference."""
 
-    def __init__(self, kernels: KernelEnergy, products: Sequence[int]) -> None:
-        self.kernels, self.products = kernels, products
+    kernels: KernelEnergy
+    products: Sequence[int]
 
     def run(self, kept: list[Any] | None, x: Tensor, *records: Tensor) -> tuple[Tensor, ...]:
         problem = KernelProblem(self.kernels, Reference.of_records(records))

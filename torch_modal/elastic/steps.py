@@ -262,11 +262,11 @@ class FineEnergy(nn.Module):
     ) -> Tensor:
         """Steps of all vertices, never uphill, by :func:`descend`. *Shape:* ``(B, V, 3)``."""
         most = VERTICES_AT_ONCE_OF_CPU if x.device.type == "cpu" else VERTICES_AT_ONCE_OF_GPU
-        parts = []
-        for i in range(0, len(x), max(1, most // x.shape[1])):
-            some = slice(i, i + max(1, most // x.shape[1]))
-            parts.append(self.relax_chunk(x[some], trees.rows(rests, some), products, extra(some, x[some])))
-        return torch.cat(parts)
+        n = max(1, most // x.shape[1])
+        if len(x) <= n:
+            return self.relax_chunk(x, rests, products, extra(slice(None), x))
+        chunks = [slice(i, i + n) for i in range(0, len(x), n)]
+        return torch.cat([self.relax_chunk(x[i], trees.rows(rests, i), products, extra(i, x[i])) for i in chunks])
 
     def relax_chunk(self, x: Tensor, rests: RestShapes, products: Sequence[int], extra: Sequence[FreeEnergy]) -> Tensor:
         """:meth:`relax` of samples that fit into the caches, with their own further energies."""

@@ -44,6 +44,7 @@ class KeyframeAlignment(nn.Module):
     turns: Tensor
     roots: Tensor
     rooted: Tensor
+    stand_in: Tensor
     extent: Tensor
     faces: Tensor
 
@@ -67,6 +68,8 @@ class KeyframeAlignment(nn.Module):
         #: Roots of the weights, and the first reference times these. *Shape:* ``(V,), (3, V)``.
         self.register_buffer("roots", weights.sqrt(), persistent=False)
         self.register_buffer("rooted", (self.reference.mT * self.roots).contiguous(), persistent=False)
+        #: The first reference at the caller's scale, for key-frames without a shape. *Shape:* ``(3, V)``.
+        self.register_buffer("stand_in", (self.reference.mT / scale).contiguous(), persistent=False)
         extent = (self.reference.amax(0) - self.reference.amin(0)).norm()
         #: Diagonal of the bounding box of the first reference.
         self.register_buffer("extent", extent, persistent=False)
@@ -108,7 +111,7 @@ class KeyframeAlignment(nn.Module):
         sizes = (rows.amax(-1) - rows.amin(-1)).norm(dim=-1) * self.scale
         usable = sizes.isfinite() & (sizes > SMALLEST_SIZE * CANONICAL_SIZE)  # what is not finite has no extent
         self._warn_of_size(sizes)
-        return torch.where(usable[..., None, None], keyframes, self.reference.mT / self.scale), usable
+        return torch.where(usable[..., None, None], keyframes, self.stand_in), usable
 
     def _align(self, keyframes: Tensor, weights: Tensor) -> tuple[Tensor, Pose]:
         """Key-frames turned on to their weighted mean, and this to the reference. *Shape:* ``(B, K, 3, V)``."""

@@ -51,23 +51,23 @@ def blend_towards_starts(
         distortions = distortion(shapes, rests)
     numbers = is_eager(distortions)
     # Added to the distortions of the starts: invisible strains make no shape worse.
-    slight = distortion.slight(rests.stiffness, x)
-    ratio = (distortions[0] / (distortions[1:] + slight)).amax(0)
+    visible = distortion.visibility_threshold(rests.stiffness, x)
+    ratio = (distortions[0] / (distortions[1:] + visible)).amax(0)
     solution = solution._replace(distortion_ratio=ratio, start_weights=distortions.new_zeros(len(x), len(starts)))
     if numbers and bool((ratio <= _least(slack)).all()):
         return x, solution
     if torch.is_grad_enabled():
-        parts = _blend_weight(distortions[0], distortions[1:] + slight, slack)
+        parts = _blend_weight(distortions[0], distortions[1:] + visible, slack)
         # To first order, the shapes depend on the distortions where they are blended.
         if not numbers or bool(((parts > 0) & (parts < 1)).any()):
             distortions = distortion(shapes, rests)
-    x, replaced, weights = blend_by_distortion(x, starts, distortions, slight, slack)
+    x, replaced, weights = blend_by_distortion(x, starts, distortions, visible, slack)
     status = torch.where(replaced & (solution.status != Status.INVALID), Status.FELL_BACK, solution.status)
     return x, solution._replace(status=status, start_weights=weights.detach())
 
 
 def blend_by_distortion(
-    x: Tensor, starts: Sequence[Tensor], distortion: Tensor, slight: Tensor, slack: float = DISTORTION_SLACK
+    x: Tensor, starts: Sequence[Tensor], distortion: Tensor, visible: Tensor, slack: float = DISTORTION_SLACK
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Shapes, blended into their starts by the distortions of all, where a start has replaced one, and their weights.
 
@@ -76,7 +76,7 @@ def blend_by_distortion(
     value, *others = distortion
     replaced, weights = (torch.zeros_like(value, dtype=torch.bool), value.new_zeros(len(value), 0))
     for start, other in zip(starts, others, strict=True):
-        weight = _blend_weight(value, other + slight, slack)
+        weight = _blend_weight(value, other + visible, slack)
         replaced = replaced | (weight == 1)
         weights = torch.cat([(1 - weight)[:, None] * weights, weight[:, None]], 1)
         whole = weight[:, None, None]
