@@ -4,4 +4,4 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-sys.path += [str(ROOT / "examples"), str(ROOT / "tests" / "benchmarks")]
+sys.path += [str(ROOT / "examples"), str(ROOT / "tests" / "benchmarks"), str(ROOT / "tests")]
