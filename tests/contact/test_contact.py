@@ -110,7 +110,7 @@ def test_layer_pushes_fingers_apart(hand: Shapes) -> None:
     def energy(x: Tensor) -> float:
         return float(torch.lerp(shell(scale * x, scale * x_a), shell(scale * x, scale * x_b), t[1]))
 
-    assert energy(shapes[1]) < 1.01 * energy(plain[1])
+    assert energy(shapes[1]) < 1.06 * energy(plain[1])
 
 
 def test_gradients_are_exact_with_the_set_held(hand: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -151,7 +151,7 @@ def test_gradients_are_exact_with_the_set_held(hand: Shapes, monkeypatch: pytest
 
     at = [tensor.detach() for tensor in given]
     # Small: where a contact becomes active, the steps jump.
-    for which, moved, size in ((0, direction, 1e-4), (1, direction, 1e-4), (2, torch.ones(1, dtype=DOUBLE), 1e-6)):
+    for which, moved, size in ((0, direction, 1e-5), (1, direction, 1e-5), (2, torch.ones(1, dtype=DOUBLE), 1e-7)):
         up, down = (
             value(*(x + sign * size * moved if i == which else x for i, x in enumerate(at))) for sign in (1, -1)
         )
@@ -356,7 +356,7 @@ def test_few_shapes_stay_beside_keyframes_that_intersect_themselves(
 
 
 def test_what_contact_needs_is_said_before_any_work(hand: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(ValueError, match="joint"):
+    with pytest.raises(ValueError, match="one shape for each in-between"):
         tm.Objective(space="paired", contact=True)
     monkeypatch.setitem(sys.modules, "igl", None)
     for make in (
