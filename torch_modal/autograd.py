@@ -8,7 +8,9 @@ Torch's private names are used here alone, and only where no public one exists:
 - ``torch._C._functorch.is_batchedtensor`` tells ``vmap`` from other transforms;
 - ``_disable_current_modes`` and ``torch._C.DisableTorchFunction`` compute numbers during ``torch.export``, which would
   otherwise record the computation;
-- ``torch._functorch.eager_transforms.JVP_NESTING`` tells forward mode within forward mode.
+- ``torch._functorch.eager_transforms.JVP_NESTING`` tells forward mode within forward mode;
+- ``torch._C._autograd._top_saved_tensors_default_hooks`` and its like set hooks on saved tensors aside, as those of
+  checkpoints, which ``torch.func`` refuses.
 """
 
 from collections import OrderedDict
@@ -140,6 +142,23 @@ def disable_compile(compute: Callable[Given, Made]) -> Callable[Given, Made]:
 
     code = run.__code__.replace(co_name=compute.__name__)  # type: ignore[attr-defined]
     run.__code__ = code  # type: ignore[attr-defined]  # Dynamo limits how often one code is compiled
+    return run
+
+
+def without_saved_tensor_hooks(compute: Callable[Given, Made]) -> Callable[Given, Made]:
+    """Decorate a function that differentiates by ``torch.func``: hooks on saved tensors are set aside meanwhile."""
+
+    @wraps(compute)
+    def run(*args: "Given.args", **kwargs: "Given.kwargs") -> Made:
+        hooks = torch._C._autograd._top_saved_tensors_default_hooks(True)
+        if hooks is None:
+            return compute(*args, **kwargs)
+        torch._C._autograd._pop_saved_tensors_default_hooks()
+        try:
+            return run(*args, **kwargs)
+        finally:
+            torch._C._autograd._push_saved_tensors_default_hooks(*hooks)
+
     return run
 
 

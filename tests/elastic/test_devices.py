@@ -2,7 +2,8 @@
 
 ``FakeTensorMode`` runs every operation on shapes, dtypes and devices alone, and refuses those that mix devices. What
 looks at numbers cannot run so: loops that end by a tolerance, line searches, the placement of key-frames, kernels, and
-the searches for contacts, which run on the CPU. The largest pieces between these are called here, one after the other.
+the searches for contacts, which run on the CPU; nor autograd, which asks the device for its streams. The largest pieces
+between these are called here, one after the other.
 """
 
 from collections.abc import Iterator
@@ -121,7 +122,7 @@ def assert_core_runs(core: Any, x: Tensor, stiffness: list[Tensor]) -> None:
     paired = isinstance(core.space, PairedSpace)
     pose = Pose(blank(2, 3, 3), blank(2, 3))
     shapes = core.space.lift(a, rests.shapes)[0] if paired else core.space.lift(a, x)
-    assert_there([placement, core.space.derivatives(a, placement), shapes])
+    assert_there([placement, core.space.value(a, placement), shapes])
     assert_there([core.alignment.to_caller(shapes, pose), core.alignment.to_frame(shapes, pose)])
     reference = rests.reference(core.fine.energy)
     assert_there(reference)

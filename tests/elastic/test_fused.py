@@ -18,16 +18,14 @@ from torch import Tensor
 from torch.func import functional_call, grad, vmap
 
 import torch_modal as tm
-from torch_modal import trees
-from torch_modal.elastic import backend, kernel_energy, modal
+from torch_modal.elastic import backend
 from torch_modal.elastic.backend import TorchBackend, choose
 from torch_modal.elastic.bend import Bend
 from torch_modal.elastic.distortion import Distortion, KernelDistortion
 from torch_modal.elastic.energy import Energy, Reference, RestShapes
-from torch_modal.elastic.kernel_energy import KernelEnergy, _MergeRests
+from torch_modal.elastic.kernel_energy import KernelEnergy, _MergeRests, by_kernels
 from torch_modal.elastic.kernel_steps import KernelFineEnergy, KernelProblem, _Relaxation
 from torch_modal.elastic.kernels import launch
-from torch_modal.elastic.modal import KernelModalEnergy, ModalEnergy, Placement
 from torch_modal.elastic.procrustes import mean_pose
 from torch_modal.elastic.rotations import WarpRotations
 from torch_modal.elastic.steps import FineEnergy, SumOfEnergies, TermsTowards, descend
@@ -50,6 +48,11 @@ pytest.importorskip("warp", reason="warp-lang is not installed")
 DOUBLE = torch.float64
 
 
+def by_kernels_alone(energy: Energy, mesh: Mesh) -> KernelEnergy:
+    """Of terms that kernels serve."""
+    return KernelEnergy(energy, [part for part in by_kernels(energy, mesh) if part is not None])
+
+
 class Case:
     """Two samples between two shapes each, with stiffnesses of each element."""
 
@@ -57,7 +60,7 @@ class Case:
         generator = torch.Generator().manual_seed(0)
         mesh = self.mesh = Mesh.of(faces, shapes.keyframes.shape[1])
         self.energy = Energy(mesh, [Stretch(), Bend(), Volume()])
-        self.fused = KernelEnergy.of(self.energy, mesh)
+        self.fused = by_kernels_alone(self.energy, mesh)
         x = shapes.keyframes * (CANONICAL_SIZE / (shapes.keyframes[0].amax(0) - shapes.keyframes[0].amin(0)).norm())
         n_edges, n_hinges = len(mesh.edges), len(mesh.hinges)
         stiffness = [
@@ -168,59 +171,16 @@ def test_gradient_where_the_steps_start(small_bars: Shapes) -> None:
         assert all(float(own.abs().max()) < 10 for own in gradients(run, given))
 
 
-class TestModal:
-    """The energy in the amplitudes of a space."""
-
-    @staticmethod
-    def both(case: Case) -> list[tuple[ModalEnergy, Placement]]:
-        start, generator = case.given[0], torch.Generator().manual_seed(2)
-        columns = torch.randn(5, *start.shape[1:], dtype=DOUBLE, generator=generator)
-        shell = case.fused
-        modals = KernelModalEnergy(shell, columns), ModalEnergy(case.energy, columns)
-        rests = case.rests(*case.given[1:])
-        return [
-            (modals[0], modals[0].place(start, shell.reference(rests))),
-            (modals[1], modals[1].place(start, rests.reference(case.energy))),
-        ]
-
-    @torch.no_grad()
-    def test_values_and_derivatives(self, case: Case) -> None:
-        a = 0.1 * torch.randn(2, 5, dtype=DOUBLE, generator=torch.Generator().manual_seed(3))
-        (by_kernel, own), (plain, truth) = self.both(case)
-        several = torch.stack([a, 2 * a, -a])
-        torch.testing.assert_close(by_kernel.value(several, own), plain.value(several, truth), rtol=1e-12, atol=0)
-        found, wanted = by_kernel.derivatives(a, own), plain.derivatives(a, truth)
-        assert float(wanted.second_order.abs().max()) > 1e-3 * float(wanted.gauss_newton.abs().max())
-        assert_alike(found, wanted, 1e-9)
-        value, gradient = by_kernel.value_and_gradient(a, own)
-        torch.testing.assert_close(value, plain.value(a, truth), rtol=1e-12, atol=0)
-        torch.testing.assert_close(plain.value_and_gradient(a, truth)[0], plain.value(a, truth), rtol=1e-12, atol=0)
-        assert_alike((gradient, plain.value_and_gradient(a, truth)[1]), (wanted.gradient,) * 2, 1e-9)
-
-    def test_gradients_are_differentiated(self, case: Case) -> None:
-        generator = torch.Generator().manual_seed(4)
-        a, direction = torch.randn(2, 2, 5, dtype=DOUBLE, generator=generator).mul(0.1)
-        (by_kernel, own), (plain, truth) = self.both(case)
-        given = [a, *trees.leaves(own)]
-
-        def by_kernels(a: Tensor, *leaves: Tensor) -> Tensor:
-            return by_kernel.value_and_gradient(a, trees.fill(own, leaves))[1]
-
-        def by_torch(a: Tensor, *leaves: Tensor) -> Tensor:
-            return plain.value_and_gradient(a, by_kernel.by_torch(trees.fill(own, leaves)))[1]
-
-        assert_alike([by_kernels(*given)], [plain.derivatives(a, truth).gradient], 1e-10)
-        found, wanted = (torch.func.vjp(each, *given)[1](direction) for each in (by_kernels, by_torch))
-        assert_alike(found, wanted, 1e-10)
+class TestReferences:
+    """Rest shapes merged into one."""
 
     @pytest.mark.parametrize("relative", [False, True])
     def test_softer_at_needles(self, case: Case, relative: bool) -> None:
         """Shapes with needles, along either side of their triangles; rest shapes with some, too."""
-        (by_kernel, own), _ = self.both(case)
-        start = own.base * torch.tensor([0.02, 1.0, 3.0], dtype=DOUBLE)
+        start = case.given[0] * torch.tensor([0.02, 1.0, 3.0], dtype=DOUBLE)
         rests, weights = case.rests(*case.given[1:])[:2]
         rests = torch.cat([rests[:, :1] * torch.tensor([1.0, 0.04, 1.0], dtype=DOUBLE), rests[:, 1:]], 1)
-        operation, given = _MergeRests(by_kernel.kernels, [1], relative), [rests, weights, case.given[5]]
+        operation, given = _MergeRests(case.fused, [1], relative), [rests, weights, case.given[5]]
         if relative:
             alone = torch.tensor([[1.0, 0.0]] * 2, dtype=DOUBLE)
             as_stiff = operation.by_torch(rests.flip(1), alone, case.given[5], rests[:, 1])[0]
@@ -229,28 +189,6 @@ class TestModal:
         assert float((softened / hard)[hard > 0].min()) < 0.1
         run, truth = lambda *x: operation(*x)[0], lambda *x: operation.by_torch(*x)[0]
         assert_kernels(run, truth, [*given, start], 1e-12 * float(hard.max()), 1e-11)
-
-    @torch.no_grad()
-    def test_samples_that_are_too_many_at_a_time(self, case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
-        """No array of all samples outgrows what kernels count: they are taken in chunks."""
-        a = 0.1 * torch.randn(2, 5, dtype=DOUBLE, generator=torch.Generator().manual_seed(3))
-        (by_kernel, own), _ = self.both(case)
-        several, many = torch.cat([a, -a, 2 * a])[:5], trees.rows(own, torch.tensor([0, 1, 0, 1, 0]))
-        truth = by_kernel.derivatives(several, many)
-        largest = max(len(by_kernel.blocks) * by_kernel.blocks.shape[1], 81 * len(case.mesh.hinges)) * 3
-        monkeypatch.setattr(modal, "MOST_NUMBERS", largest)
-        sizes: list[int] = []
-
-        def watched(kernel: Any, dim: tuple[int, ...], given: list[Any], adjoints: Any = ()) -> None:
-            sizes.extend(x.numel() for x in given if isinstance(x, Tensor))
-            launch.launch(kernel, dim, given, adjoints)
-
-        monkeypatch.setattr(modal, "launch", watched)
-        monkeypatch.setattr(kernel_energy, "launch", watched)
-        found = by_kernel.derivatives(several, many)
-        assert max(sizes) <= largest
-        assert_alike(found, truth, 1e-13)
-        assert by_kernel.derivatives(several, many, second_order=False).second_order is None
 
     @pytest.mark.parametrize("n_shapes", [1, 2, 4])
     def test_merged_references_by_kernels_and_by_torch_agree(self, case: Case, n_shapes: int) -> None:
@@ -472,10 +410,9 @@ class TestLayers:
 
     @torch.no_grad()
     def test_kernels_of_a_term_of_ones_own(self, case: Case) -> None:
-        """Energy, gradient and Hessian of one term are those of torch; a volume alone is torch's."""
-        assert KernelEnergy.of(Energy(case.mesh, [Volume()]), case.mesh) is None
+        """Energy, gradient and Hessian of one term are those of torch."""
         energy = Energy(case.mesh, [fibres()(1e3)])
-        own = KernelEnergy.of(energy, case.mesh)
+        own = by_kernels_alone(energy, case.mesh)
         start, first, second, t, *_ = case.given
         rests = case.rests(first, second, t, torch.full((2, 1), 1e3, dtype=DOUBLE))
         to, truth = own.reference(rests), TermsTowards(energy, rests.reference(energy))

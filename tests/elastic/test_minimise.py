@@ -11,11 +11,8 @@ from test_gauss_newton import LeastSquares, Rosenbrock, Uphill, start
 from torch import Tensor
 from torch.func import jacfwd
 
-from torch_modal.elastic import minimise as minimisation
-from torch_modal.elastic.backend import WarpBackend
 from torch_modal.elastic.bend import Bend
 from torch_modal.elastic.minimise import Solution, Status, minimise
-from torch_modal.elastic.modal import Derivatives
 from torch_modal.elastic.shell import ShellEnergy
 from torch_modal.elastic.term import Term, periodic_square
 from torch_modal.inbetween.results import ConvergenceError, report
@@ -23,32 +20,6 @@ from torch_modal.inbetween.settings import Solver
 from torch_modal.layers.mid_shape import MidShape
 
 # ----------------------------------------------------------------------------------------------- known solutions
-
-
-def test_a_step_by_the_kernel_is_that_of_torch() -> None:
-    """Samples that converge, go uphill, have tried the shortest step, had converged before, and bend downwards."""
-    pytest.importorskip("warp")
-    generator, n = torch.Generator().manual_seed(0), 7
-
-    def random(*shape: int) -> Tensor:
-        return torch.randn(*shape, dtype=torch.float64, generator=generator)
-
-    half = random(5, n, n)
-    inverse = half @ half.mT + torch.eye(n, dtype=torch.float64)
-    length = torch.tensor([1, 1, minimisation.SHORTEST_STEP, 0, 1], dtype=torch.float64)
-    value = torch.tensor([0.5, 2.0, 2.0, 0.5, 0.5], dtype=torch.float64)
-    a, gradient = random(5, n, 1), random(5, n, 1)
-    there = a - length[:, None, None] * (inverse @ gradient)
-    slope = 0.1 * gradient + 0.1 * random(5, n, 1)
-    slope[4] = gradient[4] + 0.1 * (a - there)[4]
-    norm = gradient.norm(dim=(1, 2))
-    rest = norm, inverse, length, 0.5 * norm, torch.zeros(5).double(), torch.arange(5), None
-    state = minimisation.State(torch.arange(5), a, there, torch.ones(5).double(), gradient, *rest)
-    own = state._replace(**{k: x.clone() for k, x in state._asdict().items() if isinstance(x, Tensor)})
-    wanted = minimisation.bfgs_update(state, value, slope.squeeze(-1))
-    found = WarpBackend().quasi_newton(own, value, slope.squeeze(-1).clone())
-    for got, expected in zip(found[:-1], wanted[:-1], strict=True):
-        torch.testing.assert_close(got, expected, rtol=1e-10, atol=1e-10)
 
 
 class Waves(LeastSquares):
@@ -65,13 +36,16 @@ def test_across_negative_curvature() -> None:
     assert (solution.energy < 1e-6).all()
 
 
-def test_another_hessian_for_what_has_not_converged(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(minimisation, "MOST_EVALUATIONS", 8)
-    solution = minimise(Rosenbrock(), start([-1.2, 1.0], [1.0, 1.0]), None)
+def test_a_hessian_serves_until_the_gradient_shrinks_no_more() -> None:
+    """Gauss-Newton's is exact at the end of the bent valley; the start is no place for it to serve long."""
+    energy, hessians = Rosenbrock(), []
+    whole = energy.derivatives
+    energy.derivatives = lambda *given, **k: hessians.append(k) or whole(*given, **k)  # type: ignore[method-assign]
+    solution = minimise(energy, start([-1.2, 1.0], [1.0, 1.0]), None, tolerance=1e-12)
     assert solution.converged.all()
-    torch.testing.assert_close(solution.amplitudes, torch.ones(2, 2, dtype=torch.float64), atol=1e-6, rtol=0)
-    assert solution.n_steps[0] > 8
+    torch.testing.assert_close(solution.amplitudes, torch.ones(2, 2, dtype=torch.float64), atol=1e-9, rtol=0)
     assert solution.n_steps[1] == 0, "it started at the solution"
+    assert hessians[0] == {"second_order": False} and len([k for k in hessians if k != {}]) == 1
 
 
 def test_what_drowns_in_rounding_has_converged() -> None:
@@ -85,29 +59,14 @@ def test_what_drowns_in_rounding_has_converged() -> None:
     assert float(solution.gradient_norm) < 100, "one Newton step has 202 times the gradient of the start"
 
 
-def test_a_hessian_that_is_too_singular_for_single_precision_is_computed_again() -> None:
-    class Single(Rosenbrock):
-        """Without the second-order term, samples with a first amplitude below zero have lost what is small."""
-
-        def derivatives(self, a: Tensor, placement: Any, second_order: bool = True) -> Derivatives:
-            found = super().derivatives(a, placement, second_order)
-            lost = found.gauss_newton * torch.where(a[:, :1, None] < 0, -1.0, 1.0)
-            return found if second_order else found._replace(gauss_newton=lost)
-
-    given = start([0.5, 0.5], [-1.2, 1.0])
-    exact, found = (minimise(energy, given, None) for energy in (Rosenbrock(), Single()))
-    assert found.converged.all()
-    assert torch.equal(found.amplitudes, exact.amplitudes)
-
-
 def test_what_cannot_go_on_says_why() -> None:
     """Neither what stalls nor what runs out of steps counts as converged; what is at its optimum does."""
     stalled = minimise(Uphill(), start([0.5], [2.0]), None)
     assert (stalled.status == Status.STALLED).all() and not stalled.usable.any()
     assert stalled.amplitudes.tolist() == [[0.5], [2.0]]
-    short = minimise(Rosenbrock(), start([-1.2, 1.0], [1.0, 1.0]), None, max_steps=6)
+    short = minimise(Rosenbrock(), start([-1.2, 1.0], [1.0, 1.0]), None, max_steps=1)
     assert short.status.tolist() == [Status.OUT_OF_STEPS, Status.CONVERGED]
-    assert 0 < short.n_steps[0] <= 6 and short.n_steps[1] == 0
+    assert short.n_steps.tolist() == [1, 0]
     invalid = minimise(Rosenbrock(), start([float("nan"), 1.0], [0.0, 0.0]), None)
     assert invalid.status.tolist() == [Status.INVALID, Status.CONVERGED]
     with pytest.raises(ConvergenceError, match="did not converge"):

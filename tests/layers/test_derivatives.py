@@ -220,7 +220,7 @@ def test_at_key_frames_the_tangent_is_that_of_the_in_between(small_bars: Shapes,
 
 
 def test_no_tangent_goes_through_amplitudes_that_did_not_converge(bars: Shapes) -> None:
-    case = in_between(bars, preset="modal", solver=tm.Solver(max_steps=1))
+    case = in_between(bars, preset="modal", solver=tm.Solver(max_steps=0))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", tm.ConvergenceWarning)
         assert not bool(case.layer.solve(*bars.keyframes[:2], 0.3).solution.converged)  # type: ignore[attr-defined]

@@ -583,12 +583,3 @@ def test_export_of_what_reads_no_numbers(name: str, small_bars: Shapes) -> None:
     program = torch.export.export(layer, given, dynamic_shapes=sizes, strict=False).module()
     other = (1.01 * x[:batch], x.flip(0)[:batch])[:n]
     torch.testing.assert_close(program(*other), layer(*other), rtol=0, atol=1e-12)
-
-
-@pytest.mark.slow
-def test_export_of_fixed_steps(small_bars: Shapes) -> None:
-    solver = tm.Solver(local_steps=0, gradient="unroll", max_steps=3)
-    layer, (x_a, x_b) = in_between(small_bars, solver=solver), small_bars.keyframes[:2]
-    exported = torch.export.export(layer, (x_a, x_b, TIMES[:1]), strict=False).module()
-    others = (1.01 * x_a, x_b + 0.1 * x_a, TIMES[:1] + 0.1)
-    torch.testing.assert_close(exported(*others), layer(*others), rtol=0, atol=1e-12)

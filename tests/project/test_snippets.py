@@ -16,7 +16,6 @@ from snippets import COMMAND, LANGUAGES, NOT_RUN, PAGES, ROOT, Block, blocks, co
 from test_examples import load_example
 
 from torch_modal.cli import main as cli
-from torch_modal.elastic.backend import BACKENDS
 from torch_modal.io.formats import ANIMATION_FORMATS, MESH_FORMATS
 
 QUICK = {"layer", "viewing"}
@@ -37,8 +36,8 @@ def meshes(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(autouse=True)
 def registered() -> Iterator[None]:
-    """Formats and backends that a page registers are gone after it."""
-    with patch.dict(MESH_FORMATS), patch.dict(ANIMATION_FORMATS), patch.dict(BACKENDS):
+    """Formats that a page registers are gone after it."""
+    with patch.dict(MESH_FORMATS), patch.dict(ANIMATION_FORMATS):
         yield
 
 

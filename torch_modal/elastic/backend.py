@@ -16,13 +16,10 @@ from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.elastic.crossings import WarpPairs
 from torch_modal.elastic.distortion import Distortion, KernelDistortion
 from torch_modal.elastic.energy import Energy
-from torch_modal.elastic.kernel_energy import KernelEnergy, volumes_by_kernel
+from torch_modal.elastic.kernel_energy import volumes_by_kernel
 from torch_modal.elastic.kernel_steps import KernelFineEnergy
 from torch_modal.elastic.kernels.launch import kernels, launch, load_kernels
-from torch_modal.elastic.minimise import bfgs_update
-from torch_modal.elastic.modal import KernelModalEnergy, ModalEnergy
 from torch_modal.elastic.procrustes import mean_pose as mean_pose_by_kernel
-from torch_modal.elastic.quasi_newton import update
 from torch_modal.elastic.rotations import WarpRotations
 from torch_modal.elastic.steps import FineEnergy
 from torch_modal.elastic.term import Mesh, Term
@@ -40,8 +37,7 @@ class TorchBackend:
     that it is faster at, and returns to these where it cannot serve; both give the same numbers, up to rounding.
     """
 
-    mean_pose, quasi_newton = staticmethod(mean_pose), staticmethod(bfgs_update)
-    volumes_of = staticmethod(volumes_of)
+    mean_pose, volumes_of = staticmethod(mean_pose), staticmethod(volumes_of)
 
     def load(self) -> None:
         """Load what takes long, so that the first call does not wait for it."""
@@ -49,10 +45,6 @@ class TorchBackend:
     def rotations(self, mesh: Connectivity, references: Tensor) -> LocalRotations:
         """Local rotations of triangles between shapes near references. *Shape:* ``(K, V, 3)``."""
         return LocalRotations(mesh, references)
-
-    def modal_energy(self, energy: Energy, mesh: Mesh, columns: Tensor) -> ModalEnergy:
-        """Terms in the amplitudes of columns, for the modal solve. *Shape:* ``(n, V, 3)``."""
-        return ModalEnergy(energy, columns)
 
     def fine_energy(self, mesh: Mesh, terms: Sequence[Term]) -> FineEnergy:
         """All terms on the caller's mesh, for steps of all vertices. Those of Eq. 5 come first."""
@@ -79,7 +71,6 @@ class WarpBackend(TorchBackend):
     rotations = staticmethod(WarpRotations)
     fine_energy = staticmethod(KernelFineEnergy)
     distortion = staticmethod(KernelDistortion)
-    quasi_newton = staticmethod(update)
 
     def __init__(self) -> None:
         if importlib.util.find_spec("warp") is None:
@@ -102,13 +93,6 @@ class WarpBackend(TorchBackend):
             return False
         return True
 
-    def modal_energy(self, energy: Energy, mesh: Mesh, columns: Tensor) -> ModalEnergy:
-        """Overrides the base class."""
-        by_kernel = KernelEnergy.of(energy, mesh)
-        if by_kernel is None or not by_kernel.exact:
-            return super().modal_energy(energy, mesh, columns)
-        return KernelModalEnergy(by_kernel, columns)
-
     def crossings(self, mesh: Connectivity, shape: FloatArray) -> Callable[[FloatArray], IntArray]:
         """Overrides the base class."""
         return WarpPairs(mesh, shape)
@@ -117,23 +101,8 @@ class WarpBackend(TorchBackend):
 BACKENDS: dict[str, Callable[[], TorchBackend]] = {"torch": TorchBackend, "warp": WarpBackend}
 
 
-def register_backend(name: str, make: Callable[[], TorchBackend]) -> None:
-    """Register a backend, for ``Solver(backend=name)``.
-
-    Args:
-        name: Its name. One that is known already is replaced.
-        make: Called with no arguments for each layer that is made.
-    """
-    BACKENDS[name] = make
-
-
-def names() -> tuple[str, ...]:
-    """Names that :func:`choose` takes."""
-    return ("auto", *BACKENDS)
-
-
 def choose(name: str) -> TorchBackend:
-    """The backend of a name; ``"auto"`` is the kernels where they work, otherwise torch.
+    """The backend of a name: ``"auto"`` is the kernels where they work, otherwise torch.
 
     Raises:
         MissingPackageError: ``"warp"`` is requested and not installed.

@@ -77,36 +77,6 @@ class SquaredBend(Term):
         to_e = -((a * e).sum(0) * to_a + (b * e).sum(0) * to_b) * inverse((e * e).sum(0), flat)
         return self.measure(edge_vectors, hinges), torch.stack([to_e, to_a, to_b])
 
-    def hessians(self, edge_vectors: Tensor) -> Tensor:
-        r"""Hessian of the angle in closed form, zero where a triangle is collapsed.
-
-        ``torch.func`` knows neither checkpoints, whose tensors have hooks, nor ``torch.export``.
-
-        Each triangle of the hinge has a part of its own, made of the edge ``e``, its unit normal ``n``, its altitude
-        ``h`` and ``w = n x e``: with :math:`S = (n w^T + w n^T)\, |e| / |n_1|^2` and :math:`U = e n^T / (|e| |n_1|)`, a
-        tip whose foot divides the edge at ``r`` has the blocks ``S`` with itself and ``U - r S`` with the edge, which
-        has :math:`(r^2 + h^2 / 2 |e|^2) S - r (U + U^T)` with itself. The two tips have none.
-        """
-        e, a, b = edge_vectors
-        n1, n2, flat, length = normals(edge_vectors)
-        per_length = inverse(length, flat)
-        edge_block = e.new_zeros(())
-        with_itself, with_edge = [], []
-        for normal, tip, w in ((n1, a, cross(n1, e)), (n2, b, cross(e, n2))):
-            area = (normal * normal).sum(0)
-            per_area = inverse(area, flat)
-            # n and w are not of length one here: their factors are in front.
-            half = (normal * (length * per_area * per_area))[:, None] * w
-            s = half + half.transpose(0, 1)
-            u = e[:, None] * (normal * (per_length * per_area))
-            r = (tip * e).sum(0) * per_length * per_length
-            edge_block = edge_block + (r * r + 0.5 * area * per_length**4) * s - r * (u + u.transpose(0, 1))
-            with_itself.append(s)
-            with_edge.append(u - r * s)
-        (a_a, b_b), (a_e, b_e), none = with_itself, with_edge, torch.zeros_like(edge_block)
-        rows = (edge_block, a_e.transpose(0, 1), b_e.transpose(0, 1)), (a_e, a_a, none), (b_e, none, b_b)
-        return torch.stack([torch.stack(row, 1) for row in rows])
-
 
 class Bend(PeriodicTerm, SquaredBend):
     r"""Dihedral angles: :math:`\beta \sum_h f(\theta_h - \bar\theta_h) \bar l_h^2 / \bar A_h`, smooth at half a turn.
@@ -308,6 +278,4 @@ def kernel_functions() -> KernelFunctions:
         return fullness_of(x[0], x[1], altitude) * fullness_of(x[0], x[2], altitude)
 
     values = measure, linearise
-    return KernelFunctions(
-        "bend", 3, periodic(), *values, hessian_product=hessian_product, weight=weight, fullness=fullness
-    )
+    return KernelFunctions("bend", 3, periodic(), *values, weight=weight, fullness=fullness)

@@ -121,10 +121,10 @@ class AssembledTerm(nn.Module):
         rest_weights = weights[..., None] * self.term.weights(edge_vectors, measures).expand_as(measures)
         return self.term.merge_rests(self.term.at_rest(measures), rest_weights, stiffness)
 
-    def linearise(self, extended: Tensor, record: Tensor) -> "Linearised":
-        """The term at given shapes. *Shape:* ``(3, B, V)``, extended."""
+    def linearise(self, extended: Tensor, record: Tensor, by_torch: bool = False) -> "Linearised":
+        """The term at given shapes; by :meth:`Term.jacobian` if wanted. *Shape:* ``(3, B, V)``, extended."""
         edge_vectors = self.edge_vectors(extended)
-        measures, gradients = self.term.linearise(edge_vectors)
+        measures, gradients = (self.term.jacobian if by_torch else self.term.linearise)(edge_vectors)
         if self.term.total:
             measures = measures.sum(-1, keepdim=True)
             gradients = self.scatter_vectors(torch.zeros_like(extended), gradients)

@@ -5,11 +5,13 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from torch_modal.autograd import disable_compile, full_precision
-from torch_modal.elastic.minimise import Solution, Status, add_ridge
+from torch_modal.autograd import disable_compile, full_precision, is_eager, without_saved_tensor_hooks
 from torch_modal.elastic.modal import Derivatives
 
-# Parts of a step that are tried side by side.
+# Part of the decrease that Newton's step promises, from which on it is taken without a search.
+SUFFICIENT = 0.25
+
+# Parts of both steps that are tried side by side otherwise.
 STEP_LENGTHS = (1.0, 0.5, 0.25, 0.1, 0.03, 0.003)
 
 
@@ -24,14 +26,19 @@ class Step(NamedTuple):
     """Before the step. *Shape:* ``(B,)``."""
     moved: Tensor
     """False where no step was found that does not go uphill. *Shape:* ``(B,)``, bool."""
+    gradient: Tensor
+    """After the step. *Shape:* ``(B, n)``."""
+    gain: Tensor
+    """Decrease that Newton's step promised; infinite where the Hessian is not positive definite. *Shape:* ``(B,)``."""
 
 
 class GaussNewtonStep(nn.Module):
-    """One damped step of every sample of a batch, never uphill.
+    """One damped step of every sample of a batch, never uphill beyond rounding.
 
-    The residual at the optimum is large: Gauss-Newton alone gains a digit every six steps there, and the full Hessian
-    alone is often indefinite far from it. Both directions are tried, at several step lengths, in one batched evaluation
-    of the energy; the lowest wins. A sample where none is lower stays where it is::
+    The residual at the optimum is large: Gauss-Newton alone gains a digit every six steps there, while the full Hessian
+    doubles the digits, and is often indefinite far from it. Newton's step is taken where it gains enough; otherwise
+    both directions are tried, at several step lengths, and the lowest energy wins. A sample where none is lower stays
+    where it is::
 
         shell = tm.ShellEnergy(faces)
         energy = tm.ModalEnergy(shell, basis.modes)
@@ -52,12 +59,14 @@ class GaussNewtonStep(nn.Module):
 
     @disable_compile
     @full_precision
-    def forward(self, a: Tensor, placement: Any) -> Step:
-        """Take one step, without a branch that depends on data.
+    @without_saved_tensor_hooks
+    def forward(self, a: Tensor, placement: Any, at: Derivatives | None = None) -> Step:
+        """Take one step; where tensors are traced, without a branch that depends on data.
 
         Args:
             a: Amplitudes. *Shape:* ``(B, n)``.
             placement: What the energy knows of each sample.
+            at: The derivatives there, if known.
 
         Raises:
             ValueError: The amplitudes have no batch dimension, or several.
@@ -67,74 +76,55 @@ class GaussNewtonStep(nn.Module):
                 f"amplitudes have the shape (B, n), as the placement has B samples; got {tuple(a.shape)}: of one "
                 "sample, pass a[None] and place start[None]"
             )
-        derivatives = self.energy.derivatives(a, placement)
-        directions = _directions(derivatives)
+        at = self.energy.derivatives(a, placement) if at is None else at
+        norm, newton = at.gradient.norm(dim=-1), _direction(at.gradient, at.hessian)
+        definite = newton.isfinite().all(-1)
+        gain = torch.where(definite, -0.5 * (at.gradient * newton).sum(-1), torch.inf)
+        reached = a + torch.where(definite[:, None], newton, 0)
+        energy, gradient = self.energy.value_and_gradient(reached, placement)
+        fall = at.value - energy
+        # Near the optimum the energy is flat to rounding while the gradient still has digits to gain.
+        gains = (fall >= SUFFICIENT * gain) | ((fall >= -at.rounding) & (gradient.norm(dim=-1) < norm))
+        good = definite & gains
+        found = Step(reached, energy, norm, good, gradient, gain)
+        if is_eager(good) and bool(good.all()):
+            return found
+        other = self._search(a, placement, at, newton)
+        chosen = [torch.where(good.view(-1, *[1] * (x.dim() - 1)), x, y) for x, y in zip(found, other, strict=True)]
+        return Step(*chosen)._replace(gradient_norm=norm, gain=gain)
+
+    def _search(self, a: Tensor, placement: Any, at: Derivatives, newton: Tensor) -> Step:
+        """The lowest of several lengths of both directions."""
+        directions = torch.stack([newton, _direction(at.gradient, at.gauss_newton)])
         steps = torch.cat([length * directions for length in STEP_LENGTHS])
         usable = steps.isfinite().all(-1)
         candidates = a + torch.where(usable[..., None], steps, 0)
         energies = self.energy.value(candidates, placement)
-        energies = torch.where(usable & energies.isfinite(), energies, torch.inf)
-        lowest, index = energies.min(0)
+        lowest, index = torch.where(usable & energies.isfinite(), energies, torch.inf).min(0)
         best = candidates.gather(0, index[None, :, None].expand(1, *a.shape)).squeeze(0)
-        value = self.energy.value(a, placement)
-        # At the optimum the energy is flat to rounding while the gradient still has digits to gain.
-        moved = lowest <= value + 4 * torch.finfo(value.dtype).eps * value.abs()
-        reached, energy = torch.where(moved[:, None], best, a), torch.where(moved, lowest, value)
-        return Step(reached, energy, derivatives.gradient.norm(dim=-1), moved)
+        moved = lowest < at.value - at.rounding
+        best = torch.where(moved[:, None], best, a)
+        energy, gradient = self.energy.value_and_gradient(best, placement)
+        return Step(best, energy, at.value, moved, gradient, at.value)
 
 
-def _directions(derivatives: Derivatives) -> Tensor:
-    """Directions ``-H^-1 g`` of Gauss-Newton and of the full Hessian; NaN where it is not positive definite.
-
-    *Shape:* ``(2, B, n)``.
-    """
-    hessians = add_ridge(torch.stack([derivatives.gauss_newton, derivatives.hessian]))
-    factor, info = torch.linalg.cholesky_ex(hessians)
-    definite = info == 0
+def _direction(gradient: Tensor, hessian: Tensor) -> Tensor:
+    """The direction ``-H^-1 g``; NaN where the Hessian is not positive definite. *Shape:* ``(B, n), (B, n, n)``."""
+    hessian = add_ridge(hessian)
+    factor, info = torch.linalg.cholesky_ex(hessian)
+    definite = (info == 0)[:, None]
     if torch.is_grad_enabled():
         # A failed factorisation that is not used would still give NaN gradients.
-        eye = torch.eye(hessians.shape[-1], dtype=hessians.dtype, device=hessians.device)
-        factor, _ = torch.linalg.cholesky_ex(torch.where(definite[..., None, None], hessians, eye))
-    gradient = derivatives.gradient.expand(len(hessians), -1, -1)[..., None]
-    direction = -torch.cholesky_solve(gradient, factor).squeeze(-1)
-    return torch.where(definite[..., None], direction, torch.nan)
+        eye = torch.eye(hessian.shape[-1], dtype=hessian.dtype, device=hessian.device)
+        factor, _ = torch.linalg.cholesky_ex(torch.where(definite[..., None], hessian, eye))
+    return torch.where(definite, -torch.cholesky_solve(gradient[..., None], factor).squeeze(-1), torch.nan)
 
 
-def newton(
-    energy: Any,
-    a: Tensor,
-    placement: Any,
-    max_steps: int = 10,
-    tolerance: float = 3e-7,
-    stop_early: bool = True,
-) -> Solution:
-    """Minimise by :class:`GaussNewtonStep`: ten of them, as many as the paper takes.
+def add_ridge(hessian: Tensor) -> Tensor:
+    """A Hessian with a ridge relative to its mean diagonal, for directions without stiffness. *Shape:* ``(..., n, n)``.
 
-    They reach its relative decrease of 1e-10 in 6 or 7.
-
-    Args:
-        energy: The energy of the amplitudes.
-        a: Where to start. *Shape:* ``(B, n)``.
-        placement: What the energy knows of each sample.
-        max_steps: Number of steps at most.
-        tolerance: Bound on the gradient norm, relative to the one at the start.
-        stop_early: False to take all steps of all samples, without a branch that depends on data.
+    Coincident key-frames cause these, which would break the factorisation.
     """
-    step, n_steps, start = GaussNewtonStep(energy), torch.zeros(len(a), dtype=torch.int64, device=a.device), None
-    moving = torch.ones_like(n_steps, dtype=torch.bool)
-    for _ in range(max_steps):
-        reached = step(a, placement)
-        start = reached.gradient_norm if start is None else start
-        if stop_early:
-            moving = moving & reached.moved & (reached.gradient_norm > tolerance * start)
-        a, n_steps = torch.where(moving[:, None], reached.amplitudes, a), n_steps + moving
-        if stop_early and not moving.any():
-            break
-    derivatives = energy.derivatives(a, placement, second_order=False)
-    norm, value = derivatives.gradient.norm(dim=-1), derivatives.value
-    start = norm if start is None else start
-    small = norm <= torch.maximum(tolerance * start, derivatives.floor)
-    status = torch.where(small, Status.CONVERGED, torch.where(moving, Status.OUT_OF_STEPS, Status.STALLED))
-    status = torch.where(norm.isfinite() & value.isfinite(), status, Status.INVALID)
-    relative = norm / start.clamp_min(torch.finfo(start.dtype).tiny)
-    return Solution(a, value, relative.detach(), n_steps, status)
+    size = hessian.diagonal(dim1=-2, dim2=-1).mean(-1)
+    ridge = (1e-12 if hessian.dtype == torch.float64 else 1e-6) * size.abs() + torch.finfo(size.dtype).tiny
+    return hessian + torch.diag_embed(ridge[..., None].expand(hessian.shape[:-1]))

@@ -1,4 +1,4 @@
-"""Gradients of a minimiser: by the implicit function theorem, or through a fixed number of steps."""
+"""Gradients of a minimiser by the implicit function theorem."""
 
 from collections.abc import Callable
 from contextlib import suppress
@@ -9,8 +9,8 @@ from torch import Tensor
 
 from torch_modal import trees
 from torch_modal.autograd import apply_function, apply_transpose, is_double_backward, merge_vmapped
-from torch_modal.elastic.gauss_newton import newton
-from torch_modal.elastic.minimise import Solution, Status, add_ridge, minimise
+from torch_modal.elastic.gauss_newton import add_ridge
+from torch_modal.elastic.minimise import Solution, Status, minimise
 from torch_modal.threads import warn
 
 Inverse = Callable[[Any, Tensor, Any, Tensor], Callable[[Tensor], Tensor]]
@@ -128,13 +128,3 @@ def solve_implicit(
     """
     limits, tree = (method, max_steps, tolerance, inverse), trees.skeleton(placement)
     return Solution(*apply_function(_ArgMin, energy, limits, tree, usable, *trees.leaves(placement)))
-
-
-def solve_unrolled(energy: Any, placement: Any, usable: Tensor, max_steps: int, tolerance: float) -> Solution:
-    """Take exactly ``max_steps`` steps from zeros; gradients flow back through all of them.
-
-    Arguments as for :func:`solve_implicit`.
-    """
-    start = trees.leaves(placement)[0].new_zeros(len(usable), energy.n_amplitudes)
-    solution = newton(energy, start, placement, max_steps, tolerance, stop_early=False)
-    return solution._replace(status=torch.where(usable, solution.status, Status.INVALID))

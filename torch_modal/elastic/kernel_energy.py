@@ -262,14 +262,6 @@ class KernelEnergy(nn.Module):
         #: True if kernels know the adjoints of all terms.
         self.exact = all(term.functions.exact for term in parts)
 
-    @classmethod
-    def of(cls, energy: Energy, mesh: Mesh) -> "KernelEnergy | None":
-        """An energy by kernels; None where they do not serve all of its terms, or it is a volume alone."""
-        parts = by_kernels(energy, mesh)
-        served = [part for part in parts if part is not None]
-        serves = len(served) == len(parts) and not all(isinstance(part, KernelVolume) for part in served)
-        return cls(energy, served) if serves else None
-
     def reference(self, rests: RestShapes, start: Tensor | None = None, relative: bool = False) -> Reference:
         """Merge rest shapes into one reference (Eq. 8); arguments as :meth:`RestShapes.reference`."""
         records: dict[int, Tensor] = {}

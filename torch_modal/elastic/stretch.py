@@ -35,18 +35,8 @@ class Stretch(Term):
 
     def linearise(self, edge_vectors: Tensor) -> tuple[Tensor, Tensor]:
         """Lengths and unit vectors, 0 where there is no length."""
-        squared = (edge_vectors * edge_vectors).sum(1, keepdim=True)
-        gradients = edge_vectors * inverse(squared.sqrt(), squared <= tiny(edge_vectors))
-        return self.measure(edge_vectors), gradients
-
-    def hessians(self, edge_vectors: Tensor) -> Tensor:
-        """The projector across the edge over the length, 0 where there is none."""
-        edge = edge_vectors[0]
-        squared = (edge * edge).sum(0)
-        per_length = inverse(squared.sqrt(), squared <= tiny(edge))
-        unit = edge * per_length
-        eye = torch.eye(3, dtype=edge.dtype, device=edge.device).reshape(3, 3, *[1] * (edge.dim() - 1))
-        return ((eye - unit[:, None] * unit) * per_length)[None, :, None]
+        length, squared = self.measure(edge_vectors), (edge_vectors * edge_vectors).sum((0, 1))
+        return length, edge_vectors * inverse(length, squared <= tiny(edge_vectors))
 
     def tension(self, edge_vectors: Tensor, slope: Tensor, curvature: Tensor) -> Tensor:
         """Transverse stiffness of a stretched string; smoothly near zero under compression."""

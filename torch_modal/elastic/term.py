@@ -16,7 +16,7 @@ from typing import Any, NamedTuple, no_type_check
 
 import torch
 from torch import Tensor, nn
-from torch.func import jacrev, vmap
+from torch.func import vjp, vmap
 
 from torch_modal.autograd import as_normal_tensor, outside_inference_mode
 from torch_modal.geometry.connectivity import Connectivity
@@ -68,8 +68,6 @@ class Potential(NamedTuple):
     energy: Any
     """Measure, record -> energy, but for what is left at the record."""
     slope: Any
-    rate: Any
-    """Change with the measure, of what changes so with the argument for the measure: measure, gradient."""
     left: Any
     """Energy that is left: sums, factor, record."""
     n_rows: int
@@ -94,8 +92,6 @@ class KernelFunctions:
     """Edge vectors -> measure, gradient."""
     exact: bool = True
     """True if the gradient is in closed form, so that it can be differentiated."""
-    hessian_product: Any = None
-    """Edge vectors, matrix -> the measure's Hessian times the matrix; from the gradient where it is None."""
     weight: Any = None
     """Weight at rest: edge vectors, measure, mean of the measures; None where torch merges the rest shapes."""
     uses_mean: bool = False
@@ -258,16 +254,27 @@ class Term(nn.Module):
         """The measure of each element. *Shape:* ``(n-1, 3, ..., M) -> (..., M)``."""
         return self._each(self.measure, edge_vectors)
 
-    def linearise(self, edge_vectors: Tensor) -> tuple[Tensor, Tensor]:
-        """The measures and their gradients in the edge vectors.
+    def jacobian(self, edge_vectors: Tensor) -> tuple[Tensor, Tensor]:
+        """The measures and their gradients in the edge vectors, by ``torch.func``: one pass back of all elements.
 
         *Shape:* ``(n-1, 3, ..., M) -> (..., M), (n-1, 3, ..., M)``.
         """
-        return self.measures(edge_vectors), self._each(jacrev(self.measure), edge_vectors)
+        measures, back = vjp(self.measures, edge_vectors)[:2]
+        return measures, back(torch.ones_like(measures))[0]
+
+    def linearise(self, edge_vectors: Tensor) -> tuple[Tensor, Tensor]:
+        """:meth:`jacobian`, which terms that have to be fast write out."""
+        return self.jacobian(edge_vectors)
 
     def hessians(self, edge_vectors: Tensor) -> Tensor:
-        """Hessians of the measures in the edge vectors. *Shape:* ``(n-1, 3, ..., M) -> (n-1, 3, n-1, 3, ..., M)``."""
-        return self._each(jacrev(jacrev(self.measure)), edge_vectors)
+        """Hessians of the measures in the edge vectors: Jacobians of :meth:`linearise`, by ``torch.func``.
+
+        *Shape:* ``(n-1, 3, ..., M) -> (n-1, 3, n-1, 3, ..., M)``.
+        """
+        n, back = len(edge_vectors), vjp(lambda e: self.linearise(e)[1], edge_vectors)[1]
+        units = torch.eye(3 * n, dtype=edge_vectors.dtype, device=edge_vectors.device)
+        units = units.view(3 * n, n, 3, *[1] * (edge_vectors.dim() - 2)).expand(-1, *edge_vectors.shape)
+        return vmap(lambda unit: back(unit)[0])(units).unflatten(0, (n, 3))
 
     def tension(self, edge_vectors: Tensor, slope: Tensor, curvature: Tensor) -> Tensor | None:
         """Stiffness that stretched elements of two vertices have across; None for elements of more.
@@ -381,17 +388,13 @@ def square() -> Potential:
         return real(2.0) * to[0] * (q - to[1])
 
     @wp.func
-    def rate(q: real, gradient: real):
-        return gradient
-
-    @wp.func
     def left(m: vec3, factor: real, to: record):
         energy_left = real(0.0)
         if m[0] > real(0.0):
             energy_left = factor * (m[2] - m[1] * to[1])
         return energy_left
 
-    return Potential(record, real, vec3, moments, merge_rests, energy, slope, rate, left, 2)
+    return Potential(record, real, vec3, moments, merge_rests, energy, slope, left, 2)
 
 
 @cache
@@ -445,14 +448,10 @@ def periodic() -> Potential:
         return third * (real(8.0) * to[3] * s - twice + to[5])
 
     @wp.func
-    def rate(q: vec2, gradient: vec2):
-        return q[0] * gradient[1] - q[1] * gradient[0]
-
-    @wp.func
     def left(m: vec5, factor: real, to: record):
         return real(2.5) * to[0] - third * (real(8.0) * to[3] - real(0.5) * to[4])
 
-    return Potential(record, vec2, vec5, moments, merge_rests, energy, slope, rate, left, 6)
+    return Potential(record, vec2, vec5, moments, merge_rests, energy, slope, left, 6)
 
 
 @cache

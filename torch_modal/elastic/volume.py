@@ -48,16 +48,6 @@ class Volume(Term):
         gradients = torch.stack([cross(q, r), cross(r, p), cross(p, q)]) / 6
         return (p * gradients[0]).sum(0), gradients
 
-    def hessians(self, edge_vectors: Tensor) -> Tensor:
-        """``p.(q x r)`` has the block ``-[r]`` between ``p`` and ``q``."""
-        zero = torch.zeros_like(edge_vectors[0, 0])
-        p, q, r = (
-            torch.stack([zero, z, -y, -z, zero, x, y, -x, zero]).unflatten(0, (3, 3)) for x, y, z in edge_vectors / 6
-        )
-        none = torch.zeros_like(p)
-        rows = (none, r, -q), (-r, none, p), (q, -p, none)
-        return torch.stack([torch.stack(row, 1) for row in rows])
-
     def kernel_functions(self, n: int) -> KernelFunctions | None:
         """Functions of rest shapes; of a class that inherits from this one, none."""
         return kernel_functions() if type(self) is Volume else None
@@ -104,7 +94,7 @@ def kernels() -> SimpleNamespace:
     """Volumes as above, with their gradients, and the adjoint."""
     import warp as wp
 
-    from torch_modal.elastic.kernels.types import length_of, place, wide
+    from torch_modal.elastic.kernels.types import length_of, place
 
     real, vec3, module = wp.float64, wp.vec3d, wp.get_module("torch_modal.elastic.kernels.volume")
     half, sixth = wp.constant(real(0.5)), wp.constant(real(1 / 6))
@@ -137,32 +127,4 @@ def kernels() -> SimpleNamespace:
                 surface += half * length_of(doubled)
         wp.atomic_add(result, 2 * s + 1, vec3(inside, surface, real(0.0)))
 
-    @wp.func
-    def columns_of(columns: wp.array[wide], v: int, n_blocks: int, b: int):
-        at = place(3 * n_blocks * v, b)
-        return wp.matrix_from_rows(columns[at], columns[place(at, n_blocks)], columns[place(at, 2 * n_blocks)])
-
-    @wp.kernel(module=module, enable_backward=False)
-    def curved(
-        faces: wp.array[wp.vec3i], n_vertices: int, x: wp.array[vec3], moment: wp.array[real],
-        columns: wp.array[wide], n_rows: int, n_blocks: int, out: wp.array[wide], threads: int,
-    ):  # fmt: skip
-        """The volume's Hessian times its moment on columns of vertices and the centre, added."""
-        i = wp.tid()
-        s = i // threads
-        v = s * n_vertices
-        for k in range(i - s * threads, faces.shape[0], threads):
-            face = faces[place(k, 0)]
-            p = sixth * moment[s] * x[place(v, face[0])]
-            q = sixth * moment[s] * x[place(v, face[1])]
-            r = sixth * moment[s] * x[place(v, face[2])]
-            for b in range(n_blocks):
-                result = wp.skew(r - q) @ columns_of(columns, face[0], n_blocks, b)
-                result += wp.skew(p - r) @ columns_of(columns, face[1], n_blocks, b)
-                result += wp.skew(q - p) @ columns_of(columns, face[2], n_blocks, b)
-                for j in range(3):
-                    to = place(3 * n_blocks * (s * n_rows + face[j]), b)
-                    for a in range(3):
-                        wp.atomic_add(out, place(to, a * n_blocks), result[a])
-
-    return SimpleNamespace(sizes=sizes, curved=curved)
+    return SimpleNamespace(sizes=sizes)

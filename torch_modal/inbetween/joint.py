@@ -7,10 +7,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from torch_modal.elastic.backend import TorchBackend
 from torch_modal.elastic.energy import AssembledTerm, Energy, RestShapes
-from torch_modal.elastic.modal import Derivatives, Placement
-from torch_modal.elastic.shell import N_SHELL_TERMS
+from torch_modal.elastic.modal import Derivatives, ModalEnergy, Placement, value_and_gradient
 from torch_modal.elastic.steps import FineEnergy
 from torch_modal.inbetween.coarse import CoarseMesh
 
@@ -21,13 +19,12 @@ class JointSpace(nn.Module):
     The basis is orthonormal under vertex weights that add up to one, so that the anchor ``rho`` holds the mean squared
     distance from the base: without it, the minimiser jumps between far minima of almost the same energy.
 
-    The terms of Eq. 5 are evaluated on the coarse mesh, and so are others, but for those that name vertices of the
-    caller's mesh. A placement has one part for each of these kinds that there is.
+    Terms are evaluated on the coarse mesh, except those that name vertices of the caller's mesh. A placement has one
+    part for each of these kinds that there is.
 
     Args:
         coarse: The coarse mesh.
         fine: All terms on the caller's mesh.
-        backend: Makes the energies in the amplitudes.
         basis: Directions of the subspace, ``U``, on the fine and on the coarse mesh, where they are orthonormal under
             the weights of the vertices. *Shape:* ``(n, V, 3), (n, V_coarse, 3)``.
         anchor: ``rho``.
@@ -37,33 +34,22 @@ class JointSpace(nn.Module):
     basis: Tensor
     coarse_basis: Tensor
 
-    def __init__(
-        self,
-        coarse: CoarseMesh,
-        fine: FineEnergy,
-        backend: TorchBackend,
-        basis: tuple[Tensor, Tensor],
-        anchor: float = 0.0,
-    ) -> None:
+    def __init__(self, coarse: CoarseMesh, fine: FineEnergy, basis: tuple[Tensor, Tensor], anchor: float = 0.0) -> None:
         super().__init__()
         self.register_buffer("basis", basis[0], persistent=False)
         self.register_buffer("coarse_basis", basis[1], persistent=False)
-        mesh, terms = coarse.mesh, [summand.term for summand in fine.energy.parts]
-        kinds = [2 if term.sampled else 1 if i >= N_SHELL_TERMS else 0 for i, term in enumerate(terms)]
-        members = [[i for i, kind in enumerate(kinds) if kind == level] for level in range(3)]
+        terms = [summand.term for summand in fine.energy.parts]
+        members = [[i for i, term in enumerate(terms) if term.sampled == kind] for kind in (False, True)]
         #: The terms of each part.
         self.members = [numbers for numbers in members if numbers]
         self.n_anchors = [0 if term.anchors is None else len(term.anchors) for term in terms]
         parts = []
         for numbers in self.members:
             sampled = terms[numbers[0]].sampled
-            energy = Energy(fine.mesh if sampled else mesh, [terms[i] for i in numbers], sampled)
-            columns = self.basis[:, energy.vertices] if sampled else self.coarse_basis
-            parts.append(backend.modal_energy(energy, mesh, columns))
+            energy = Energy(fine.mesh if sampled else coarse.mesh, [terms[i] for i in numbers], sampled)
+            parts.append(ModalEnergy(energy, self.basis[:, energy.vertices] if sampled else self.coarse_basis))
         self.parts: Any = nn.ModuleList(parts)
         self.coarse, self.anchor = coarse, anchor
-        #: Steps of the minimisation.
-        self.quasi_newton = backend.quasi_newton
         self.__dict__["fine"] = fine  # not registered here: it belongs to the solver
 
     # ----------------------------------------------------------------------------------------------- the affine space
@@ -90,7 +76,7 @@ class JointSpace(nn.Module):
             if anchors is not None:
                 each = anchors.split(self.n_anchors, 1)
                 anchors = torch.cat([each[i] for i in members], 1)
-            reference = part.reference(RestShapes(shapes, rests.weights, stiffness), part_base if soften else None)
+            reference = RestShapes(shapes, rests.weights, stiffness).reference(energy, part_base if soften else None)
             placed.append(part.place(part_base, reference, anchors))
         return placed
 
@@ -106,13 +92,12 @@ class JointSpace(nn.Module):
 
     def value(self, a: Tensor, placement: Sequence[Placement]) -> Tensor:
         """Energy at ``a``. *Shape:* ``(..., B, n) -> (..., B)``."""
-        energies = [part.value(a.to(at.base.dtype), at) for part, at in zip(self.parts, placement, strict=True)]
+        energies = [part.value(a, at) for part, at in zip(self.parts, placement, strict=True)]
         return reduce(torch.add, energies) + 0.5 * self.anchor * a.square().sum(-1)
 
     def derivatives(self, a: Tensor, placement: Sequence[Placement], second_order: bool = True) -> Derivatives:
         """Energy, gradient and Hessians at ``a``. *Shape:* ``(B, n)``."""
-        pairs = zip(self.parts, placement, strict=True)
-        parts = [part.derivatives(a.to(at.base.dtype), at, second_order) for part, at in pairs]
+        parts = [part.derivatives(a, at, second_order) for part, at in zip(self.parts, placement, strict=True)]
         sums: list[Any] = [None if each[0] is None else reduce(torch.add, each) for each in zip(*parts, strict=True)]
         value, gradient, gauss_newton, *others = sums
         value, eye = value + 0.5 * self.anchor * a.square().sum(-1), torch.eye(a.shape[-1]).to(gauss_newton)
@@ -120,11 +105,7 @@ class JointSpace(nn.Module):
 
     def value_and_gradient(self, a: Tensor, placement: Sequence[Placement]) -> tuple[Tensor, Tensor]:
         """Energy and gradient at ``a``. *Shape:* ``(B, n) -> (B,), (B, n)``."""
-        pairs = zip(self.parts, placement, strict=True)
-        each = [part.value_and_gradient(a.to(at.base.dtype), at) for part, at in pairs]
-        values, gradients = zip(*each, strict=True)
-        value = torch.add(reduce(torch.add, values), a.square().sum(-1), alpha=0.5 * self.anchor)
-        return value, torch.add(reduce(torch.add, gradients), a, alpha=self.anchor)
+        return value_and_gradient(self, a, placement)
 
 
 def coarse_values(values: Tensor, fine: AssembledTerm, coarse: AssembledTerm, clusters: Tensor, n: int) -> Tensor:

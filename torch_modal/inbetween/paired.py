@@ -1,13 +1,12 @@
 """The paired space of the paper (Eq. 4): one shape near each key-frame, pulled together."""
 
-from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from torch_modal.elastic.energy import RestShapes
-from torch_modal.elastic.modal import Derivatives, Placement
+from torch_modal.elastic.modal import Derivatives, Placement, value_and_gradient
 from torch_modal.inbetween.joint import JointSpace
 
 
@@ -61,7 +60,8 @@ class PairedSpace(nn.Module):
             rest = rests._replace(shapes=rests.shapes[:, k : k + 1], weights=torch.ones_like(rests.weights[:, :1]))
             placed.append(tuple(space.place(rests.shapes[:, k], rest, soften=False)))
         difference = self.first.coarse.restrict(rests.shapes[:, 0] - rests.shapes[:, 1]).flatten(1)
-        return PairedPlacement(placed[0], placed[1], difference @ self.gap.mT, (difference**2).sum(-1), mu)
+        linear = difference @ self.gap.to(difference).mT
+        return PairedPlacement(placed[0], placed[1], linear, (difference**2).sum(-1), mu)
 
     def lift(self, a: Tensor, keyframes: Tensor) -> tuple[Tensor, Tensor]:
         """The fine shapes ``x_1`` and ``x_2``. *Shape:* ``(B, n), (B, 2, V, 3) -> (B, V, 3)`` each."""
@@ -87,31 +87,24 @@ class PairedSpace(nn.Module):
 
     def derivatives(self, a: Tensor, placement: PairedPlacement, second_order: bool = True) -> Derivatives:
         """Energy, gradient and Hessians at ``a``; the similarity is quadratic and part of Gauss-Newton's."""
-        ends = self._ends(a, placement)
+        ends = zip((self.first, self.second), self.split(a), (placement.first, placement.second), strict=True)
         first, second = (space.derivatives(a_k, place, second_order) for space, a_k, place in ends)
         similarity, slope = self._similarity(a, placement)
         value, gradient = first.value + second.value + similarity, torch.cat([first.gradient, second.gradient], -1)
-        similar = 2 * placement.mu[:, None, None] * self.gap_gram
+        similar = 2 * placement.mu[:, None, None] * self.gap_gram.to(a)
         gauss_newton = _block_diagonal(first.gauss_newton, second.gauss_newton) + similar
         curved = _block_diagonal(first.second_order, second.second_order) if second_order else None
         return Derivatives(value, gradient + slope, gauss_newton, curved, first.resolution + second.resolution)
 
     def value_and_gradient(self, a: Tensor, placement: PairedPlacement) -> tuple[Tensor, Tensor]:
         """Energy and gradient at ``a``. *Shape:* ``(B, n) -> (B,), (B, n)``."""
-        first, second = (space.value_and_gradient(a_k, place) for space, a_k, place in self._ends(a, placement))
-        similarity, slope = self._similarity(a, placement)
-        return first[0] + second[0] + similarity, torch.cat([first[1], second[1]], -1) + slope
+        return value_and_gradient(self, a, placement)
 
     def _similarity(self, a: Tensor, placement: PairedPlacement) -> tuple[Tensor, Tensor]:
         """The energy of the similarity and its gradient. *Shape:* ``(..., B, n) -> (..., B), (..., B, n)``."""
-        grown = a @ self.gap_gram
+        grown = a @ self.gap_gram.to(a)
         value = (a * (grown + 2 * placement.linear)).sum(-1) + placement.constant
         return placement.mu * value, 2 * placement.mu[:, None] * (grown + placement.linear)
-
-    def _ends(
-        self, a: Tensor, placement: PairedPlacement
-    ) -> Iterator[tuple[JointSpace, Tensor, tuple[Placement, ...]]]:
-        return zip((self.first, self.second), self.split(a), (placement.first, placement.second), strict=True)
 
 
 def _block_diagonal(first: Any, second: Any) -> Tensor:

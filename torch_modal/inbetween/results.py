@@ -77,7 +77,7 @@ def report(solution: Solution, solver: Solver) -> None:
     Raises:
         ConvergenceError: Something did not converge where gradients are recorded, and that is an error.
     """
-    if not is_traced(solution.status) and solver.gradient == "implicit":
+    if not is_traced(solution.status):
         forbid = solver.unconverged == "raise" and torch.is_grad_enabled()
         seen = [x for x in (solution.status, solution.distortion_ratio) if x is not None]
         run_outside_transforms(partial(_report, max_steps=solver.max_steps, forbid=forbid), *seen)

@@ -8,7 +8,7 @@ from typing import Any, Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from torch_modal.elastic.backend import names
+from torch_modal.elastic.backend import BACKENDS
 from torch_modal.elastic.bend import Bend, SquaredBend
 from torch_modal.elastic.energy import Energy
 from torch_modal.elastic.shell import ALPHA, BETA, GAMMA
@@ -93,23 +93,20 @@ class Solver:
     """The way to solve.
 
     Attributes:
-        max_steps: Steps at most in the modal space; with ``gradient="unroll"`` exactly that many Newton steps.
+        max_steps: Newton steps at most in the modal space.
         tolerance: Bound on the gradient norm there, relative to the one at the start. Gradients of the layer are as
             exact as that. It is the same whether gradients are recorded or not, and so is the result.
-        gradient: ``"implicit"`` (by the implicit function theorem with the full Hessian; memory does not grow with the
-            steps) or ``"unroll"`` (through all steps).
         unconverged: What happens when samples did not converge: ``"warn"`` warns and lets no gradient flow through
-            their amplitudes, ``"raise"`` raises where gradients are recorded. With ``gradient="unroll"`` only ``solve``
-            tells.
+            their amplitudes, ``"raise"`` raises where gradients are recorded.
         local_steps: Newton steps of all vertices. Gradients go through them; they cost memory in proportion to V.
         polish: Further steps on the fine mesh, each four times as long; two come within 2 % of the optimum.
         regions: In the paired space, the segments that are interpolated once more on the fine mesh, the rest fixed:
             of 24, the worst reached by the modes (section 3.2 of the paper). They are chosen once, by the references of
             the bases: no gradient goes through the choice. Two bases of one reference have none.
-        backend: ``"warp"`` (kernels of NVIDIA Warp for the local rotations, the modal energy and the local steps),
-            ``"torch"``, ``"auto"`` (kernels where Warp is installed), or one that was registered (docs/extending.md).
-            Kernels compute in float64, also in a layer of float32. Terms of your own without a
-            :attr:`~torch_modal.Term.kernel_measure` are computed by torch.
+        backend: ``"warp"`` (kernels of NVIDIA Warp for the local rotations and the local steps), ``"torch"``, or
+            ``"auto"`` (kernels where Warp is installed). Kernels, and the modal solve, compute in float64, also in a
+            layer of float32. Terms of your own without a :attr:`~torch_modal.Term.kernel_measure` are computed by
+            torch.
 
     Raises:
         ValueError: A choice that does not exist, or a number out of range.
@@ -117,7 +114,6 @@ class Solver:
 
     max_steps: int = 80
     tolerance: float = 3e-7
-    gradient: Literal["implicit", "unroll"] = "implicit"
     unconverged: Literal["warn", "raise"] = "warn"
     local_steps: int = 2
     polish: int = 0
@@ -125,9 +121,8 @@ class Solver:
     backend: str = "auto"
 
     def __post_init__(self) -> None:
-        _choice("gradient", self.gradient, ("implicit", "unroll"))
         _choice("unconverged", self.unconverged, ("warn", "raise"))
-        _choice("backend", self.backend, names())
+        _choice("backend", self.backend, ("auto", *BACKENDS))
         for name in ("max_steps", "local_steps", "polish", "regions"):
             _whole(name, getattr(self, name), 0)
         if not self.tolerance >= 0:

@@ -6,11 +6,11 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from torch_modal.elastic.backend import TorchBackend, choose
+from torch_modal import trees
+from torch_modal.elastic.backend import choose
 from torch_modal.elastic.energy import Energy, RestShapes
-from torch_modal.elastic.gauss_newton import newton
-from torch_modal.elastic.implicit import solve_implicit, solve_unrolled
-from torch_modal.elastic.minimise import Solution, Status, minimise
+from torch_modal.elastic.implicit import solve_implicit
+from torch_modal.elastic.minimise import Solution, Status
 from torch_modal.elastic.shell import N_SHELL_TERMS
 from torch_modal.elastic.term import Mesh, Term
 from torch_modal.inbetween.alignment import KeyframeAlignment, Pose
@@ -74,13 +74,10 @@ class InBetweenSolver(nn.Module):
         alignment, rotations = self.alignment, self.alignment.turns
         aligned_modes = [basis @ rotation.mT for basis, rotation in zip(modes, rotations, strict=True)]
         coarse = CoarseMesh(alignment.references, self.mesh, objective.coarse_faces, alignment.weights, aligned_modes)
-        # The paired space, and steps that are unrolled, are differentiated like any other expression: by torch.
-        by_kernels = self.blend is not None and self.solver.gradient == "implicit"
-        args = coarse, self.fine, self.backend if by_kernels else TorchBackend()
         if self.blend is not None:
-            return JointSpace(*args, elastic_subspace(aligned_modes, alignment, coarse), objective.anchor)
-        first, second = (JointSpace(*args, elastic_subspace([basis], alignment, coarse)) for basis in aligned_modes)
-        return PairedSpace(first, second)
+            return JointSpace(coarse, self.fine, elastic_subspace(aligned_modes, alignment, coarse), objective.anchor)
+        each = (elastic_subspace([basis], alignment, coarse) for basis in aligned_modes)
+        return PairedSpace(*(JointSpace(coarse, self.fine, basis) for basis in each))
 
     def forward(self, samples: Samples) -> InBetweenResult:
         """Solve.
@@ -123,12 +120,9 @@ class InBetweenSolver(nn.Module):
         """Amplitudes of least energy in the modal space. *Shape:* of ``mu`` and ``usable`` ``(B,)``."""
         if not self.modal:
             return trivial_solution(base, usable)
-        arguments = self.space, self.space.place(base, rests, mu), usable, self.solver.max_steps, self.solver.tolerance
-        if self.solver.gradient == "unroll":
-            solution = solve_unrolled(*arguments)
-        else:
-            solution = solve_implicit(*arguments, newton if self.blend is None else minimise)
-        # Kernels compute in float64, whatever goes in and comes out.
+        # In float64, whatever goes in and comes out.
+        placement = self.space.place(*trees.map_leaves((base, rests, mu), Tensor.double))
+        solution = solve_implicit(self.space, placement, usable, self.solver.max_steps, self.solver.tolerance)
         values = (value.to(base) if value.is_floating_point() else value for value in solution if value is not None)
         return Solution(*values)
 

@@ -184,8 +184,7 @@ class InBetweenLayer(PreciseModule):
 
         *Shape:* ``(*lead, K, V, 3), (*lead, K)``, or ones that expand to these.
         """
-        if self.solver.gradient == "implicit" or self.solver.local_steps or self.solver.regions:
-            require_numbers(type(self).__name__, keyframes)
+        require_numbers(type(self).__name__, keyframes)
         self._require_own_bases()
         n, item = weights.shape[-1], keyframes.shape[-2:]
         flat = keyframes.to(self.dtype).expand(*lead, n, *item).reshape(-1, n, *item)

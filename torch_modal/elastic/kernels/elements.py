@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from torch_modal.elastic.bend import LEAST_FULLNESS
-from torch_modal.elastic.kernels.types import block, place, real, symmetric, vec3, wide
+from torch_modal.elastic.kernels.types import block, place, real, symmetric, vec3
 from torch_modal.elastic.term import KernelFunctions
 
 
@@ -299,65 +299,10 @@ def convex_adjoint(f: KernelFunctions, rider: KernelFunctions | None) -> SimpleN
 
 @cache
 def forward(f: KernelFunctions) -> SimpleNamespace:
-    """Merged rest shapes, and the Jacobian along columns of a space."""
-    c, potential, module, n = _common(f), f.potential, _module(f, "forward"), f.n
+    """Kernels that merge the rest shapes of a term into records (Eq. 8)."""
+    c, potential, module = _common(f), f.potential, _module(f, "forward")
     corners, edge_vectors, record = c.corners, c.edge_vectors, potential.record
-    kernel = _kernel(f, module)
-
-    @kernel
-    def jacobian(
-        elements: wp.array[corners], n_vertices: int, x: wp.array[vec3], rests: wp.array[record],
-        columns: wp.array[wide], n_columns: int, n_blocks: int, first_row: int, n_rows: int, out: wp.array[wide],
-        entries: wp.array[real], totals: wp.array[wp.vec2d], threads: int,
-    ):  # fmt: skip
-        """Change of each measure along the columns, and the measure's residual; all stiffnesses and energies together.
-
-        All by the root of twice the weight. The residual comes in the column after the last. A component of a vertex
-        has a row of blocks of eight columns; those of the measures are the same memory twice.
-        """
-        i = wp.tid()
-        s = i // threads
-        total = real(0.0)
-        energy = real(0.0)
-        for k in range(i - s * threads, elements.shape[0], threads):
-            q = elements[place(k, 0)]
-            to = rests[place(s * elements.shape[0], k)]
-            row = s * n_rows + first_row + k
-            m, g = f.linearise(edge_vectors(x, s * n_vertices, q))
-            root = wp.sqrt(real(2.0) * to[0])
-            g = root * g
-            for b in range(n_blocks):
-                product_row = wide()
-                first = vec3()
-                for j in range(wp.static(n)):
-                    at = place(3 * n_blocks * q[j + 1], b)
-                    product_row += g[j, 0] * columns[at]
-                    product_row += g[j, 1] * columns[place(at, n_blocks)]
-                    product_row += g[j, 2] * columns[place(at, 2 * n_blocks)]
-                    first += g[j]
-                at = place(3 * n_blocks * q[0], b)
-                product_row -= first[0] * columns[at]
-                product_row -= first[1] * columns[place(at, n_blocks)]
-                product_row -= first[2] * columns[place(at, 2 * n_blocks)]
-                out[place(row * n_blocks, b)] = product_row
-            residual = real(0.0)
-            if root > real(0.0):
-                residual = potential.slope(m, to) / root
-            entries[place(row * n_blocks * 8, n_columns)] = residual
-            total += root * root
-            energy += potential.energy(m, to)
-        wp.atomic_add(totals, s, wp.vec2d(total, energy))
-
-    merge = _merge_kernel(f, module) if f.weight is not None else {}
-    return SimpleNamespace(jacobian=jacobian, **merge)
-
-
-def _merge_kernel(f: KernelFunctions, module: "wp.Module") -> dict[str, "wp.Kernel"]:
-    """Kernels that merge the rest shapes of a term into records (Eq. 8), where it has weights for them."""
-    c, potential = _common(f), f.potential
-    corners, edge_vectors, record = c.corners, c.edge_vectors, potential.record
-    kernel = _kernel(f, module)
-    merging = _merging(f)
+    kernel, merging = _kernel(f, module), _merging(f)
     fullness, softness, merge_rests = merging.fullness, merging.softness, merging.merge
 
     @kernel
@@ -393,7 +338,7 @@ def _merge_kernel(f: KernelFunctions, module: "wp.Module") -> dict[str, "wp.Kern
         wp.atomic_add(constant, s, left)
 
     if not f.uses_mean:
-        return {"merge": merge}
+        return SimpleNamespace(merge=merge)
 
     @kernel
     def total(
@@ -407,89 +352,10 @@ def _merge_kernel(f: KernelFunctions, module: "wp.Module") -> dict[str, "wp.Kern
             moments_sum += f.measure(edge_vectors(x, s * n_vertices, elements[place(k, 0)]))
         wp.atomic_add(out, s, moments_sum)
 
-    return {"merge": merge, "total": total}
+    return SimpleNamespace(merge=merge, total=total)
 
 
 @cache
 def backward(f: KernelFunctions) -> SimpleNamespace:
-    """The adjoint of ``merge``, and second derivatives."""
-    c, potential, module, n = _common(f), f.potential, _module(f, "backward"), f.n
-    vectors, corners, edge_vectors, inner = c.vectors, c.corners, c.edge_vectors, c.inner
-    record, slope_of, hessian_product = potential.record, potential.slope, f.hessian_product
-
-    @wp.func
-    def of_gradient(e: vectors, received: vectors):
-        """The gradient of the measure along a direction: its own gradient is a product with a Hessian."""
-        _m, g = f.linearise(e)
-        return inner(g, received)
-
-    if hessian_product is None:
-
-        @wp.func
-        def hessian_product(e: vectors, received: vectors):
-            product, _unused = wp.grad(of_gradient)(e, received)
-            return product
-
-    @wp.kernel(module=module)
-    def hessians(
-        elements: wp.array[corners], n_vertices: int, x: wp.array[vec3], rests: wp.array[record],
-        out: wp.array[vectors], threads: int,
-    ):  # fmt: skip
-        """Second derivatives of the energy of each element beyond Gauss and Newton's, in its edge vectors."""
-        i = wp.tid()
-        s = i // threads
-        for k in range(i - s * threads, elements.shape[0], threads):
-            q = elements[place(k, 0)]
-            at = place(s * elements.shape[0], k)
-            to = rests[at]
-            e = edge_vectors(x, s * n_vertices, q)
-            m, g = f.linearise(e)
-            slope = potential.slope(m, to)
-            to_m, _0 = wp.grad(slope_of)(m, to)
-            beyond = potential.rate(m, to_m) - real(2.0) * to[0]
-            for j in range(3 * n):
-                unit = vectors()
-                unit[j // 3, j % 3] = slope
-                out[place(3 * n * at, j)] = hessian_product(e, unit) + (beyond * g[j // 3, j % 3]) * g
-
-    merge = None if f.weight is None else wp.kernel(forward(f).merge.func, module=module)
-    return SimpleNamespace(hessians=hessians, merge=merge)
-
-
-@cache
-def curving(n: int) -> SimpleNamespace:
-    """Second derivatives of elements of so many edge vectors, on the columns of a space."""
-    corners, module = wp.types.vector(length=n + 1, dtype=wp.int32), wp.get_module(f"{__name__}.curving{n}")
-    local = wp.types.matrix(shape=(3 * n, 3 * n), dtype=real)
-    tall = wp.types.matrix(shape=(3 * n, 8), dtype=real)
-
-    @wp.kernel(module=module, enable_backward=False)
-    def curved(
-        elements: wp.array[corners], hessians: wp.array[local], n_vertices: int, columns: wp.array[wide],
-        n_blocks: int, out: wp.array[wide], threads: int,
-    ):  # fmt: skip
-        """Sums on the vertices."""
-        i = wp.tid()
-        s = i // threads
-        for k in range(i - s * threads, elements.shape[0], threads):
-            q = elements[place(k, 0)]
-            h = hessians[place(s * elements.shape[0], k)]
-            for b in range(n_blocks):
-                moved = tall()
-                first = place(3 * n_blocks * q[0], b)
-                for j in range(wp.static(n)):
-                    at = place(3 * n_blocks * q[j + 1], b)
-                    for a in range(3):
-                        moved[3 * j + a] = columns[place(at, a * n_blocks)] - columns[place(first, a * n_blocks)]
-                for a in range(3):
-                    whole = wide()
-                    for j in range(wp.static(n)):
-                        received = h[3 * j + a, 0] * moved[0]
-                        for r in range(1, wp.static(3 * n)):
-                            received += h[3 * j + a, r] * moved[r]
-                        to = 3 * n_blocks * (s * n_vertices + q[j + 1]) + a * n_blocks
-                        wp.atomic_add(out, place(to, b), received)
-                        whole += received
-                    wp.atomic_add(out, place(3 * n_blocks * (s * n_vertices + q[0]) + a * n_blocks, b), -whole)
-
-    return SimpleNamespace(curved=curved)
+    """The adjoint of ``merge``."""
+    return SimpleNamespace(merge=wp.kernel(forward(f).merge.func, module=_module(f, "backward")))

@@ -33,15 +33,15 @@ def make_once(make: Callable[..., Any], *arguments: Any) -> Any:
         return make(*arguments)
 
 
-def of_elements(kind: Literal["convex", "convex_adjoint", "forward", "backward", "curving"], *arguments: Any) -> Any:
-    """Kernels of a module that one or two terms have, or elements of so many edge vectors."""
+def of_elements(kind: Literal["convex", "convex_adjoint", "forward", "backward"], *arguments: Any) -> Any:
+    """Kernels of a module that one or two terms have."""
     return make_once(getattr(kernels("elements"), kind), *arguments)
 
 
 def load_kernels() -> None:
     """Load the kernels of in-betweens without gradients for the CPU, so that the first call does not wait for them."""
     with _LOADING:
-        elements, *_ = map(kernels, ("elements", "procrustes", "rotations", "quasi_newton", "steps"))
+        elements, *_ = map(kernels, ("elements", "procrustes", "rotations", "steps"))
         shell_functions = bend.kernel_functions(), stretch.kernel_functions()
         for functions in (*shell_functions, volume.kernel_functions()):
             elements.forward(functions)

@@ -7,8 +7,6 @@ vec3 = wp.vec3d
 vec4 = wp.vec4d
 symmetric = wp.types.vector(length=6, dtype=real)
 """Entries ``xx, xy, xz, yy, yz, zz`` of a symmetric matrix."""
-wide = wp.types.vector(length=8, dtype=real)
-"""A row's entries of eight columns."""
 
 TINY = wp.constant(real(1.4916681462400413e-154))  # vectors.tiny of float64
 TINIEST = wp.constant(real(2.2250738585072014e-308))
