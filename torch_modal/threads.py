@@ -182,10 +182,15 @@ def by_chunks(compute: Callable[[Any], Any], samples: Any, n_vertices: int, clos
         n_vertices: Number of vertices of a sample.
         closed: True if no other tensor has gradients. Otherwise the backward pass is torch's, on one thread.
     """
-    tensors, tree = trees.leaves(samples), trees.skeleton(samples)
+    tensors = trees.leaves(samples)
     if not is_eager(*tensors) or within_transforms() or current_dispatch_mode() is not None or not tensors[0].is_cpu:
         return compute(samples)
     sizes, skeletons = chunk_sizes(len(tensors[0]), n_vertices), []
+    recording = closed and torch.is_grad_enabled() and any(x.requires_grad for x in tensors)
+    if len(sizes) == 1 and not recording:
+        with alone():
+            return compute(samples)
+    tree = trees.skeleton(samples)
 
     def result(chunk: Sequence[Tensor]) -> list[Tensor]:
         output = compute(trees.fill(tree, chunk))
@@ -197,9 +202,6 @@ def by_chunks(compute: Callable[[Any], Any], samples: Any, n_vertices: int, clos
         return list(zip(parts, run([partial(result, chunk) for chunk in parts]), strict=True))
 
     with alone():
-        recording = closed and torch.is_grad_enabled() and any(x.requires_grad for x in tensors)
-        if len(sizes) == 1 and not recording:
-            return compute(samples)
         if recording:
             output = _Chunks.apply(results, sizes, *tensors)
         else:

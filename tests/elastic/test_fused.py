@@ -180,7 +180,7 @@ class TestReferences:
         start = case.given[0] * torch.tensor([0.02, 1.0, 3.0], dtype=DOUBLE)
         rests, weights = case.rests(*case.given[1:])[:2]
         rests = torch.cat([rests[:, :1] * torch.tensor([1.0, 0.04, 1.0], dtype=DOUBLE), rests[:, 1:]], 1)
-        operation, given = _MergeRests(case.fused, [1], relative), [rests, weights, case.given[5]]
+        operation, given = _MergeRests(case.fused, [case.fused.parts[1]], relative), [rests, weights, case.given[5]]
         if relative:
             alone = torch.tensor([[1.0, 0.0]] * 2, dtype=DOUBLE)
             as_stiff = operation.by_torch(rests.flip(1), alone, case.given[5], rests[:, 1])[0]

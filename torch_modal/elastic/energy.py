@@ -18,9 +18,8 @@ from torch_modal.geometry.vectors import pick
 _ROWS, _COLUMNS = [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]
 
 
-def energy_rounding(dtype: torch.dtype) -> float:
-    """Relative difference of energies that is rounding."""
-    return 64.0 * torch.finfo(dtype).eps
+# Relative difference of energies that is rounding, in units of the dtype.
+ENERGY_ROUNDING = 64.0
 
 
 class Rest(NamedTuple):

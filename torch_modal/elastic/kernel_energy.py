@@ -4,6 +4,8 @@ The torch code is the reference of the tests, runs where Warp is not installed, 
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import torch
@@ -56,26 +58,32 @@ class KernelTerm(nn.Module):
 
     elements: Tensor
     term: Any
+    bound: dict[Any, Any]
+    """Kernels by kind and name, from their first launch on."""
 
     def __init__(self, part: AssembledTerm, elements: Tensor | None = None) -> None:
         super().__init__()
-        self.part, self.n = part, len(part.corners) - 1
+        self.part, self.n, self.bound = part, len(part.corners) - 1, {}
         self.__dict__["term"] = part.term  # not registered here: the layer owns it
         elements = part.corners.T if elements is None else elements
         self.register_buffer("elements", elements.int().contiguous(), persistent=False)
         self.n_elements = len(elements)
 
-    @property
+    def __getstate__(self) -> dict[str, Any]:
+        """Without functions and kernels, which are no data."""
+        return {name: value for name, value in self.__dict__.items() if name != "functions"} | {"bound": {}}
+
+    @cached_property
     def functions(self) -> Any:
-        """The functions that kernels are made from; they are no data, and are not stored."""
+        """The functions that kernels are made from."""
         return self.term.kernel_functions(self.n)
 
-    def launch(
-        self, name: str, dim: int, *arguments: Any, back: bool = False, adjoints: Sequence[Tensor | None] = ()
-    ) -> None:
+    def launch(self, name: str, dim: int, *arguments: Any, adjoints: Sequence[Tensor | None] = ()) -> None:
         """Run a kernel over the elements of so many samples, or its adjoint."""
-        kernel = getattr(of_elements("backward" if back else "forward", self.functions), name)
-        launch(kernel, (dim, self.n_elements), [self.elements, *arguments], adjoints and [None, *adjoints])
+        key = name, bool(adjoints)
+        if key not in self.bound:
+            self.bound[key] = getattr(of_elements("backward" if adjoints else "forward", self.functions), name)
+        launch(self.bound[key], (dim, self.n_elements), [self.elements, *arguments], adjoints and [None, *adjoints])
 
     def shapes_to_merge(self, shapes: Tensor) -> tuple[Tensor, Tensor | None]:
         """The shapes that elements are merged of, and all measures together, where their mean counts.
@@ -122,11 +130,6 @@ class KernelVolume(KernelTerm):
         share = extended[:, -1:] / len(self.used)
         return extended[:, :-1].index_add(1, self.used, share.expand(-1, len(self.used), -1))
 
-    def of_faces(self, name: str, extended: Tensor, *arguments: Any) -> None:
-        """Run a kernel over the faces of so many samples."""
-        kernel = getattr(make_once(volume.kernels), name)
-        launch(kernel, (len(extended), len(self.faces)), [self.faces, extended.shape[1], extended, *arguments])
-
     def at(self, x: Tensor, gradient: bool = False, area: bool = False) -> tuple[Tensor, Tensor | None]:
         """Volumes, and areas if wanted, as the first two components of the second vertex of an element.
 
@@ -135,7 +138,8 @@ class KernelVolume(KernelTerm):
         """
         extended, sizes = self.extend(x), x.new_zeros(len(x), 2, 3)
         normal = torch.zeros_like(extended) if gradient else None
-        self.of_faces("sizes", extended, sizes, self.n_faces if area else 0, normal)
+        arguments = [self.faces, extended.shape[1], extended, sizes, self.n_faces if area else 0, normal]
+        launch(make_once(volume.kernels).sizes, (len(x), len(self.faces)), arguments)
         return sizes, None if normal is None else self.fold(normal)
 
     def shapes_to_merge(self, shapes: Tensor) -> tuple[Tensor, Tensor | None]:
@@ -198,6 +202,7 @@ class Pass(nn.Module):
         super().__init__()
         self.number, self.term = term
         self.other, self.rider = rider
+        self.bound: dict[Any, Any] = {}
         elements = self.term.elements
         if self.rider is not None and own is not None:
             # Where there is no element, all further vertices are the first.
@@ -212,14 +217,16 @@ class Pass(nn.Module):
 
     def launch(self, name: str, dim: int, *arguments: Any, adjoints: Sequence[Tensor | None] = ()) -> None:
         """Run a kernel over the elements of so many samples, or its adjoint."""
-        functions = self.term.functions, self.rider and self.rider.functions
-        kernel = getattr(of_elements("convex_adjoint" if adjoints else "convex", *functions), name)
+        key = name, bool(adjoints)
+        if key not in self.bound:
+            functions = self.term.functions, self.rider and self.rider.functions
+            self.bound[key] = getattr(of_elements("convex_adjoint" if adjoints else "convex", *functions), name)
         arguments = self.elements, self.own, self.n_own, *arguments
-        launch(kernel, (dim, self.n_elements), arguments, adjoints and [None] * 3 + [*adjoints])
+        launch(self.bound[key], (dim, self.n_elements), arguments, adjoints and [None] * 3 + [*adjoints])
 
-    def records(self, records: Sequence[Tensor]) -> tuple[Tensor, Tensor | None]:
-        """The records of the term and the rider."""
-        return records[self.number], None if self.other is None else records[self.other]
+    def __getstate__(self) -> dict[str, Any]:
+        """Without kernels, which are no data."""
+        return {**self.__dict__, "bound": {}}
 
 
 def _passes(parts: Sequence[KernelTerm], n_vertices: int) -> list[Pass]:
@@ -270,7 +277,8 @@ class KernelEnergy(nn.Module):
             if numbers:
                 tensors = [rests.shapes, rests.weights, *(rests.stiffness[i] for i in numbers)]
                 tensors += [] if start is None else [start]
-                *merged, left = _MergeRests(self, numbers, relative)(*tensors, kernels=by_kernels)
+                parts = [self.parts[i] for i in numbers]
+                *merged, left = _MergeRests(self, parts, relative)(*tensors, kernels=by_kernels)
                 records.update(zip(numbers, merged, strict=True))
                 constant = constant + left
         return Reference(tuple(records[i] for i in range(len(self.parts))), constant)
@@ -282,9 +290,8 @@ class KernelEnergy(nn.Module):
         diagonal = x.new_zeros(*x.shape[:2], 6) if order > 1 else None
         for one in self.passes:
             pass_factors = [x.new_empty(len(x), *size) if order > 1 and size else None for size in one.sizes]
-            one.launch(
-                "linearise", len(x), x.shape[1], x, *one.records(to.records), energy, gradient, diagonal, *pass_factors
-            )
+            records = to.records[one.number], None if one.other is None else to.records[one.other]
+            one.launch("linearise", len(x), x.shape[1], x, *records, energy, gradient, diagonal, *pass_factors)
             factors.append(pass_factors)
         if not self.volumes:
             zeros = torch.zeros_like(energy)
@@ -342,8 +349,11 @@ class KernelEnergy(nn.Module):
         """
         b, n = x.shape[:2]
         for one, factors, received in zip(self.passes, at.factors, to_factors or at.factors, strict=True):
-            values = n, x, *one.records(to.records), at.value, at.gradient, at.diagonal, *factors
-            adjoints = None, to_x, *one.records(to_records), to_energy, to_gradient, to_diagonal, *received
+            records, to_own = (
+                (each[one.number], None if one.other is None else each[one.other]) for each in (to.records, to_records)
+            )
+            values = n, x, *records, at.value, at.gradient, at.diagonal, *factors
+            adjoints = None, to_x, *to_own, to_energy, to_gradient, to_diagonal, *received
             one.launch("linearise", b, *values, adjoints=adjoints)
         if not self.volumes:
             return
@@ -363,22 +373,28 @@ class KernelEnergy(nn.Module):
         to_records[i].add_(torch.stack([to_weight, -to_volume], -1)[:, None])
 
 
+@dataclass(frozen=True, eq=False)
 class _MergeRests(Operation):
     """Rest shapes, weights, the stiffnesses of some terms, and perhaps a start as records, and what remains."""
 
-    def __init__(self, energy: KernelEnergy, numbers: Sequence[int], relative: bool) -> None:
-        self.energy, self.parts, self.relative = energy, [energy.parts[i] for i in numbers], relative
-        self.n_differentiable = len(numbers)
-        self.n_results = self.n_differentiable + 1
+    energy: KernelEnergy
+    parts: Sequence[KernelTerm]
+    relative: bool
 
-    def _split(self, tensors: Sequence[Tensor]) -> tuple[Tensor, Tensor, Sequence[Tensor], Tensor | None]:
-        shapes, weights, *more = tensors
-        n = len(self.parts)
-        return shapes, weights, more[:n], more[n] if len(more) > n else None
+    @property
+    def n_differentiable(self) -> int:  # type: ignore[override]
+        """Number of records."""
+        return len(self.parts)
+
+    @property
+    def n_results(self) -> int:  # type: ignore[override]
+        """Records, and the constant."""
+        return len(self.parts) + 1
 
     def _arguments(self, i: int, seen: tuple[Tensor, Tensor | None], tensors: Sequence[Tensor]) -> list[Any]:
         """Arguments of the kernel before its results, or their gradients."""
-        (x, total), (shapes, weights, stiffness, start) = seen, self._split(tensors)
+        (x, total), (shapes, weights, *stiffness) = seen, tensors
+        start = stiffness[-1] if len(stiffness) > len(self.parts) else None
         soft = None if self.parts[i].functions.fullness is None else start
         relative = self.relative and soft is not None
         needle = NEEDLE_OF_STEPS if relative else NEEDLE
@@ -406,13 +422,14 @@ class _MergeRests(Operation):
             values = *self._arguments(i, kept[i], tensors), torch.empty_like(grads[i]), torch.empty_like(grads[-1])
             _, _, to_weights, _, to_stiffness, to_start, *sizes = self._arguments(i, (to_seen, None), gradients)
             adjoints = None, to_seen, to_weights, None, to_stiffness, to_start, *[None] * len(sizes), grads[i]
-            term.launch("merge", len(tensors[0]), *values, back=True, adjoints=adjoints)
+            term.launch("merge", len(tensors[0]), *values, adjoints=adjoints)
             if isinstance(term, KernelVolume):
                 term.back(tensors[0].flatten(0, 1), to_seen, None, to_shapes)
         return gradients
 
     def by_torch(self, *tensors: Tensor) -> tuple[Tensor, ...]:
-        shapes, weights, stiffness, start = self._split(tensors)
+        shapes, weights, *stiffness = tensors
+        start = stiffness.pop() if len(stiffness) > len(self.parts) else None
         extend = self.energy.energy.extend
         rows, begin = extend(shapes.movedim(-1, 0)), None if start is None else extend(start.movedim(-1, 0))
         pairs = zip(self.parts, stiffness, strict=True)

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.func import vjp
 
-from torch_modal.elastic.energy import Energy, Linearised, Reference, energy_rounding
+from torch_modal.elastic.energy import ENERGY_ROUNDING, Energy, Linearised, Reference
 from torch_modal.elastic.shell import ShellEnergy
 from torch_modal.elastic.term import Term
 
@@ -48,7 +48,7 @@ class Derivatives(NamedTuple):
         """Change of the energy, a sum of squares, that rounding of sums and positions explains. *Shape:* ``(B,)``."""
         stiffest = self.gauss_newton.diagonal(dim1=-2, dim2=-1).amax(-1).clamp_min(torch.finfo(self.value.dtype).tiny)
         of_positions = self.resolution * (self.value.clamp_min(0) / stiffest).sqrt()
-        return energy_rounding(self.value.dtype) * self.value.abs() + of_positions
+        return ENERGY_ROUNDING * torch.finfo(self.value.dtype).eps * self.value.abs() + of_positions
 
 
 class Placement(NamedTuple):

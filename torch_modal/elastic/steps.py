@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from torch_modal import trees
 from torch_modal.autograd import is_eager
-from torch_modal.elastic.energy import Energy, EnergyAt, Reference, RestShapes, energy_rounding
+from torch_modal.elastic.energy import ENERGY_ROUNDING, Energy, EnergyAt, Reference, RestShapes
 from torch_modal.elastic.term import Mesh, Term
 from torch_modal.geometry.canonical import CANONICAL_SIZE
 
@@ -108,7 +108,7 @@ def step_length(before: Tensor, slope: Tensor, after: Tensor, largest: Tensor) -
         *Shape:* ``(B,)``.
     """
     half, finite = -0.5 * slope, after.isfinite()
-    rounding = energy_rounding(before.dtype) * before.detach().abs()
+    rounding = ENERGY_ROUNDING * torch.finfo(before.dtype).eps * before.detach().abs()
     gap = torch.where(finite, after, before) - before + half - rounding
     if not torch.is_grad_enabled() and is_eager(gap) and bool((finite & (gap <= 0)).all()):
         return torch.ones_like(gap)  # nearly always

@@ -54,10 +54,10 @@ def blend_towards_starts(
     visible = distortion.visibility_threshold(rests.stiffness, x)
     ratio = (distortions[0] / (distortions[1:] + visible)).amax(0)
     solution = solution._replace(distortion_ratio=ratio, start_weights=distortions.new_zeros(len(x), len(starts)))
-    if numbers and bool((ratio <= _least(slack)).all()):
+    parts = _blend_weight(distortions[0], distortions[1:] + visible, slack)
+    if numbers and not bool(parts.any()):
         return x, solution
     if torch.is_grad_enabled():
-        parts = _blend_weight(distortions[0], distortions[1:] + visible, slack)
         # To first order, the shapes depend on the distortions where they are blended.
         if not numbers or bool(((parts > 0) & (parts < 1)).any()):
             distortions = distortion(shapes, rests)
@@ -85,14 +85,9 @@ def blend_by_distortion(
     return x, replaced, weights
 
 
-def _least(slack: float) -> float:
-    """Ratio of distortions up to which a shape is not blended into its start."""
-    return 1 + BLENDING_MARGIN * (slack - 1)
-
-
 def _blend_weight(value: Tensor, other: Tensor, slack: float) -> Tensor:
     """Part by which a shape gives way to one of its starts, 0 to 1. *Shape:* ``(B,), (..., B) -> (..., B)``."""
-    least = _least(slack)
+    least = 1 + BLENDING_MARGIN * (slack - 1)  # up to which a shape is not blended into its start
     weight = ((value / other - least) / (slack - least)).clamp(0, 1)
     weight = torch.where(value.isfinite(), weight * weight * (3 - 2 * weight), 1)
     return torch.where(other.isfinite(), weight, 0)

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from torch_modal import trees
 from torch_modal.autograd import as_normal_tensor, is_double_backward, outside_inference_mode, run_outside_transforms
-from torch_modal.elastic.energy import AssembledTerm, Energy, EnergyAt, Linearised, Reference, energy_rounding
+from torch_modal.elastic.energy import ENERGY_ROUNDING, AssembledTerm, Energy, EnergyAt, Linearised, Reference
 from torch_modal.elastic.minimise import Solution, Status
 from torch_modal.elastic.steps import conjugate_gradients
 from torch_modal.geometry.canonical import CANONICAL_SIZE
@@ -97,7 +97,7 @@ class FreeVertices(nn.Module):
             if bool(step.abs().max() <= SMALL_STEP):  # energies do not resolve it
                 a, status = a + step, Status.CONVERGED
                 break
-            slope, bound = (gradient * step).sum(), value + energy_rounding(a.dtype) * value.abs()
+            slope, bound = (gradient * step).sum(), value + ENERGY_ROUNDING * torch.finfo(a.dtype).eps * value.abs()
             for length in LENGTHS:
                 there, gradient_there = self.value_and_gradient(a + length * step, placement)
                 if there <= bound + DECREASE * length * slope:

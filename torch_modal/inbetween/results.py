@@ -58,8 +58,6 @@ def trivial_solution(x: Tensor, usable: Tensor) -> Solution:
 
 def join_bodies(results: Sequence[InBetweenResult], vertices: Sequence[Any]) -> InBetweenResult:
     """Results of bodies as one, from the vertices of each: with the sum of the energies, otherwise the worst of all."""
-    if len(results) == 1:
-        return results[0]
     a, *numbers = zip(*(result.solution[:5] for result in results), strict=True)
     energy, norm, n_steps, status = (torch.stack(values) for values in numbers)
     worst = (status % Status.FELL_BACK).amax(0)  # that a body fell back is the least of all

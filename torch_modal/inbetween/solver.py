@@ -59,6 +59,9 @@ class InBetweenSolver(nn.Module):
         self.solver, self.mesh, self.backend = solver, mesh, backend
         self.alignment = KeyframeAlignment(references, mesh.connectivity, backend)
         self.fine = backend.fine_energy(mesh, terms)
+        #: Products with the Hessian in each step of all vertices.
+        self.products = [LOCAL_PRODUCTS] * solver.local_steps + [POLISH_PRODUCTS] * solver.polish
+        self.has_anchors = any(term.anchors is not None for term in terms)
         self.distortion = backend.distortion(mesh, Energy(mesh, others) if others else None)
         paired, self.modal = objective.modal_space == "paired", objective.modal_space is not None
         self.blend = None if paired else RotationBlend(mesh.connectivity, self.alignment.references, backend)
@@ -87,17 +90,21 @@ class InBetweenSolver(nn.Module):
         """
         weights = samples.weights
         shapes, pose, usable = self.alignment(samples.keyframes, weights)
-        anchors = self.fine.energy.anchors
-        if anchors is not None:
+        anchors: Any = None
+        if self.has_anchors:
+            anchors = self.fine.energy.anchors
             anchors = self.alignment.to_frame(anchors.to(weights).expand(len(weights), -1, -1), pose)
         rests = RestShapes(shapes, weights, samples.stiffness, anchors)
         straight = torch.bmm(weights[:, None], shapes.flatten(2)).view_as(shapes[:, 0])
         base = straight if self.blend is None else self.blend(shapes, weights, straight)
-        solution = self.minimise_amplitudes(base, rests, samples.mu, usable)
-        if self.blend is None:
-            return self.finish_paired(rests, solution, pose)
-        x = self.space.lift(solution.amplitudes, base) if self.modal else base
-        x = self.relax(x, rests)
+        x, solution = base, trivial_solution(base, usable)
+        if self.modal:
+            solution = self.minimise_amplitudes(base, rests, samples.mu, usable)
+            if self.blend is None:
+                return self.finish_paired(rests, solution, pose)
+            x = self.space.lift(solution.amplitudes, base)
+        if self.products and len(x):
+            x = self.fine.relax(x, rests, self.products)
         # No shape is better for being far from a key-frame with a weight below zero.
         compared = rests._replace(weights=weights.clamp_min(0))
         x, solution = blend_towards_starts(x, [base, straight], solution, self.distortion, compared, DISTORTION_SLACK)
@@ -111,15 +118,15 @@ class InBetweenSolver(nn.Module):
         if self.local is not None:
             ends, status = self.local(ends, rests, solution.status != Status.INVALID)
             solution = solution._replace(status=torch.where(solution.converged, status, solution.status))
-        x = self.relax((ends[0] + ends[1]) / 2, rests)
+        x = (ends[0] + ends[1]) / 2
+        if self.products and len(x):
+            x = self.fine.relax(x, rests, self.products)
         valid = (solution.status != Status.INVALID)[:, None, None]
         first, second, x = (torch.where(valid, self.alignment.to_caller(y, pose), torch.nan) for y in (*ends, x))
         return InBetweenResult(x, solution, first, second)
 
     def minimise_amplitudes(self, base: Tensor, rests: RestShapes, mu: Tensor, usable: Tensor) -> Solution:
         """Amplitudes of least energy in the modal space. *Shape:* of ``mu`` and ``usable`` ``(B,)``."""
-        if not self.modal:
-            return trivial_solution(base, usable)
         # In float64, whatever goes in and comes out.
         placement = self.space.place(*trees.map_leaves((base, rests, mu), Tensor.double))
         solution = solve_implicit(self.space, placement, usable, self.solver.max_steps, self.solver.tolerance)
@@ -129,8 +136,3 @@ class InBetweenSolver(nn.Module):
     def finish(self, x: Tensor, solution: Solution, rests: RestShapes) -> tuple[Tensor, Solution]:
         """Shapes and solutions as they are; a solver with contacts goes on from them. *Shape:* ``(B, V, 3)``."""
         return x, solution
-
-    def relax(self, x: Tensor, rests: RestShapes) -> Tensor:
-        """Local steps and polish: deformation that the modes cannot represent. *Shape:* ``(B, V, 3)``."""
-        products = [LOCAL_PRODUCTS] * self.solver.local_steps + [POLISH_PRODUCTS] * self.solver.polish
-        return self.fine.relax(x, rests, products) if len(x) and products else x

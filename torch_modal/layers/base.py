@@ -191,11 +191,13 @@ class InBetweenLayer(PreciseModule):
         flat_weights = weights.to(self.dtype).expand(*lead, n).reshape(-1, n)
         mu = expand_to_samples("mu[..., None]", torch.as_tensor(self.mu)[..., None], 1, flat_weights, lead)[:, 0]
         results = []
-        for i, (vertices, core) in enumerate(zip(self.vertices, self.cores, strict=True)):
-            samples = Samples(flat[:, :, vertices], flat_weights, mu, self.stiffness_of(flat_weights, lead, i))
+        for vertices, core, closed in zip(self.vertices, self.cores, self.encloses, strict=True):
+            stiffness = stiffnesses(self.terms, core.fine.energy, flat_weights, lead, closed)
+            samples = Samples(flat[:, :, vertices], flat_weights, mu, stiffness)
             # Further terms may have parameters of their own.
             results.append(by_chunks(core, samples, samples.keyframes.shape[2], closed=not self.objective.terms))
-        return join_bodies(results, self.vertices).unflatten(lead)
+        result = results[0] if len(results) == 1 else join_bodies(results, self.vertices)
+        return result.unflatten(lead)
 
     def stiffness_of(self, like: Tensor, lead: torch.Size, body: int = 0) -> list[Tensor]:
         """Stiffnesses of a body in a flat batch, of each term. *Shape of each:* ``(B, M)`` or ``(B, 1)``."""

@@ -268,7 +268,7 @@ class Path(PreciseModule):
             )
             shapes = spline.alignment.to_caller(x, spline.pose(body, i, which, u))
             results.append(InBetweenResult(torch.where(usable[:, None, None], shapes, torch.nan), solution))
-        return join_bodies(results, self.vertices)
+        return results[0] if len(results) == 1 else join_bodies(results, self.vertices)
 
     def _separate_contacts(
         self, knots: list[Knots], flat: Tensor, i: int, which: Tensor, u: Tensor, result: InBetweenResult, n: int
