@@ -22,8 +22,8 @@ import torch
 import torch_modal as tm
 
 BOUNDS = {
-    "lines of code": 16689,
-    "functions": 1510,
+    "lines of code": 16210,
+    "functions": 1473,
     "docstrings that begin with no noun": 0,
     "functions of in-between": 142,
     "files of in-between": 34,

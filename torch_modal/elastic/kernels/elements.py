@@ -1,7 +1,7 @@
 """Kernels of a term, made from its functions of one element.
 
-Derivatives of the functions come from ``wp.grad``. In a kernel without ``enable_backward`` it would lose those of
-functions that call others, in silence: the kernels of :func:`backward` have it, though nothing differentiates them.
+Gradients of a measure without a closed form come from ``wp.grad``. In a kernel without ``enable_backward`` it would
+lose those of functions that call others, in silence: kernels of such terms have it, though nothing differentiates them.
 """
 
 from collections.abc import Callable
