@@ -110,6 +110,7 @@ setup(
                 "viser>=1.1",  # examples/live.py
                 "pyvista>=0.46",  # bodies of the benchmarks
                 "h5py>=3.11",
+                "lightning>=2.4",  # its Trainer over a data set
             ],
             *["build>=1.2", "twine>=6.1", "check-wheel-contents>=0.6", "setuptools>=77"],
         ],

@@ -11,7 +11,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
-from functools import cache, partial
+from functools import lru_cache, partial
 from typing import Any, TypeVar
 
 import torch
@@ -26,6 +26,9 @@ Result = TypeVar("Result")
 # Vertices of a chunk: at most, but for rounding; and at least, as each takes some milliseconds whatever its size.
 MOST_VERTICES = 40_000
 LEAST_VERTICES = 8_000
+
+# Pools of threads that stay, of the numbers of threads that were set last: one for torch's, others for bounded memory.
+N_POOLS = 4
 
 
 class StoppedError(Exception):
@@ -48,7 +51,7 @@ def warn(text: str, number: int, category: type[Warning]) -> None:
         _HERE.warned[text, category] = _HERE.warned.get((text, category), 0) + number
 
 
-@cache
+@lru_cache(N_POOLS)
 def _pool(n: int) -> ThreadPoolExecutor:
     # The number of torch's threads is set for one thread alone. Threads stay: launches of kernels are kept by thread.
     return ThreadPoolExecutor(n, "torch_modal", torch.set_num_threads, (1,))

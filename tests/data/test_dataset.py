@@ -3,6 +3,7 @@
 import gc
 import pickle
 import warnings
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import pytest
 import torch
 from conftest import Shapes
 from safetensors.torch import load_file, save_file
-from torch.utils.data import DataLoader, default_collate
+from torch.utils.data import DataLoader, Subset, default_collate
 
 import torch_modal as tm
 from torch_modal.data.in_betweens import FORMAT, VERSION
@@ -139,6 +140,124 @@ def test_ordinary_loaders_mix_sets_of_one_connectivity(root: Path) -> None:
     assert sorted(distances.argmin(1).tolist()) == list(range(len(data)))
 
 
+LOADERS: dict[str, Callable[..., DataLoader]] = {
+    "sampler": lambda data, **options: DataLoader(data, batch_sampler=tm.SetBatchSampler(data, 3), **options),
+    "plain": lambda data, **options: DataLoader(data, 3, collate_fn=list, **options),
+    "subset": lambda data, **options: DataLoader(Subset(data, range(len(data))), 3, collate_fn=list, **options),
+}
+WORKERS: dict[str, dict[str, Any]] = {
+    "none": {},
+    "two": {"num_workers": 2, "timeout": 120},
+    "two that persist": {"num_workers": 2, "timeout": 120, "persistent_workers": True},
+}
+
+
+N_TURNED = 8
+"""Samples of :func:`turned`."""
+
+
+def turned(root: Path) -> tm.ShapeDataset:
+    """Two sets with a transform that costs little."""
+    return tm.ShapeDataset(root / "deep", tm.RandomRigidMotion(p=1.0), samples_per_set=N_TURNED // 2, seed=4)
+
+
+def vertices_of(batches: Iterable[Any]) -> list[torch.Tensor]:
+    """Of all samples, in the order of their loader."""
+    return [
+        x
+        for batch in batches
+        for x in (batch["vertices"] if isinstance(batch, dict) else [s["vertices"] for s in batch])
+    ]
+
+
+def repeats(epochs: Sequence[Sequence[torch.Tensor]]) -> int:
+    """Number of samples that equal another one, of this or another epoch."""
+    every = [x for epoch in epochs for x in epoch]
+    return len(every) - len({x.numpy().tobytes() for x in every})
+
+
+@pytest.mark.parametrize("kind", LOADERS)
+def test_each_iteration_is_a_new_epoch(root: Path, kind: str) -> None:
+    """Four passes of loops that never set it: no sample comes twice, and any workers give the same from one seed."""
+    found = {}
+    for name, options in WORKERS.items():
+        loader = LOADERS[kind](turned(root), **options)
+        found[name] = [vertices_of(loader) for _ in range(4)]
+        assert repeats(found[name]) == 0
+    for other in found.values():
+        for one, its in zip(found["none"], other, strict=True):
+            assert all(torch.equal(x, y) for x, y in zip(one, its, strict=True))
+
+
+@pytest.mark.parametrize("kind", LOADERS)
+@pytest.mark.parametrize("workers", WORKERS)
+def test_a_chosen_epoch_is_the_next_iterations(root: Path, kind: str, workers: str) -> None:
+    data = turned(root)
+    loader = LOADERS[kind](data, **WORKERS[workers])
+    first = [vertices_of(loader) for _ in range(2)]
+    assert data.epoch == 1
+    data.set_epoch(0)
+    again = [vertices_of(loader) for _ in range(2)]
+    assert all(torch.equal(x, y) for one, its in zip(first, again, strict=True) for x, y in zip(one, its, strict=True))
+
+
+def test_iterations_side_by_side_keep_to_their_epochs(root: Path) -> None:
+    """Of one that was not finished, and with workers that draw ahead."""
+    data, expected = turned(root), turned(root)
+    whole = [vertices_of(LOADERS["sampler"](expected)) for _ in range(2)]
+    loader = LOADERS["sampler"](data, **WORKERS["two"])
+    older = iter(loader)
+    first = vertices_of([next(older)])
+    newer = vertices_of(loader)
+    for found, its in zip((first + vertices_of(older), newer), whole, strict=True):
+        assert all(torch.equal(x, y) for x, y in zip(found, its, strict=True))
+
+
+def test_a_dataset_is_iterated_itself(root: Path) -> None:
+    data = turned(root)
+    one, other = ([sample["vertices"] for sample in data] for _ in range(2))
+    assert len(one) == len(data) and repeats([one, other]) == 0
+    assert data.epoch == 1 and torch.equal(data[5]["vertices"], other[5]) and torch.equal(data[5]["vertices"], other[5])
+
+
+def recorder(lightning: Any) -> Any:
+    """A module of Lightning that keeps what it is trained on."""
+
+    class Recorder(lightning.LightningModule):
+        def __init__(self) -> None:
+            super().__init__()
+            self.scale = torch.nn.Parameter(torch.ones(()))
+            self.epochs: list[list[torch.Tensor]] = []
+
+        def on_train_epoch_start(self) -> None:
+            self.epochs.append([])
+
+        def training_step(self, batch: Any, _: int) -> torch.Tensor:
+            self.epochs[-1].extend(vertices_of([batch]))
+            return self.scale * vertices_of([batch])[0].square().mean()
+
+        def configure_optimizers(self) -> torch.optim.Optimizer:
+            return torch.optim.SGD(self.parameters(), 0.01)
+
+    return Recorder()
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("kind", LOADERS)
+@pytest.mark.parametrize("workers", WORKERS)
+def test_a_trainer_of_lightning_has_new_samples_in_each_epoch(root: Path, kind: str, workers: str) -> None:
+    lightning = pytest.importorskip("lightning")
+    runs = []
+    for _ in range(2):
+        module = recorder(lightning)
+        options = {"logger": False, "enable_checkpointing": False, "enable_progress_bar": False}
+        trainer = lightning.Trainer(max_epochs=4, accelerator="cpu", **options)
+        trainer.fit(module, LOADERS[kind](turned(root), **WORKERS[workers]))
+        assert [len(epoch) for epoch in module.epochs] == 4 * [N_TURNED] and repeats(module.epochs) == 0
+        runs.append([x for epoch in module.epochs for x in epoch])
+    assert all(torch.equal(x, y) for x, y in zip(*runs, strict=True))
+
+
 def test_batches_of_one_set(root: Path) -> None:
     data = dataset(root)
     sampler = tm.SetBatchSampler(data, 3)
@@ -146,9 +265,9 @@ def test_batches_of_one_set(root: Path) -> None:
     assert len(drawn) == len(sampler) == N_SETS * 3
     assert sorted(index for batch in drawn for index in batch) == list(range(len(data)))
     assert all(len({index // PER_SET for index in batch}) == 1 for batch in drawn)
-    assert list(sampler) == drawn
-    data.set_epoch(1)
     assert list(sampler) != drawn
+    data.set_epoch(0)
+    assert list(sampler) == drawn
     assert list(tm.SetBatchSampler(data, 3, shuffle=False))[:4] == [[0, 1, 2], [3, 4, 5], [6, 7], [8, 9, 10]]
     with pytest.raises(ValueError, match="batch_size"):
         tm.SetBatchSampler(data, 0)
@@ -172,12 +291,7 @@ def test_labels_from_a_function(root: Path) -> None:
     batch = default_collate(soft.__getitems__(list(range(PER_SET))))
     torch.testing.assert_close(batch["shape_labels"].sum(1), torch.ones(PER_SET))
     assert float(batch["shape_labels"].amax(1).min()) < 0.9
-    assert_same(
-        list(
-            DataLoader(soft, batch_sampler=tm.SetBatchSampler(soft, 4), num_workers=1, multiprocessing_context="spawn")
-        ),
-        list(DataLoader(soft, batch_sampler=tm.SetBatchSampler(soft, 4))),
-    )
+    assert_same(batches(soft, num_workers=1, multiprocessing_context="spawn"), batches(soft))
 
 
 def soft_poses(stored: tm.StoredSet) -> dict[str, torch.Tensor]:

@@ -261,6 +261,20 @@ class TestRotations:
         found = vmap(lambda t: turned(rotations)(*given[:2], t.expand(2)))(given[2])
         torch.testing.assert_close(found[1], turned(rotations)(*given[:2], given[2][1].expand(2)), rtol=0, atol=1e-12)
 
+    @pytest.mark.parametrize("which", [0, 1])
+    @pytest.mark.parametrize("height", [0.0, 4e-7])
+    def test_a_flat_triangle_has_no_large_gradients(
+        self, rotations: WarpRotations, small_bars: Shapes, height: float, which: int
+    ) -> None:
+        """As by torch, which leaves out how the normal of a triangle without area turns."""
+        x = small_bars.keyframes[:2].clone()
+        i, j, k = small_bars.faces[7]
+        x[which, k] = 0.5 * (x[which, i] + x[which, j]) + height * torch.tensor([1.0, 2.0, -1.0], dtype=DOUBLE)
+        given = [x[:1], x[1:], torch.tensor([0.3], dtype=DOUBLE)]
+        by_kernels, by_torch = (gradients(turned(rotations, kind), given) for kind in (WarpRotations, LocalRotations))
+        for found, truth in zip(by_kernels, by_torch, strict=True):
+            assert found.isfinite().all() and float(found.abs().max()) < 2 * float(truth.abs().max())
+
     @pytest.mark.parametrize("angle", [0.0, 0.03, 1.0, 3.0])
     def test_a_turn(self, small_bars: Shapes, angle: float) -> None:
         """Also none, and where the series end."""

@@ -324,6 +324,35 @@ def test_gltf_with_files_beside_it_becomes_a_whole_glb(tmp_path):
     assert {image.convert("RGB").getpixel((4, 4)) for image in images} == {RED, BLUE}
 
 
+@pytest.mark.parametrize("mime", ["image/png", None])
+def test_a_picture_that_is_none_does_not_go_into_a_glb(tmp_path, mime):
+    textured_glb(tmp_path / "in.glb")
+    scene = trimesh.load_scene(tmp_path / "in.glb", process=False)
+    for name, data in scene.export(file_type="gltf").items():
+        (tmp_path / name).write_bytes(data)
+    source = tmp_path / "model.gltf"
+    root = json.loads(source.read_text())
+    root["images"][0] = {"uri": "notes.png"} | ({} if mime is None else {"mimeType": mime})
+    source.write_text(json.dumps(root))
+    (tmp_path / "notes.png").write_bytes(b"no picture")
+    asset = tm.open_asset(source)
+    with pytest.warns(MeshWarning, match="without image 0, now white: its content is no picture"):
+        out = write(asset, tmp_path / "out.glb", bend(asset.positions))
+    assert not gltf_validator.issues(out)
+    assert b"no picture" not in out.read_bytes()
+
+
+@pytest.mark.parametrize("line", ["v 1_0 0 0", "f 1 2 0_3", "vt 0.1_5 0", "vn 0 0 1_0"])
+def test_numbers_of_an_obj_have_no_underscores(tmp_path, line):
+    """Python reads 1_0 as 10."""
+    path = tmp_path / "a.obj"
+    path.write_text(f"v 0 0 0\nv 1 0 0\nv 0 1 0\n# 1_0\no part_1\n{line}\nf 1 2 3\n")
+    with pytest.raises(MeshError, match=f"underscore in a number.*{line[2:].strip()}"):
+        tm.open_asset(path)
+    path.write_text(path.read_text().replace(line, ""))
+    assert len(tm.open_asset(path).positions) == 3
+
+
 def accessor_document() -> tuple[dict, bytes]:
     """Two triangles with interleaved attributes, sparse positions, tangents, and a mirrored second node."""
     points = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [9, 9, 9]], "<f4")

@@ -340,7 +340,17 @@ def test_key_frames_in_the_place_of_bases_are_arrays_or_lists(kind: Any, bars: S
             assert torch.equal(own, value)
 
 
-@pytest.mark.parametrize("wrong", ["not finite", "shape"])
+@pytest.mark.parametrize("preset", ["accurate", "fast"])
+def test_the_energy_is_that_of_the_shell(preset: Any, bars: Shapes) -> None:
+    """Eq. 5 at a size of 100; the solver's mesh and alignment differ a little from the caller's."""
+    x, y = bars.keyframes[:2]
+    found, shell = InBetween(bars.bases[:2], bars.faces, preset).solve(x, y, 0.3), tm.ShellEnergy(bars.faces)
+    scale = 100 / (x.amax(0) - x.amin(0)).norm()
+    expected = 0.7 * shell(scale * found.shapes, scale * x) + 0.3 * shell(scale * found.shapes, scale * y)
+    torch.testing.assert_close(found.solution.energy, expected, rtol=0.2, atol=0)
+
+
+@pytest.mark.parametrize("wrong", ["not finite", "shape", "missing", "unexpected"])
 @pytest.mark.parametrize("kind", [InBetween, tm.Path])
 def test_a_state_that_is_refused_changes_nothing(kind: Any, wrong: str, bars: Shapes) -> None:
     layer = kind(bars.bases[:2], bars.faces, preset="modal", **({"smooth": False} if kind is tm.Path else {}))
@@ -348,8 +358,12 @@ def test_a_state_that_is_refused_changes_nothing(kind: Any, wrong: str, bars: Sh
     state = {name: 2 * value for name, value in before.items()}
     if wrong == "not finite":
         state["bases.1.reference"][3] = torch.nan
-    else:
+    elif wrong == "shape":
         state["bases.1.modes"] = state["bases.1.modes"][1:]
+    elif wrong == "missing":
+        del state["bases.1.modes"]
+    else:
+        state["bases.2.modes"] = state["bases.1.modes"]
     with pytest.raises((ValueError, RuntimeError), match=r"NaN|which stays as it is: bases"):
         layer.load_state_dict(state)
     with pytest.raises((ValueError, RuntimeError)):

@@ -78,6 +78,29 @@ def test_results_and_gradients_are_the_same_bit_for_bit(layer: tm.InBetween, bar
         assert layer(*leaves(bars)).is_inference()
 
 
+def test_threads_have_the_modes_of_their_caller() -> None:
+    torch.set_num_threads(2)
+    modes = 2 * [lambda: (torch.is_inference_mode_enabled(), torch.is_grad_enabled())]
+    assert threads.run(modes) == 2 * [(False, True)]
+    with torch.no_grad():
+        assert threads.run(modes) == 2 * [(False, False)]
+    with torch.inference_mode():
+        assert threads.run(modes) == 2 * [(True, False)]
+
+
+def test_only_the_last_pools_of_threads_stay() -> None:
+    def n_started() -> int:
+        return sum(each.name.startswith("torch_modal") for each in threading.enumerate())
+
+    for n in range(2, 14):
+        torch.set_num_threads(n)
+        threads.run(4 * n * [threading.get_ident])
+    deadline = time.monotonic() + 10  # threads of pools that are given up end by themselves
+    while n_started() > 13 * threads.N_POOLS and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert n_started() <= 10 + 11 + 12 + 13
+
+
 def test_all_layers_and_subdivide(bars: Shapes) -> None:
     x, bases, faces = bars.keyframes, bars.bases, bars.faces
     weights = torch.rand(6, 3, dtype=DOUBLE).softmax(1)

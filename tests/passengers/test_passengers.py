@@ -59,6 +59,18 @@ def test_points_of_the_surface_stay_near_it(bars: Shapes) -> None:
     torch.testing.assert_close(corners(y), y, rtol=0, atol=1e-12)
 
 
+def test_middles_of_triangles_stay_on_the_surface() -> None:
+    """Of a coarse strip that is rolled up, whose corners turn apart: within 1 % of the diagonal."""
+    along, across = torch.meshgrid(torch.arange(7.0), torch.arange(3.0), indexing="ij")
+    x = torch.stack([along, across, 0 * along], -1).view(-1, 3).double()
+    i = (3 * torch.arange(6)[:, None] + torch.arange(2)).view(-1, 1)
+    faces = torch.cat([i + torch.tensor([0, 3, 1]), i + torch.tensor([1, 3, 4])])
+    y = torch.stack([(1.2 * x[:, 0]).sin(), x[:, 1], 1 - (1.2 * x[:, 0]).cos()], 1)
+    passengers = tm.Passengers(x, faces, x[faces].mean(1))
+    off = (passengers(y) - y[faces].mean(1)).norm(dim=1) / (x.amax(0) - x.amin(0)).norm()
+    assert 1e-3 < float(off.max()) < 1e-2
+
+
 def test_closest_faces_are_exact() -> None:
     """Against all triangles, long ones among them, for points near and far."""
     generator = torch.Generator().manual_seed(0)

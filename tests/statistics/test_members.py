@@ -14,6 +14,7 @@ from torch_modal.elastic.backend import TorchBackend
 from torch_modal.elastic.steps import FineEnergy
 from torch_modal.elastic.term import Mesh, Term
 from torch_modal.geometry.connectivity import Connectivity
+from torch_modal.geometry.rigid import best_fit
 
 
 def test_the_same_seed_has_the_same_members(space: tm.ShapeSpace) -> None:
@@ -46,6 +47,25 @@ def test_edges_keep_the_lengths_of_the_keyframes(space: tm.ShapeSpace, bars: Sha
     variation = space.variation()
     most = max(variation.folds(x) for x in bars.keyframes)
     assert max(variation.folds(x) for x in members) <= most
+
+
+def test_members_stand_where_the_keyframes_stand(space: tm.ShapeSpace, bars: Shapes) -> None:
+    """On average over draws; those on the mean shape are 2 % of the diagonal away."""
+    x, areas = bars.keyframes, space.reconstruction().areas
+    blend = tm.RandomBlend(p=1.0, space=space, generator=seeded())
+    for members in (space.sample(60, seeded()), blend(x.repeat(20, 1, 1) + 5)):
+        motion = best_fit(members.mean(0), x.mean(0), areas)
+        shift = (motion.target - motion.source).norm() / (x[0].amax(0) - x[0].amin(0)).norm()
+        cosine = 0.5 * (motion.rotation.trace() - 1)
+        assert float(shift) < 3e-3 and float(torch.rad2deg(cosine.clamp(max=1).acos())) < 1
+
+
+def test_members_on_the_mean_shape(space: tm.ShapeSpace) -> None:
+    placed, others = space.sample(2, seeded()), space.sample(2, seeded(), on_keyframes=False)
+    assert float((placed - others).abs().max()) > 1e-3
+    assert max(far(one, other) for one, other in zip(placed, others, strict=True)) < 1e-9
+    variation = space.variation()
+    torch.testing.assert_close(others - variation.origin, variation.coordinates.align(others - variation.origin))
 
 
 def test_folds_are_counted(space: tm.ShapeSpace, bars: Shapes) -> None:
@@ -95,9 +115,19 @@ def test_densities_that_do_not_exist(space: tm.ShapeSpace, options: dict[str, fl
         tm.RandomBlend(**options)
 
 
+def drawn(space: tm.ShapeSpace, n: int) -> dict[str, torch.Tensor]:
+    """Parameters of the members of :meth:`tm.ShapeSpace.sample`."""
+    weights, factors = space.variation().draw(n, 0.2, 3.0, seeded())
+    return {"batch_prob": torch.ones(n, dtype=torch.bool), "weights": weights, "factors": factors}
+
+
 class TestRandomBlend:
-    def test_replaces_shapes_in_their_pose(self, space: tm.ShapeSpace, bars: Shapes) -> None:
-        transform = tm.RandomBlend(p=1.0, generator=seeded(), space=space)
+    def test_draws_as_the_space_does(self, space: tm.ShapeSpace, bars: Shapes) -> None:
+        found = tm.RandomBlend(p=1.0, space=space)(bars.keyframes + 10, params=drawn(space, 3))
+        torch.testing.assert_close(found, space.sample(3, seeded()), rtol=0, atol=1e-9)
+
+    def test_replaces_shapes_in_their_pose_if_asked(self, space: tm.ShapeSpace, bars: Shapes) -> None:
+        transform = tm.RandomBlend(p=1.0, generator=seeded(), space=space, on_keyframes=False)
         given = bars.keyframes[[0, 1]].float() + 10
         found = transform(given)
         assert found.shape == given.shape and found.dtype == torch.float32

@@ -156,6 +156,20 @@ def small_pictures(monkeypatch):
     monkeypatch.setattr(animation, "PIXELS", 160)
 
 
+@pytest.mark.parametrize("suffix", ["usda", "usdc"])
+def test_usd_to_a_full_disk(tmp_path, suffix):
+    pytest.importorskip("pxr", reason="usd-core is not installed")
+    resource = pytest.importorskip("resource", reason="this system has no limit on the size of files")
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (512, before[1]))
+    try:
+        with pytest.raises(OSError, match=rf"writing file.*a\.{suffix}") as caught:
+            tm.save_animation(FRAMES, FACES, tmp_path / f"a.{suffix}")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert caught.value.__suppress_context__ and not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize(("suffix", "extra"), [("mp4", "video"), ("usdc", "usd")])
 def test_missing_packages_are_named_before_the_work(tmp_path, monkeypatch, suffix, extra):
     for name in ("imageio", "pxr"):

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from torch.utils.data import BatchSampler, Dataset, Sampler
+from torch.utils.data import BatchSampler, Dataset, Sampler, get_worker_info
 
 from torch_modal.autograd import Recent
 from torch_modal.data.augmentation import AugmentationSequential, ShapeAugmentation
@@ -33,6 +33,10 @@ class ShapeDataset(Dataset[Sample]):
     on the seed, the epoch and its index alone, not on workers or their number. (Samples of a batch are computed
     together: with another batch size they agree up to rounding.) Each process opens sets at first use and keeps only
     the most recent open, so that memory does not grow with their number.
+
+    Each iteration of the dataset or of a :class:`SetBatchSampler` is a new epoch, and so is each pass of another
+    loader: an index that a loader draws again is of its next epoch. :meth:`set_epoch` chooses another. ``data[i]`` is
+    of the current epoch, as often as it is called.
 
     A sample is a dict: ``vertices`` (V, 3); ``set``, the index of its set in :attr:`sets`; ``keyframe``, its
     key-frame; and if requested, ``faces`` (F, 3), ``normals`` (V, 3), ``vertex_labels`` and ``shape_labels``.
@@ -84,8 +88,10 @@ class ShapeDataset(Dataset[Sample]):
         self.with_faces = faces
         self.with_normals = normals
         self.options = options
-        # In shared memory: workers that outlive an epoch see the next one.
+        # In shared memory: workers that outlive an epoch see the next one, and loaders see what their workers drew.
         self._epoch = torch.zeros(1, dtype=torch.int64).share_memory_()
+        #: Epoch in which a loader draws each index next.
+        self._next = torch.zeros(len(self), dtype=torch.int64).share_memory_()
         self._opened = Recent(OPEN_SETS)
 
     def __len__(self) -> int:
@@ -94,42 +100,63 @@ class ShapeDataset(Dataset[Sample]):
 
     @property
     def epoch(self) -> int:
-        """The epoch of the samples."""
+        """The current epoch: the one that was set, or that an iteration began since."""
         return int(self._epoch)
 
     def set_epoch(self, epoch: int) -> None:
-        """Choose the epoch, before a loader is iterated; its workers see it too, persistent ones included."""
+        """Choose the epoch of ``data[i]`` and of the next iteration; workers see it too, persistent ones included."""
         self._epoch.fill_(epoch)
+        self._next.fill_(epoch)
+
+    def begin_epoch(self) -> int:
+        """Begin the next epoch, or the one that was set; returns its number. Iterations call this."""
+        epoch = int(self._next.max())
+        self._epoch.fill_(epoch)
+        self._next.fill_(epoch + 1)
+        return epoch
 
     def space(self, number: int) -> ShapeSpace:
         """Key-frames and modes of a set."""
         return self._opened.get(number, lambda: self._read(number))[0]
 
+    def __iter__(self) -> Iterator[Sample]:
+        """All samples of a new epoch."""
+        epoch = self.begin_epoch()
+        return (self[EpochIndex(index, epoch)] for index in range(len(self)))
+
     def __getitem__(self, index: int) -> Sample:
         """One sample."""
+        if get_worker_info() is None:
+            index = EpochIndex(index, getattr(index, "epoch", self.epoch))
         return self.__getitems__([index])[0]
 
     def __getitems__(self, indices: Sequence[int]) -> list[Sample]:
         """Several samples; samples of the same set are computed together. Loaders call this for each batch."""
         samples: dict[int, Sample] = {}
-        by_set: dict[int, list[int]] = {}
-        for place, index in enumerate(indices):
-            if not -len(self) <= index < len(self):
-                raise IndexError(f"index {index} of {len(self)} samples")
-            by_set.setdefault(index % len(self) // self.samples_per_set, []).append(place)
+        by_set: dict[int, list[tuple[int, int, int]]] = {}
+        for place, given in enumerate(indices):
+            if not -len(self) <= given < len(self):
+                raise IndexError(f"index {given} of {len(self)} samples")
+            index, epoch = given % len(self), getattr(given, "epoch", None)
+            if epoch is None:
+                epoch = int(self._next[index])
+                self._next[index] = epoch + 1
+                self._epoch.fill_(epoch)
+            by_set.setdefault(index // self.samples_per_set, []).append((place, index, epoch))
         with torch.no_grad(), alone():
-            for number, places in by_set.items():
-                of_set = self._make_samples(number, [indices[place] % len(self) for place in places])
-                samples.update(zip(places, of_set, strict=True))
+            for number, draws in by_set.items():
+                of_set = self._make_samples(number, [draw[1:] for draw in draws])
+                samples.update(zip((draw[0] for draw in draws), of_set, strict=True))
         return [samples[place] for place in range(len(indices))]
 
-    def _make_samples(self, number: int, indices: Sequence[int]) -> list[Sample]:
+    def _make_samples(self, number: int, draws: Sequence[tuple[int, int]]) -> list[Sample]:
+        """Samples of one set, of indices with their epochs."""
         space, pool = self._opened.get(number, lambda: self._read(number))
-        before = self.epoch * self.samples_per_set
-        start = torch.tensor([(index % self.samples_per_set + before) % len(space) for index in indices])
+        n = self.samples_per_set
+        start = torch.tensor([(index % n + epoch * n) % len(space) for index, epoch in draws])
         drawn = []
-        for index in indices:
-            state = np.random.SeedSequence([self.seed, self.epoch, index]).generate_state(1, np.uint64)
+        for index, epoch in draws:
+            state = np.random.SeedSequence([self.seed, epoch, index]).generate_state(1, np.uint64)
             generator = torch.Generator().manual_seed(int(state[0] >> np.uint64(1)))
             drawn.append(self.transform.forward_parameters(1, space, generator))
         params = [
@@ -144,7 +171,7 @@ class ShapeDataset(Dataset[Sample]):
             {name: tensor[row].clone() for name, tensor in fields.items() if tensor is not None}
             | {"set": number, "keyframe": int(start[row])}
             | ({"faces": space.faces} if self.with_faces else {})
-            for row in range(len(indices))
+            for row in range(len(draws))
         ]
 
     def _read(self, number: int) -> tuple[ShapeSpace, ShapeBatch]:
@@ -164,10 +191,22 @@ class ShapeDataset(Dataset[Sample]):
         return space, pool
 
 
+class EpochIndex(int):
+    """Index of a sample in an epoch: workers that draw ahead, or for an older iteration, keep to its epoch."""
+
+    def __new__(cls, index: int, epoch: int = 0) -> "EpochIndex":
+        """An integer; unpickling sets the epoch by itself."""
+        made = super().__new__(cls, index)
+        made.epoch = epoch
+        return made
+
+    epoch: int
+
+
 class SetBatchSampler(Sampler[list[int]]):
     """Batches whose samples are of one set, so that they can be stacked where sets have different numbers of vertices.
 
-    Follows the epoch of the dataset.
+    Each iteration is a new epoch of the dataset.
 
     Args:
         dataset: The dataset.
@@ -186,13 +225,17 @@ class SetBatchSampler(Sampler[list[int]]):
         """Number of batches in an epoch."""
         return len(self.dataset.sets) * math.ceil(self.dataset.samples_per_set / self.batch_size)
 
+    def set_epoch(self, epoch: int) -> None:
+        """Choose the epoch of the next iteration; trainers call this, with the right number after a restart."""
+        self.dataset.set_epoch(epoch)
+
     def __iter__(self) -> Iterator[list[int]]:
-        size = self.dataset.samples_per_set
-        random = np.random.default_rng([self.dataset.seed, self.dataset.epoch])
+        size, epoch = self.dataset.samples_per_set, self.dataset.begin_epoch()
+        random = np.random.default_rng([self.dataset.seed, epoch])
         batches: list[list[int]] = []
         for number in range(len(self.dataset.sets)):
             indices = number * size + (random.permutation(size) if self.shuffle else np.arange(size))
             batches += BatchSampler(indices.tolist(), self.batch_size, drop_last=False)
         order = random.permutation(len(batches)) if self.shuffle else np.arange(len(batches))
         for place in order:
-            yield batches[place]
+            yield [EpochIndex(index, epoch) for index in batches[place]]

@@ -122,10 +122,10 @@ class RandomExtrapolation(RandomInBetween):
 
 
 class RandomBlend(ShapeAugmentation):
-    """Replaces shapes by random mixtures of all key-frames (:meth:`ShapeSpace.sample`), aligned with the given shapes.
+    """Replaces shapes by random mixtures of all key-frames (:meth:`ShapeSpace.sample`).
 
     Labels of vertices and of shapes stay: use it for shapes whose labels all key-frames share. Gradients reach the
-    given shapes through the alignment alone.
+    given shapes through the alignment with them, which ``on_keyframes=False`` makes.
 
     Args:
         concentration: As for :meth:`ShapeSpace.sample`.
@@ -133,6 +133,9 @@ class RandomBlend(ShapeAugmentation):
         p: Probability that a shape is transformed.
         members: Number of mixtures of a space, which are computed once and stored with its tables; each draw is one of
             them. By default each draw is a new mixture.
+        on_keyframes: Whether mixtures are laid on the key-frames, as by :meth:`ShapeSpace.sample`, wherever the given
+            shapes are: transforms that move shapes come after this one. Otherwise each is laid on the shape that it
+            replaces, by least squares over the surface, which turns it by some degrees where the two differ in pose.
         options: As for :class:`ShapeAugmentation`.
 
     Raises:
@@ -146,6 +149,7 @@ class RandomBlend(ShapeAugmentation):
         p: float = 0.5,
         *,
         members: int | None = None,
+        on_keyframes: bool = True,
         **options: Any,
     ) -> None:
         super().__init__(p, **options)
@@ -153,6 +157,7 @@ class RandomBlend(ShapeAugmentation):
         if members is not None and members < 1:
             raise ValueError(f"members must be 1 or more, or None; got {members}")
         self.concentration, self.locality, self.members = concentration, locality, members
+        self.on_keyframes = on_keyframes
 
     def generate_parameters(self, n: int, space: Any, generator: torch.Generator | None) -> Parameters:
         """``weights`` of the key-frames, and ``factors`` by which they vary over the surface.
@@ -170,13 +175,15 @@ class RandomBlend(ShapeAugmentation):
         """Draw a member for each shape; gradients reach the shapes through the rigid alignment with them alone."""
         drawn = {name: value.detach().double().cpu() for name, value in params.items()}
         if self.members is None:
-            members = space.variation().members(drawn["weights"], drawn["factors"])
+            variation = space.variation()
+            members = variation.members(drawn["weights"], drawn["factors"]) + variation.origin
         else:
             table = space.members(self.members, self.concentration, self.locality)
             members = table[(drawn["member"] * len(table)).long().clamp_max(len(table) - 1)]
-        members = members.to(batch.shapes)
-        areas = space.reconstruction(members.device).areas.to(members)
-        shapes: Tensor = best_fit(members, batch.shapes, areas).apply(members)
+        shapes: Tensor = members.to(batch.shapes)
+        if not self.on_keyframes:
+            areas = space.reconstruction(shapes.device).areas.to(shapes)
+            shapes = best_fit(shapes, batch.shapes, areas).apply(shapes)
         return batch._replace(shapes=shapes, nearest=space.nearest(shapes))
 
 

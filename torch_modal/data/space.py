@@ -195,7 +195,13 @@ class ShapeSpace:
 
     @torch.no_grad()
     def sample(
-        self, n: int, generator: torch.Generator | None = None, *, concentration: float = 0.2, locality: float = 3.0
+        self,
+        n: int,
+        generator: torch.Generator | None = None,
+        *,
+        concentration: float = 0.2,
+        locality: float = 3.0,
+        on_keyframes: bool = True,
     ) -> Tensor:
         """New members: random mixtures of the key-frames, with weights that vary from part to part of the surface.
 
@@ -211,16 +217,18 @@ class ShapeSpace:
                 key-frames, more their mean.
             locality: Standard deviation of the logarithms of the weights over the surface; 0 means the same weights
                 everywhere.
+            on_keyframes: Whether each member is laid on the mean of the key-frames by its weights, by least squares
+                over the surface. Otherwise all are laid on the mean shape, whose pose is near the first key-frame's.
 
         Returns:
-            In the pose of the first key-frame. *Shape:* ``(n, V, 3)``, in the dtype of the space.
+            *Shape:* ``(n, V, 3)``, in the dtype of the space.
 
         Raises:
             ValueError: An argument is out of range.
         """
         variation = self.variation()
         drawn = variation.draw(n, concentration, locality, generator)
-        return (variation.members(*drawn) + variation.origin).to(self.dtype)
+        return (variation.members(*drawn, on_keyframes) + variation.origin).to(self.dtype)
 
     def members(self, n: int, concentration: float, locality: float) -> Tensor:
         """Table of members that are drawn once, with a fixed seed, and stored with the other tables.
@@ -233,7 +241,7 @@ class ShapeSpace:
             generator = torch.Generator().manual_seed(0)
             return self.sample(n, generator, concentration=concentration, locality=locality), True
 
-        content = [self._keyframes, self.faces, str(self.dtype), settings]
+        content = [self._keyframes, self.faces, str(self.dtype), settings, "on key-frames"]
         return self._made.get(settings, lambda: read_or_compute(folder, "between-all", content, draw))
 
     def fit(

@@ -1,5 +1,6 @@
 """A sequence as positions over time: point caches (MDD, PC2, NPZ) for a mesh that exists already, and USD."""
 
+import errno
 import struct
 from pathlib import Path
 from typing import Any
@@ -38,7 +39,20 @@ def write_usd(animation: Animation, path: Path) -> None:
 
     A time code is one frame of the timing. Polygons, texture coordinates and colours come from the asset. The suffix
     ``.usda`` is text, the others are binary.
+
+    Raises:
+        OSError: The file cannot be written.
     """
+    from pxr import Tf
+
+    try:
+        _write_stage(animation, path)
+    except Tf.ErrorException as error:  # "Error in ... : 'reason'", line by line
+        reason = str(error).partition(" : '")[2].partition("'")[0]
+        raise OSError(errno.EIO, f"usd-core: {reason}", str(path)) from None
+
+
+def _write_stage(animation: Animation, path: Path) -> None:
     from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 
     shapes, faces, timing, asset = animation.shapes, animation.faces, animation.timing, animation.asset

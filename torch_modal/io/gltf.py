@@ -32,6 +32,9 @@ Tracks = dict[tuple[int, str], FloatArray]
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963
+PICTURES = {b"\x89PNG": "image/png", b"\xff\xd8": "image/jpeg", b"RIFF": "image/webp"}
+PICTURES |= {b"\xabKTX": "image/ktx2", b"DDS ": "image/vnd-ms.dds"}
+"""Kinds of pictures, with those of extensions, by their first bytes."""
 WHITE = base64.b64decode(
     "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAAAAAA6fptVAAAACklEQVR42mP4DwABAQEAHLCMmQAAAABJRU5ErkJggg=="
 )  # a PNG of one pixel
@@ -91,10 +94,13 @@ class Document:
         return bytes(data)
 
     def image(self, index: int) -> bytes:
-        """The bytes of an image; if they cannot be read, a white image and a warning."""
+        """The bytes of a picture; if they cannot be read or are no picture, a white one and a warning."""
         image = self.get("images", index)
         try:
-            return self.view(image["bufferView"]) if "bufferView" in image else self.resource(image.get("uri", ""))
+            data = self.view(image["bufferView"]) if "bufferView" in image else self.resource(image.get("uri", ""))
+            if not data.startswith(tuple(PICTURES)):
+                raise ValueError("its content is no picture: neither PNG, JPEG, WebP, KTX 2 nor DDS")
+            return data
         except (ValueError, TypeError, LookupError) as error:
             warnings.warn(f"{self.path.name} is without image {index}, now white: {error}", MeshWarning, stacklevel=6)
         return WHITE
@@ -153,7 +159,7 @@ class Document:
 
     def add_image(self, data: bytes) -> Json:
         """Add a picture; returns the JSON of an image."""
-        mime = "image/jpeg" if data.startswith(b"\xff\xd8") else "image/png"
+        mime = next(kind for start, kind in PICTURES.items() if data.startswith(start))
         return {"bufferView": self.add_bytes(data), "mimeType": mime}
 
     def add(

@@ -16,7 +16,6 @@ from torch_modal.io.asset import Asset, Material, Part
 from torch_modal.io.gltf import (
     ARRAY_BUFFER,
     ELEMENT_ARRAY_BUFFER,
-    WHITE,
     Document,
     Json,
     Tracks,
@@ -152,9 +151,7 @@ class GltfAsset(Asset):
         document = Document(root)
         for number, image in enumerate(document.get("images")):
             image.pop("uri", None)
-            data = old.image(number)
-            added = document.add_image(data)
-            image |= added if data is WHITE or "mimeType" not in image else {"bufferView": added["bufferView"]}
+            image |= document.add_image(old.image(number))
         for node_json in document.get("nodes"):
             for key in ("mesh", "skin", "weights"):
                 node_json.pop(key, None)

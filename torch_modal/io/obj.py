@@ -40,6 +40,8 @@ class ObjAsset(Asset):
             self._line_of[kind].append(number)
             contents[kind].append(rest[0].rstrip() if rest else "")
         rows = {kind: [row.split() for row in contents[kind]] for kind in ("v", "vt", "vn", "f")}
+        if wrong := next((row for kind in rows for row in contents[kind] if "_" in row), ""):
+            raise MeshError(f"{path}: a line with an underscore in a number: {wrong[:60]!r}")  # Python reads 1_0 as 10
         self.positions = _numbers([row[:3] for row in rows["v"]], 3)
         self._texcoords = _numbers([[*row, "0", "0"][:2] for row in rows["vt"]], 2)
         self._normals = _numbers([row[:3] for row in rows["vn"]], 3)

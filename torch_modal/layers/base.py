@@ -90,10 +90,14 @@ class PreciseModule(nn.Module):
             check_tensor(name, x, "...", *sizes, *reference.shape, device=reference.device)
 
     def _load_from_state_dict(self, state_dict: Mapping[str, Any], prefix: str, *others: Any) -> None:
-        """Load a state as torch does, but refuse tensors that do not fit, before any of them is loaded."""
+        """Load a state as torch does, but refuse one that does not fit before any of its tensors is loaded."""
         present = self.state_dict(prefix=prefix)
         state = {name: state_dict.get(name, x) for name, x in present.items()}
-        if wrong := [f"{name} {tuple(x.shape)}" for name, x in state.items() if x.shape != present[name].shape]:
+        wrong = [f"{name} {tuple(x.shape)}" for name, x in state.items() if x.shape != present[name].shape]
+        if others[1]:  # strict
+            named = {name for name in state_dict if name.startswith(prefix)}
+            wrong += [f"{name} {'missing' if name in present else 'unexpected'}" for name in named ^ present.keys()]
+        if wrong:
             what = ", ".join(wrong[:4])
             raise RuntimeError(f"the state does not fit this {type(self).__name__}, which stays as it is: {what}")
         references = [state[f"{prefix}bases.{i}.reference"].double().cpu() for i in range(len(self.bases))]

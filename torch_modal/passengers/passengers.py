@@ -16,6 +16,9 @@ from torch_modal.keyframes.arrays import check_tensor
 from torch_modal.keyframes.check import check_arrays
 from torch_modal.passengers.binding import bind_points
 
+HIGHEST_BULGE = 0.0075
+"""Bound on the distance of points from flat triangles whose corners turn apart, in diagonals of the reference."""
+
 
 class Passengers(nn.Module):
     r"""Points that follow a carrier: markers, scans, splats, fine meshes, accessories.
@@ -27,9 +30,10 @@ class Passengers(nn.Module):
         p'(x) = \sum_v w_v \left(x_v + R_v(x)\, (p - \bar x_v)\right)
 
     (embedded deformation, Sumner et al. 2007, with rotations that follow from the shape). Rigid motions are followed
-    exactly, and so are the carrier's own vertices; points within a triangle follow a surface that is rounder than it,
-    and leave it by a part of its sides where its corners turn apart. Parts that are near in space and not along the
-    surface, such as fingers, do not pull on each other's points. The time is linear in the number of points.
+    exactly, and so are the carrier's own vertices. Points within a triangle follow a surface that is rounder than it
+    where its corners turn apart, by less than 0.75 % of the diagonal: the bulge :math:`\sum_v w_v R_v (q - \bar x_v)`
+    at :math:`q = \sum_v w_v \bar x_v` is bounded. Parts that are near in space and not along the surface, such as
+    fingers, do not pull on each other's points. The time is linear in the number of points.
 
     Results have the dtype and the device of the shapes, where the module has to be too (``.to``). Gradients reach the
     shapes.
@@ -49,6 +53,8 @@ class Passengers(nn.Module):
     reference: Tensor
     faces: Tensor
     points: Tensor
+    feet: Tensor
+    highest: Tensor
     inverses: Tensor
     areas: Tensor
     per_area: Tensor
@@ -91,6 +97,8 @@ class Passengers(nn.Module):
         total = area.new_zeros(len(rest)).index_add(0, corners.flatten(), area.repeat_interleave(3))
         inverses = torch.linalg.inv(torch.where(flat[:, None, None], torch.eye(3).to(frame), frame))
         buffers = {"reference": rest, "faces": corners, "points": bound}
+        diagonal = (rest[corners].amax((0, 1)) - rest[corners].amin((0, 1))).norm()
+        buffers |= {"feet": torch.from_numpy(weights @ rest.numpy()), "highest": HIGHEST_BULGE * diagonal}
         buffers |= {"inverses": inverses, "areas": area, "per_area": inverse(total, total <= 0)}
         # Weights by rows, and their transpose: torch would make it anew at each backward pass.
         for prefix, matrix in (("", weights), ("transposed_", weights.T.tocsr())):
@@ -120,10 +128,12 @@ class Passengers(nn.Module):
         turns = best_rotation(self._deformation(flat))  # (B, V, 3, 3)
         # About the carrier's middle, for the sake of float32.
         middle = self.reference.mean(0)
-        offsets = flat - middle - torch.einsum("bvij,vj->bvi", turns, self.reference - middle)
-        affine = self._mix(torch.cat([turns.flatten(2), offsets], -1))
-        offset = self.points - middle
-        moved = (affine[..., :9].unflatten(-1, (3, 3)) * offset[:, None]).sum(-1) + affine[..., 9:]
+        turned = torch.einsum("bvij,vj->bvi", turns, self.reference - middle)
+        mixed = self._mix(torch.cat([turns.flatten(2), flat - middle, turned], -1))
+        turn, foot = mixed[..., :9].unflatten(-1, (3, 3)), mixed[..., 9:12]
+        bulge = (turn * (self.feet - middle)[:, None]).sum(-1) - mixed[..., 12:]
+        bounded = bulge / (1 + (bulge / self.highest).square().sum(-1, keepdim=True)).sqrt()
+        moved = foot + (turn * (self.points - self.feet)[:, None]).sum(-1) + bounded
         return (moved + middle).view(*shapes.shape[:-2], len(self), 3)
 
     @full_precision

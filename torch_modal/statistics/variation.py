@@ -17,7 +17,7 @@ from torch_modal.elastic.term import Mesh
 from torch_modal.elastic.volume import Volume, encloses
 from torch_modal.geometry.canonical import CANONICAL_SIZE
 from torch_modal.geometry.connectivity import edge_graph, farthest_apart
-from torch_modal.geometry.rigid import best_rotation
+from torch_modal.geometry.rigid import best_fit, best_rotation
 from torch_modal.geometry.triangle_frames import frames_of
 from torch_modal.geometry.vectors import pick
 from torch_modal.statistics.coordinates import BendingCoordinates
@@ -56,7 +56,8 @@ class Variation:
     def __init__(self, shapes: Tensor, faces: Tensor, backend: str = "auto") -> None:
         #: Subtracted from all shapes: second moments far from the origin would be rounding. *Shape:* ``(3,)``.
         self.origin = shapes[0, faces.flatten()].mean(0)
-        shapes = shapes - self.origin
+        #: The given shapes where they are. *Shape:* ``(K, V, 3)``.
+        self.placed = shapes = shapes - self.origin
         # The mean of rotations and strains, seen from the first shape and then from itself.
         mean = shapes[0]
         for _ in range(2):
@@ -131,10 +132,20 @@ class Variation:
         factors = torch.randn(shape, dtype=torch.float64, generator=generator, device=device)
         return weights.cpu(), locality * factors.cpu()
 
-    def members(self, weights: Tensor, factors: Tensor) -> Tensor:
-        """Members of the set, in the pose of the mean. *Shape:* ``(n, K), (n, K, n_fields - 1) -> (n, V, 3)``."""
-        shapes = [self.member(*each)[0][None] for each in zip(weights, factors, strict=True)]
-        return self.coordinates.align(torch.cat([self.shapes[:0], *shapes]))
+    def members(self, weights: Tensor, factors: Tensor, on_shapes: bool = True) -> Tensor:
+        r"""Members of the set. *Shape:* ``(n, K), (n, K, n_fields - 1) -> (n, V, 3)``.
+
+        On the given shapes, at the rigid motion of least :math:`\sum_k w_k \int |x - x_k|^2` with the means of the
+        local weights over the surface; otherwise in the pose of the mean.
+        """
+        shapes, means = self.shapes.new_empty(len(weights), *self.shapes.shape[1:]), torch.empty_like(weights)
+        areas = self.coordinates.reconstruction.areas
+        for i, each in enumerate(zip(weights, factors, strict=True)):
+            shapes[i], local = self.member(*each)
+            means[i] = local @ areas / areas.sum()
+        if not on_shapes:
+            return self.coordinates.align(shapes)
+        return best_fit(shapes, torch.einsum("nk,kvi->nvi", means, self.placed), areas).apply(shapes)
 
     def member(self, weights: Tensor, factors: Tensor) -> tuple[Tensor, Tensor]:
         """A member of the set and its local weights; less local, if it would fold.
