@@ -219,7 +219,7 @@ def test_workers_of_a_loader_find_the_same(layer: tm.InBetween, bars: Shapes) ->
 
 def test_errors_and_warnings_reach_the_caller(bars: Shapes) -> None:
     torch.set_num_threads(3)
-    layer = tm.InBetween(bars.bases[:2], bars.faces, "modal", solver=tm.Solver(max_steps=1, unconverged="raise"))
+    layer = tm.InBetween(bars.bases[:2], bars.faces, "modal", solver=tm.Solver(max_steps=0, unconverged="raise"))
     with pytest.warns(ConvergenceWarning) as told, torch.no_grad():
         layer(*leaves(bars))
     assert len(told) == 1 and "7 of 7" in str(told[0].message)

@@ -90,8 +90,7 @@ def run_through(call: Callable[[], Any]) -> tuple[int, int]:
 def paths() -> dict[str, int]:
     """Functions and files on the way of calls that users make most often, on the sample creature."""
     x, faces = tm.load_keyframes(sorted((PACKAGE / "samples" / "creature").glob("key-*.ply"))[:3])
-    bases = tm.extract_bases(x, faces, 8, progress=False)
-    layer = tm.InBetween(bases[:2], faces)
+    layer = tm.InBetween(x[:2], faces)
 
     def backward() -> None:
         leaf = x[0].clone().requires_grad_()
@@ -100,8 +99,8 @@ def paths() -> dict[str, int]:
     calls = {
         "in-between": lambda: layer(x[0], x[1], 0.4),
         "in-between, forward and backward": backward,
-        "subdivide": lambda: tm.subdivide(x, faces, 1, bases=bases, progress=False),
-        "making a layer": lambda: tm.InBetween(bases[:2], faces),
+        "subdivide": lambda: tm.subdivide(x, faces, 1, progress=False),
+        "making a layer": lambda: tm.InBetween(x[:2], faces),
     }
     found = {}
     for name, call in calls.items():
