@@ -571,15 +571,12 @@ def test_compiled_network_around_a_layer(backend: str, small_bars: Shapes) -> No
     assert counter.frame_count == 2, "other numbers are compiled again"
 
 
-@pytest.mark.parametrize(
-    "name", ["Passengers", "ShellEnergy", "ShellLoss", pytest.param("GaussNewtonStep", marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("name", ["Passengers", "ShellEnergy", "ShellLoss"])
 def test_export_of_what_reads_no_numbers(name: str, small_bars: Shapes) -> None:
     layer, x = CASES[name].make(small_bars), small_bars.keyframes
     n = 1 if name == "Passengers" else 2
-    batch = 2 if name == "GaussNewtonStep" else 3  # PyTorch bounds its batch by the layout of matrices
     given = (x[:2].clone(), x[1:].clone())[:n]
-    sizes = ({0: torch.export.Dim("batch")},) * n if batch > 2 else None
+    sizes = ({0: torch.export.Dim("batch")},) * n
     program = torch.export.export(layer, given, dynamic_shapes=sizes, strict=False).module()
-    other = (1.01 * x[:batch], x.flip(0)[:batch])[:n]
+    other = (1.01 * x[:3], x.flip(0)[:3])[:n]
     torch.testing.assert_close(program(*other), layer(*other), rtol=0, atol=1e-12)
