@@ -2,6 +2,7 @@
 
     python tests/benchmarks/registration.py [--parts poses pairs middle] [--n-pairs 12]
     python tests/benchmarks/registration.py --across [--only TEXT ...]
+    python tests/benchmarks/registration.py --holes [--only TEXT ...]
     python tests/benchmarks/registration.py --picture docs/images/registration.png
 
 The template is a pose decimated to 60 % of its vertices and shuffled; the target is another pose, turned, scaled and
@@ -9,7 +10,9 @@ moved, and often damaged. The truth of a template vertex is the point of the oth
 face. Errors are in percent of the target's bounding-box diagonal: of a pair of poses the mean over the vertices, of an
 in-between the mean distance to the one of the true connectivity, both ways. Mean and maximum are of trusted results.
 Times are processor seconds of one thread. ``--across`` registers different subjects by eight landmarks and without, and
-judges by other places; the woman in another connectivity is judged by all vertices.
+judges by other places; the woman in another connectivity is judged by all vertices. ``--holes`` cuts a part of the
+surface out of the target, around four places of each body, once as it is, and once noisy and in millimetres: the error
+of the vertices that the target has, over that of the same vertices without a hole, and the confidence of the others.
 """
 
 import argparse
@@ -32,8 +35,9 @@ from scipy.spatial.transform import Rotation
 from timing import limit_threads
 
 import torch_modal as tm
-from torch_modal.arrays import FloatArray, IntArray
+from torch_modal.arrays import BoolArray, FloatArray, IntArray
 from torch_modal.data.samples import sample_files
+from torch_modal.geometry.connectivity import edge_graph
 from torch_modal.geometry.decimation import decimate
 from torch_modal.io.read import open_asset
 from torch_modal.registration.surface import MeshSurface, drop_unreferenced
@@ -55,6 +59,14 @@ KEPT = 0.6
 WRONG = 3.0  # percent
 COLUMNS = ["", "pairs", "doubtful", "trusted, but off by 3 %", "error, mean", "at most", "time, mean"]
 FINGERS = ("thumb", "index", "middle", "ring", "little")
+HOLES = {
+    "mh-hand": (0, 1, (1541, 850, 178, 358)),  # the wrist, two finger tips, the back
+    "mh-woman": (0, 1, (881, 2122, 6161, 1528)),  # the head, a hand, a foot, the chest
+    "creature": (0, 1, (1364, 3779, 0, 2332)),  # two feet, the head, the back
+}
+"""Template's and target's pose, and the vertices around which a part of the surface is missing."""
+CUT_OUT = (0.0, 0.05, 0.1, 0.2)
+FINE_NOISE = 0.001  # standard deviation of a coordinate, in diagonals
 HAND_LANDMARKS = (850, 29, 221, 416, 605, 1500, 1291, 1267)
 """Of mh-hand, where `own_hand` has its places; all are among the suggestions."""
 
@@ -133,6 +145,69 @@ def pair(name: str, i: int, j: int, how: str, seed: int) -> Case:
     shift = scale * random.normal(size=3)
     there, truth = (scale * p @ rotation.T + shift for p in (there, truth))
     return Case(rest, triangles, there, there_faces, truth, float(scale * np.linalg.norm(np.ptp(shapes[j], axis=0))))
+
+
+def without_part(vertices: FloatArray, faces: IntArray, at: int, share: float) -> BoolArray:
+    """Faces that are left without a share of the area, the nearest to a vertex along the edges. *Shape:* ``(F,)``."""
+    surface = MeshSurface(vertices, faces)
+    distances = csgraph.dijkstra(edge_graph(vertices, surface.edges), indices=at)[faces].mean(1)
+    order = np.argsort(distances)
+    kept: BoolArray = np.empty(len(faces), dtype=bool)
+    kept[order] = np.cumsum(surface.face_areas[order]) > share * surface.area
+    return kept
+
+
+class Hole(NamedTuple):
+    """A registration to a target that misses a part."""
+
+    errors: FloatArray
+    """Of the template's vertices, in percent of the whole target's diagonal. *Shape:* ``(V,)``."""
+    there: BoolArray
+    """The vertices that the target has. *Shape:* ``(V,)``."""
+    found: tm.Registration
+
+
+@cache
+def with_hole(name: str, at: int, share: float, noisy: bool) -> Hole:
+    """Register a body to another pose of it without a part, that may be noisy and in millimetres."""
+    i, j, _ = HOLES[name]
+    random = np.random.default_rng(17)
+    shapes, faces = poses(name)
+    rest, triangles = remeshed(shapes[i], faces, random)
+    size = float(np.linalg.norm(np.ptp(shapes[j], axis=0)))
+    turn = Rotation.random(rng=random).as_matrix()
+    first, kept = MeshSurface(shapes[i], faces), without_part(shapes[j], faces, at, share)
+    closest = first.closest(rest)
+    truth, there = first.rows(closest) @ shapes[j] @ turn.T, shapes[j] @ turn.T
+    if noisy:
+        there, truth = 1000 * (there + FINE_NOISE * size * random.normal(size=there.shape)), 1000 * truth
+        size *= 1000
+    target, _ = drop_unreferenced(there, faces[kept])
+    found, _ = registered(rest, triangles, target.vertices, target.faces)
+    assert found is not None
+    errors = 100 / size * np.linalg.norm(found.positions.numpy() - truth, axis=1)
+    return Hole(errors, kept[closest.faces], found)
+
+
+def holes(only: Iterable[str], table: Table) -> None:
+    """Rows of bodies with 0 to 20 % of their surface cut out: a number for each place."""
+    for name, noisy, share in itertools.product(HOLES, (False, True), CUT_OUT):
+        label = f"{name}, noisy" if noisy else name
+        if not wanted(f"{label}, {share:.0%}", only):
+            continue
+        places = HOLES[name][2] if share else HOLES[name][2][:1]
+        results = [with_hole(name, at, share, noisy) for at in places]
+        if share:
+            whole = with_hole(name, places[0], 0.0, noisy).errors
+            errors = [f"{one.errors[one.there].mean() / whole[one.there].mean():.2f}" for one in results]
+        else:
+            errors = [f"{results[0].errors.mean():.2f} %"]
+        low = [(one.found.vertex_confidence.numpy() < 0.5, one.there) for one in results]
+        missing = [f"{part[~there].mean():.0%}" if share else "-" for part, there in low]
+        left = [f"{part[there].mean():.0%}" for part, there in low]
+        lacking = [f"{one.found.unsupported_area:.0%}" for one in results]
+        warned = sum(any("no counterpart" in line for line in one.found.warnings) for one in results)
+        table.add(label, f"{share:.0%}", *map(" ".join, (errors, missing, left, lacking)), f"{warned} of {len(places)}")
 
 
 class Result(NamedTuple):
@@ -331,6 +406,7 @@ def main() -> None:
     parser.add_argument("--parts", nargs="*", default=list(parts(0)), choices=list(parts(0)))
     parser.add_argument("--n-pairs", type=int, default=12)
     parser.add_argument("--across", action="store_true", help="different subjects instead")
+    parser.add_argument("--holes", action="store_true", help="targets that miss a part instead")
     parser.add_argument(
         "--only", nargs="+", default=[""], metavar="TEXT", help="subjects whose names hold one of these"
     )
@@ -340,6 +416,13 @@ def main() -> None:
     limit_threads()
     if given.picture:
         picture(given.picture)
+        return
+    if given.holes:
+        columns = ["", "cut out", "error of what is there over the whole's", "missing, below 0.5", "there, below 0.5"]
+        columns += ["without a counterpart", "warned"]
+        check = "--holes --only 'mh-hand, 0%'"
+        with Table("registration-holes", columns, given.keep, check=check, labels=2) as table:
+            holes(given.only, table)
         return
     if given.across:
         columns = ["", "landmarks", "error, mean", "at most", "confidence"]

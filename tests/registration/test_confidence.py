@@ -46,7 +46,7 @@ ONE_SUBJECT = {
     "to target": (lambda v: {"quality": PERFECT._replace(to_target=off(v))}, 1.0, 0.3, "mean distance"),
     "from target": (lambda v: {"quality": PERFECT._replace(from_target=off(v))}, 1.0, 0.3, "mean distance"),
     "flipped": (lambda v: {"quality": PERFECT._replace(flipped_area=v)}, 0.10, 0.01, "flipped"),
-    "unsupported": (lambda v: {"quality": PERFECT._replace(unsupported_area=v)}, 0.05, 0.02, "no target next to"),
+    "unsupported": (lambda v: {"quality": PERFECT._replace(unsupported_area=v)}, 0.05, 0.02, "no counterpart"),
     "mirrored": (lambda v: {"mirrored_lead": v}, *MIRRORED_LEAD, "mirror image"),
     "another": (lambda v: {"lead": v}, 0.0, 0.1, "another map"),
     "sliding": (lambda v: {"freedom": v}, 0.9, 0.65, "slide"),

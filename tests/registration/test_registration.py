@@ -98,6 +98,27 @@ def test_missing_parts_have_low_confidence(found: tm.Registration) -> None:
     assert float(low[missing].double().mean()) > 0.8 and float(low[kept].double().mean()) < 0.05
 
 
+@pytest.mark.parametrize("direction", [(1, 0.2, 0.1), (0.6, -0.5, -0.6)], ids=["tip", "side"])
+def test_a_hole_is_not_covered_and_what_is_left_is_as_good(
+    pair: tuple[Mesh, Mesh, np.ndarray], found: tm.Registration, direction: tuple[float, float, float]
+) -> None:
+    """A tenth of the surface is cut out: a limb, or a piece between limbs."""
+    (rest, faces), _, truth = pair
+    fine, fine_faces = limbs(4)
+    turn = trimesh.transformations.rotation_matrix(2.0, [1, 2, 3])[:3, :3]
+    surface = MeshSurface(fine, fine_faces)
+    order = np.argsort(-surface.face_centres @ direction / np.linalg.norm(surface.face_centres, axis=1) ** 0.5)
+    kept = fine_faces[order[np.cumsum(surface.face_areas[order]) > 0.1 * surface.area]]
+    there = np.isin(np.arange(len(rest)), kept)
+    target, _ = drop_unreferenced(2 * bent(fine) @ turn.T + [5, 6, 7], kept)
+    result = register(rest, faces, target.vertices, target.faces, progress=False)
+    assert errors(result, truth)[there].mean() < 1.2 * errors(found, truth)[there].mean()
+    low = result.vertex_confidence.numpy() < 0.5
+    assert low[~there].mean() > 0.95 and low[there].mean() < 0.08
+    assert [line for line in result.warnings if "% of the template have no counterpart" in line]
+    assert result.unsupported_area == pytest.approx(0.1, abs=0.03)
+
+
 def test_report_measures_what_it_says(pair: tuple[Mesh, Mesh, np.ndarray], found: tm.Registration) -> None:
     """The places on the target are exact, and the report has their largest distance."""
     there = trimesh.Trimesh(*pair[1], process=False)

@@ -60,6 +60,15 @@ def test_tips_are_matched_where_limbs_have_grown() -> None:
     assert {side[0] for side in sides} == {1.0, -1.0} and all(abs(side.sum()) == len(side) for side in sides)
 
 
+def test_places_along_limbs_are_relative_to_their_lengths() -> None:
+    """Where limbs have grown by a quarter or shrunk by a third, the middle of a limb maps to the middle of a limb."""
+    first, second = shape(*figure(level=3)), shape(*figure(np.array([1.6, 3.8, 3.8, 2.0, 2.0]), level=3))
+    found = CoarsePair(first, second).from_limbs(np.stack([first.tips, first.tips], axis=1))
+    own = second.coarse.vertices
+    off = np.linalg.norm(own[found.vertices] - own, axis=1)
+    assert off.mean() < 0.045, "twice as much if distances are not relative"
+
+
 def test_likeness_tells_front_from_back() -> None:
     first, second = shape(*figure()), shape(*figure(HEIGHTS * 1.1))
     maps = CoarsePair(first, second).from_tips()[:2]

@@ -34,6 +34,7 @@ _RELEASED, _CAUGHT = (0.3, 5, 4), (0.5, 5, 3)  # without flipped faces, then wit
 _MAP_WEIGHTS = (0.02, 0.1)
 _MAP_ROUNDS = 40
 _MAP_SHARE = 0.05  # weight of the map relative to closest points
+_OUTLIER = 3.0  # distance to the place of a map, in medians, above which a partial target may lack it
 _LANDMARK_WEIGHT = 5.0
 _FIXING_WEIGHT = 1e-5  # fixes pieces without a counterpart
 _ALIKE = 0.4  # smallest cosine between the normals of closest points
@@ -115,12 +116,20 @@ class TemplateFit:
         back: The target or a coarse copy, whose vertices are matched to the template.
         images: Vertex of the target's coarse shape for each template vertex; closest points must be near, so that
             touching fingers do not mix. *Shape:* ``(V,)``.
+        counted: The vertices whose images count, as a mask. *Shape:* ``(V,)``.
     """
 
-    def __init__(self, meshes: MeshPair, template: MeshSurface, back: MeshSurface, images: IntArray) -> None:
+    def __init__(
+        self, meshes: MeshPair, template: MeshSurface, back: MeshSurface, images: IntArray, counted: BoolArray | None
+    ) -> None:
         self.template, self.target, self.back, self.progress = template, meshes.target, back, meshes.progress
         self.elastic = ElasticSurface(template, stretchable=not meshes.same_subject)
-        self._coarse, self._images = meshes.second, images
+        self._coarse, self._images, self._partial = meshes.second, images, meshes.partial
+        # What the target lacks is mapped to the edge of the hole.
+        self._counted = template.on_boundary | ~meshes.second.placed.on_boundary[images]
+        self._counted &= True if counted is None else counted
+        if not self._counted.any():
+            self._counted[:] = True
         self._everywhere = sparse.identity(len(images), format="csr")
         self._share = template.vertex_areas / template.vertex_areas.mean()
         self._back_share = back.vertex_areas / back.vertex_areas.mean() * (len(images) / len(back.vertices))
@@ -138,8 +147,9 @@ class TemplateFit:
         The places keep a small weight in the stages. *Shape:* ``(V, 3), (V, 3)``.
         """
         if places is not None:
-            for weight in _MAP_WEIGHTS:
-                x = self.elastic.follow(x, [self._pull(self._everywhere, places, weight), self._landmarks], _MAP_ROUNDS)
+            for k, weight in enumerate(_MAP_WEIGHTS):
+                pull = self._to_map(x, places, weight, rigid=k == 0)
+                x = self.elastic.follow(x, [pull, self._landmarks], _MAP_ROUNDS)
         none = np.zeros(len(x), dtype=bool)
         for stage in stages:
             x = self._step(x, stage, none, places)
@@ -158,11 +168,20 @@ class TemplateFit:
             shape = self.template.with_vertices(x)
             pulls = [self._to_target(shape, weight, reach, released), self._from_target(shape, weight, reach, released)]
             if places is not None:
-                pulls.append(self._pull(self._everywhere, places, _MAP_SHARE * weight))
+                pulls.append(self._to_map(x, places, _MAP_SHARE * weight))
             pulls += [self._landmarks, self._pull(self._everywhere, x, _FIXING_WEIGHT)]
             x = self.elastic.follow(x, pulls)
             self.progress.update()
         return x
+
+    def _to_map(self, x: FloatArray, places: FloatArray, weight: float, rigid: bool = False) -> Pull:
+        """Pull template vertices to their places by the map, unless the target may lack these."""
+        counted = self._counted
+        if self._partial and not rigid:
+            distances = np.linalg.norm(places - x, axis=1)
+            counted = counted & (distances <= _OUTLIER * np.median(distances[counted]))
+        rows = np.flatnonzero(counted)
+        return self._pull(self._everywhere[rows], places[rows], weight)
 
     def _to_target(self, shape: MeshSurface, weight: float, reach: float, released: BoolArray) -> Pull:
         """Pull template vertices to closest points on the target."""
@@ -177,7 +196,7 @@ class TemplateFit:
         used[hidden] = dot(normals[hidden], self.target.vertex_normals[alike]) > _ALIKE
         used[hidden] &= self._coarse.is_near(self._images[hidden], places[hidden])
         used &= np.linalg.norm(places - shape.vertices, axis=1) < reach
-        used &= (shape.on_boundary | ~self.target.on_open_edge(closest)) & ~released
+        used &= (shape.on_boundary | ~self.target.on_open_edge(closest)) & self._counted & ~released
         rows = np.flatnonzero(used)
         return self._pull(self._everywhere[rows], places[rows], weight * self._share[rows])
 

@@ -39,13 +39,14 @@ _NEAR = 0.12  # largest geodesic distance of closest points from the image of a 
 _ROUND_TRIP = 3.0
 # Relative and absolute stretch above which a triangle counts as torn.
 _TORN = (2.5, 0.03)
+_OPEN = 0.1  # length of a boundary that only the second shape has, above which parts of the first may be missing
 # Smallest fraction of the area that is the denominator of the score, if many triangles collapse.
 _LEAST_COUNTED = 0.3
 # Largest error of a consistent distance, and minimum number of consistent samples for a repair.
 _CONSISTENT, _FEWEST = 0.12, 8
 # Tips: their smallest distance, the radius in which no vertex is more distant, and the numbers that are matched.
 _TIPS_APART, _TIP_RADIUS, _FEWEST_TIPS, _MOST_TIPS = 0.35, 0.25, 4, 6
-_N_MATCHINGS = 4  # number of matchings of tips that give maps
+_N_MATCHINGS = 4, 8  # number of matchings of tips that give maps, of a whole and of a partial target
 # Weight of differences of limb lengths relative to differences of the tree between the limbs.
 _LIMB_LENGTH = 0.2
 _SHORTEST_LIMB = 0.1
@@ -86,6 +87,12 @@ class SpectralShape:
     def __len__(self) -> int:
         """Number of coarse vertices."""
         return len(self.coarse.vertices)
+
+    @property
+    def boundary_length(self) -> float:
+        """Length of the boundary, in square roots of the area."""
+        start, end = self.coarse.vertices[self.coarse.connectivity.boundary_edges].transpose(1, 0, 2)
+        return float(np.linalg.norm(end - start, axis=1).sum())
 
     def geodesics_from(self, sources: IntArray) -> FloatArray:
         """Distances along the surface by the heat method. *Shape:* ``(m,) -> (n, m)``."""
@@ -172,11 +179,14 @@ class Map:
     vertices: IntArray
     score: float
     mirrored_score: float
+    counted: BoolArray | None = None
+    """Vertices with a counterpart on a partial target, if known. *Shape:* ``(n_first,)``."""
 
     @cached_property
     def distortion(self) -> float:
         """Mean over the vertices of the largest distance error to a sample."""
-        return float(self.pair.errors(self.vertices).max(1).mean())
+        errors = self.pair.errors(self.vertices, self.counted)
+        return float((errors if self.counted is None else errors[self.counted]).max(1, initial=0).mean())
 
     def differs(self, others: Sequence["Map"]) -> bool:
         """True if each of other maps has a different image of some part."""
@@ -190,9 +200,13 @@ class CoarsePair:
 
     def __init__(self, first: SpectralShape, second: SpectralShape) -> None:
         self.first, self.second = first, second
+        #: True if the second shape has holes that the first one has not.
+        self.partial = second.boundary_length > first.boundary_length + _OPEN
+        #: Length on the second shape over the same length on the first, both in square roots of the areas.
+        self.growth = 1.0
 
     # ------------------------------------------------------------------------------------------------ scores and errors
-    def rate(self, vertices: IntArray, k: int = FINE_FUNCTIONS) -> Map:
+    def rate(self, vertices: IntArray, k: int = FINE_FUNCTIONS, counted: BoolArray | None = None) -> Map:
         """Scores of a map with ``k`` eigenfunctions. *Shape:* ``(n_first,)``."""
         first, second = self.first, self.second
         k = min(k, first.functions.shape[1], second.functions.shape[1])
@@ -200,32 +214,40 @@ class CoarsePair:
         areas = _area_balance(first, second, vertices), _area_balance(second, first, back)
         round_trip = np.linalg.norm(first.coarse.vertices[back[vertices]] - first.coarse.vertices, axis=1).mean()
         score, mirrored_score = (float(area - _ROUND_TRIP * round_trip) for area in (min(areas), -max(areas)))
-        return Map(self, vertices, score, mirrored_score)
+        return Map(self, vertices, score, mirrored_score, counted)
 
-    def errors(self, vertices: IntArray) -> FloatArray:
-        """Errors of the distances from vertices to samples. *Shape:* ``(n_first,) -> (n_first, m)``."""
+    def errors(self, vertices: IntArray, counted: BoolArray | None = None) -> FloatArray:
+        """Errors of the distances from vertices to samples that count. *Shape:* ``(n_first,) -> (n_first, m)``."""
         samples, distances = self.first.samples
-        return np.abs(distances - self.second.geodesics_from(vertices[samples])[vertices])
+        used = np.ones(len(samples), dtype=bool) if counted is None else counted[samples]
+        errors = self.growth * distances[:, used] - self.second.geodesics_from(vertices[samples[used]])[vertices]
+        # The way around a hole is longer.
+        return np.maximum(errors, 0) if self.partial else np.abs(errors)
 
-    def likeness(self, vertices: IntArray) -> float:
+    def likeness(self, vertices: IntArray, counted: BoolArray | None = None) -> float:
         """Correlation of the curvatures of corresponding vertices; front and back differ. *Shape:* ``(n_first,)``."""
         here, there = self.first.curvature(_CURVATURE_FUNCTIONS), self.second.curvature(_CURVATURE_FUNCTIONS)[vertices]
+        if counted is not None:
+            here, there = here[counted], there[counted]
         here, there = here - here.mean(), there - there.mean()
         return float(dot(here, there) / max(np.linalg.norm(here) * np.linalg.norm(there), 1e-12))
 
     # ------------------------------------------------------------------------------------------------------------- maps
-    def _functional(self, vertices: IntArray, k: int) -> FloatArray:
-        """Pull-back of functions from the second shape to the first. *Shape:* ``(k, k)``."""
-        weighted = self.first.mass[:, None] * self.second.functions[vertices, :k]
+    def _functional(self, vertices: IntArray, k: int, counted: BoolArray | None = None) -> FloatArray:
+        """Pull-back of functions from the second shape to the part of the first that counts. *Shape:* ``(k, k)``."""
+        mass = self.first.mass if counted is None else self.first.mass * counted
+        weighted = mass[:, None] * self.second.functions[vertices, :k]
         return np.asarray(self.first.functions[:, :k].T @ weighted)
 
-    def refine(self, vertices: IntArray, start: int, stop: int = FINE_FUNCTIONS) -> Map:
+    def refine(
+        self, vertices: IntArray, start: int, stop: int = FINE_FUNCTIONS, counted: BoolArray | None = None
+    ) -> Map:
         """Refine a map with from ``start`` to ``stop`` eigenfunctions (ZoomOut, Melzi et al. 2019)."""
         most = min(stop, self.first.functions.shape[1], self.second.functions.shape[1])
         for k in [*range(min(start, most), most, _STEP), most]:
-            rows = self.second.functions[:, :k] @ self._functional(vertices, k).T
+            rows = self.second.functions[:, :k] @ self._functional(vertices, k, counted).T
             vertices = nearest_rows(self.first.functions[:, :k], rows)
-        return self.rate(vertices, stop)
+        return self.rate(vertices, stop, counted)
 
     def from_landmarks(self, pairs: IntArray) -> Map:
         """Refined map from geodesic distances to landmarks. *Shape:* ``(n, 2)``, coarse vertices of both."""
@@ -252,7 +274,7 @@ class CoarsePair:
         i, j = np.triu_indices(n, 1)
         trunks = (changes - growth[:, :, None] - growth[:, None])[:, i, j]
         costs = np.sqrt((trunks**2).mean(1)) + _LIMB_LENGTH * growth.std(1)
-        best = orders[np.argsort(costs, kind="stable")[:_N_MATCHINGS]]
+        best = orders[np.argsort(costs, kind="stable")[: _N_MATCHINGS[self.partial]]]
         return [self.from_limbs(np.stack([tips[:n], others[order]], axis=1)) for order in best]
 
     def from_limbs(self, pairs: IntArray) -> Map:

@@ -48,6 +48,7 @@ class MeshPair(CoarsePair):
         self.rest = template[0] * size
         self.template = source.with_vertices(source.vertices * size)
         super().__init__(SpectralShape(self.template), SpectralShape(self.target))
+        self.partial &= same_subject
         self.marks = points[:, 0] * size, (points[:, 1] - self.origin) / self.unit
         shapes = (self.first, self.template), (self.second, self.target)
         vertices = [

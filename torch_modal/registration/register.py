@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from threadpoolctl import threadpool_limits
 
-from torch_modal.arrays import FloatArray, IntArray
+from torch_modal.arrays import BoolArray, FloatArray, IntArray
 from torch_modal.errors import MeshError
 from torch_modal.geometry.rigid import best_fit
 from torch_modal.io.cache import Cache
@@ -27,9 +27,9 @@ from torch_modal.registration.maps import (
 )
 from torch_modal.registration.pair import MeshPair
 from torch_modal.registration.report import LEAD, SLIDING, TRUSTED, Quality, Registration, judge, measure, ramp
-from torch_modal.registration.surface import MeshSurface
+from torch_modal.registration.surface import MeshSurface, beside_holes
 
-VERSION = 10  # part of the cache key: raise it when the algorithm changes
+VERSION = 11  # part of the cache key: raise it when the algorithm changes
 MIN_LANDMARKS = 5  # minimum number of landmarks between different subjects: fewer do not determine the map
 _SURE_SCORE = 0.62  # score of a spectral map below which more initial maps are tried
 _SCORE_SHARE = 0.5  # weight of a map's score and likeness relative to the stretch of its fit
@@ -40,6 +40,8 @@ _RIVAL_SCORE = 0.2, 0.15
 _WHOLE = 70  # percentile of the distances between fits that tells whether they differ as a whole
 _CLOSE = 0.1  # cost above the best fit's up to which others count
 _SPECTRAL_REFINEMENTS = (True, True, False, False)  # of the map of each repeated fit
+_MORE_REFINEMENTS = 4  # number of further ones for a partial target, whose maps converge slowly
+_FEWEST = 8  # minimum number of samples of the template that a partial target has
 _STRETCHED = 0.3  # stretch above which a fit between two subjects is repeated
 _CONVERGED = 0.3  # mean displacement of the vertices at convergence, in percent of the diagonal
 _WORSE = 0.05  # accepted increase of a candidate's cost
@@ -53,11 +55,14 @@ class _Candidate(NamedTuple):
     x: FloatArray
     quality: Quality
     likeness: float
+    counted: BoolArray | None
+    """Vertices with a counterpart on a partial target; None for a whole one. *Shape:* ``(n,)``."""
 
     @property
     def cost(self) -> float:
         """Cost of a candidate: fit and distortion minus the score of the map and the likeness of curvatures."""
-        return self.quality.cost + self.map.distortion - _SCORE_SHARE * (self.map.score + self.likeness)
+        fit = self.quality.cost(self.map.pair.partial)
+        return fit + self.map.distortion - _SCORE_SHARE * (self.map.score + self.likeness)
 
 
 def register(
@@ -150,7 +155,9 @@ class _RegistrationProblem(MeshPair):
         for lead, distances in apart:
             self.unique[distances > SAME] = np.minimum(self.unique[distances > SAME], ramp(lead, *LEAD))
         rivals = [self._fit_fine(one) for one in alike]
-        return self._report(self._rescale(best), min(leads, default=np.inf), rivals)
+        if self._rescale(best):
+            best = self._fit_coarse(best.map, best.x)
+        return self._report(best, min(leads, default=np.inf), rivals)
 
     # ------------------------------------------------------------------------------------------------------------- maps
     def _maps(self) -> list[Map]:
@@ -160,7 +167,7 @@ class _RegistrationProblem(MeshPair):
                 return [*maps, self.from_limbs(self.mark_vertices)]
             return maps + [one for one in self._spectral_maps(N_SIGNS) if self._agrees(one)]
         maps = self._spectral_maps(N_SIGNS)
-        sure = maps[0].score >= _SURE_SCORE
+        sure = maps[0].score >= _SURE_SCORE and not self.partial
         if sure and self.same_subject:
             return maps
         tips = self.from_tips()
@@ -194,18 +201,40 @@ class _RegistrationProblem(MeshPair):
 
     # ------------------------------------------------------------------------------------------------------------- fits
     def _fit_coarse(self, one: Map, x: FloatArray | None = None) -> _Candidate:
-        """Fit of the coarse template along a map, or from positions near the target."""
+        """Fit of the coarse template along a map where it counts, or from positions near the target."""
         template, back = self.first.placed, self.second.placed
-        fit, places = TemplateFit(self, template, back, one.vertices), back.vertices[one.vertices]
+        fit, places = TemplateFit(self, template, back, one.vertices, one.counted), back.vertices[one.vertices]
         if x is None:
-            rest, goal, areas = map(torch.from_numpy, (template.vertices, places, template.vertex_areas))
+            weights = template.vertex_areas * (1 if one.counted is None else one.counted)
+            rest, goal, areas = map(torch.from_numpy, (template.vertices, places, weights))
             with torch.no_grad():
                 placed = best_fit(rest, goal, areas).apply(rest).numpy()
             x = fit.run(placed, COARSE_STAGES, 2, places)
         else:
             x = fit.run(x, COARSE_STAGES, 2)
-        likeness = self.likeness(self._images(template.with_vertices(x)))
-        return _Candidate(one, x, measure(template, x, back)[0], likeness)
+        images = self._images(template.with_vertices(x))
+        quality, supported = measure(template, x, back)
+        counted = self._enough(supported >= TRUSTED)
+        if counted is not None:
+            counted = self._enough(counted & (self._well_placed(images, counted) >= TRUSTED))
+        return _Candidate(one, x, quality, self.likeness(images, counted), counted)
+
+    def _enough(self, counted: BoolArray) -> BoolArray | None:
+        """The mask if the target is partial and samples are left. *Shape:* ``(n,)``."""
+        return counted if self.partial and counted[self.first.samples[0]].sum() >= _FEWEST else None
+
+    def _well_placed(self, images: IntArray, counted: BoolArray | None) -> FloatArray:
+        """Confidence in each coarse vertex by its distances to those that count. *Shape:* ``(n,)``.
+
+        Of a vertex in a wrong place, many distances are wrong; of the others, the few to such vertices.
+        """
+        errors = self.errors(images, counted)
+        placed: FloatArray = ramp(np.quantile(errors, _MOST, axis=1), *_MISPLACED)
+        if counted is not None:  # a missing limb may lie on top of its twin: the one with larger errors is wrong
+            samples, mean = self.first.samples[0], errors.mean(1)
+            collides = (errors > np.mean(_MISPLACED)) & (mean[:, None] > mean[samples[counted[samples]]])
+            placed[collides.any(1)] = 0
+        return placed
 
     def _images(self, shape: MeshSurface) -> IntArray:
         """Coarse vertices of the target nearest to the vertices of a fitted template. *Shape:* ``(n,)``."""
@@ -216,9 +245,14 @@ class _RegistrationProblem(MeshPair):
         if not self.same_subject and candidate.quality.stretch < _STRETCHED:
             return candidate
         most = candidate.cost + _WORSE
-        for spectral in _SPECTRAL_REFINEMENTS if self.same_subject else (False,):
-            vertices = self._images(self.first.placed.with_vertices(candidate.x))
-            again = self._fit_coarse(self.refine(vertices, FINE_FUNCTIONS) if spectral else self.rate(vertices))
+        rounds = _SPECTRAL_REFINEMENTS + (False,) * _MORE_REFINEMENTS * self.partial
+        for spectral in rounds if self.same_subject else (False,):
+            if self.partial:
+                self._rescale(candidate)
+            vertices, known = self._images(self.first.placed.with_vertices(candidate.x)), candidate.counted
+            again = self._fit_coarse(
+                self.refine(vertices, FINE_FUNCTIONS, counted=known) if spectral else self.rate(vertices, counted=known)
+            )
             if again.cost > most:
                 break
             if np.linalg.norm(again.x - candidate.x, axis=1).mean() < _CONVERGED:
@@ -226,18 +260,20 @@ class _RegistrationProblem(MeshPair):
             candidate = again
         return candidate
 
-    def _rescale(self, candidate: _Candidate) -> _Candidate:
-        """Repeat the fit with the template's scale on the target: the ratio of areas is wrong if parts are missing."""
+    def _rescale(self, candidate: _Candidate) -> bool:
+        """Give the template its scale on the target: the ratio of areas is wrong if parts are missing."""
         coarse = self.first.placed
         i, j = coarse.edges.T
         now, rest = (np.maximum(np.linalg.norm(x[i] - x[j], axis=1), 1e-12) for x in (candidate.x, coarse.vertices))
-        change = float(np.median(now / rest))
+        known = np.ones(len(i), dtype=bool) if candidate.counted is None else candidate.counted[coarse.edges].all(1)
+        change = float(np.median((now / rest)[known])) if known.any() else 1.0
         if not self.same_subject or abs(np.log(change)) < _RESCALED:
-            return candidate
+            return False
+        self.growth *= change if self.partial else 1
         self.rest, self.marks = change * self.rest, (change * self.marks[0], self.marks[1])
         self.template = self.template.with_vertices(change * self.template.vertices)
         self.first.placed = coarse.with_vertices(change * coarse.vertices)
-        return self._fit_coarse(candidate.map, candidate.x)
+        return True
 
     def _fit_fine(self, candidate: _Candidate) -> FloatArray:
         """Positions of all vertices after the last stages."""
@@ -245,7 +281,9 @@ class _RegistrationProblem(MeshPair):
         carrier, faces, rest, x = map(torch.tensor, (coarse.vertices, coarse.faces, self.rest, candidate.x))
         everything: FloatArray = Passengers(carrier, faces, rest)(x).numpy()
         images = self._images(self.template.with_vertices(everything[self.used]))
-        fit = TemplateFit(self, self.template, self.target, images)
+        near = coarse.nearest_alike(self.template.vertices, self.template.vertex_normals)
+        counted = None if candidate.counted is None else candidate.counted[near]
+        fit = TemplateFit(self, self.template, self.target, images, counted)
         everything[self.used] = fit.run(everything[self.used], FINE_STAGES, 1)
         return everything
 
@@ -262,9 +300,7 @@ class _RegistrationProblem(MeshPair):
         errors = np.linalg.norm(rows @ x - self.marks[1], axis=1)
         near = self.first.placed.nearest_alike(self.template.vertices, self.template.vertex_normals)
         if self.same_subject:
-            # Of a vertex in a wrong place, many distances are wrong; of the others, the few to such vertices.
-            misplaced = np.quantile(self.errors(images), _MOST, axis=1)
-            supported = np.minimum(supported, ramp(misplaced, *_MISPLACED)[near])
+            supported = np.minimum(supported, self._well_placed(images, best.counted)[near])
         lost = float(self.template.vertex_areas[supported < TRUSTED].sum() / self.template.area)
         quality = quality._replace(unsupported_area=max(quality.unsupported_area, lost))
         freedom = sliding_freedom(self.first, self.mark_vertices[:, 0])
@@ -272,7 +308,8 @@ class _RegistrationProblem(MeshPair):
         confidence, warnings = judge(quality, score, best.likeness, errors, mirrored, lead, freedom, self.same_subject)
         vertex_confidence = np.full(len(everything), confidence)
         unique = np.minimum(self.unique[near], ramp(freedom, *SLIDING))
-        vertex_confidence[self.used] = np.minimum(supported, unique)
+        sure = ~beside_holes(self.template.with_vertices(x), self.target)
+        vertex_confidence[self.used] = np.minimum(supported * sure, unique)
         closest = self.target.closest(everything)
         corners = self.target_vertices[self.target.faces[closest.faces]]
         return Registration(

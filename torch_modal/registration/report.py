@@ -49,10 +49,10 @@ class Quality(NamedTuple):
     flipped_area: float
     unsupported_area: float
 
-    @property
-    def cost(self) -> float:
-        """Cost for comparing candidates."""
-        return self.stretch + 0.1 * (self.to_target.mean + self.from_target.mean) + self.flipped_area
+    def cost(self, partial: bool) -> float:
+        """Cost for comparing candidates; vertices may be far from a partial target."""
+        distance = self.from_target.mean + (0 if partial else self.to_target.mean)
+        return self.stretch + 0.1 * distance + self.flipped_area
 
 
 def measure(template: MeshSurface, x: FloatArray, target: MeshSurface) -> tuple[Quality, FloatArray]:
@@ -204,7 +204,7 @@ def judge(
     criteria = {
         f"the mean distance of the surfaces is {distance:.2f} % of the diagonal": ramp(distance, 1.0, 0.3),
         f"{100 * quality.flipped_area:.1f} % of the area are flipped": ramp(quality.flipped_area, 0.10, 0.01),
-        f"{100 * missing:.1f} % of the area have no target next to them": ramp(missing, 0.05, 0.02),
+        f"{100 * missing:.1f} % of the template have no counterpart, see vertex_confidence": ramp(missing, 0.05, 0.02),
         "the template is so smooth that it can slide along the target": ramp(freedom, *SLIDING),
         "another map fits nearly as well": ramp(lead, *LEAD),
     }

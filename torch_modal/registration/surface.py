@@ -102,6 +102,13 @@ class MeshSurface(Surface):
         return away
 
 
+def beside_holes(shape: MeshSurface, target: MeshSurface) -> BoolArray:
+    """Vertices at the edge of a hole that only the target has: they may belong to the hole. *Shape:* ``(V,)``."""
+    edge = np.flatnonzero(target.on_boundary)
+    edge = edge[~shape.on_open_edge(shape.closest(target.vertices[edge]))]
+    return np.asarray(np.isin(target.faces[target.closest(shape.vertices).faces], edge).any(1))
+
+
 # --------------------------------------------------------------------------------------------------------------- pieces
 def outward(vertices: FloatArray, faces: IntArray) -> IntArray:
     """Faces with outward winding if the surface is closed, otherwise unchanged. *Shape:* ``(F, 3)``."""
