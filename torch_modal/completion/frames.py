@@ -6,16 +6,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torch_modal.arrays import FloatArray
+from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.completion.observation import Observation
 from torch_modal.completion.pairs import NOISES, ObservedPoints
-from torch_modal.geometry.canonical import CANONICAL_SIZE, own_order, to_canonical
+from torch_modal.geometry.canonical import CANONICAL_SIZE, GENERIC, to_canonical
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.keyframes.arrays import require_units
 from torch_modal.registration.surface import places_between
 
 SWAY, SOFT = 2.0, 3e-5
 """Standard deviation of the amplitude of the first mode, at a size of 100; least stiffness of the modes."""
+SIZE_DIGITS = 6
+"""Digits of the logarithm of a size: equal ones, as of mirrored poses, differ by rounding."""
 NOISE = 0.5
 """Of points before it is estimated, at a size of 100."""
 HALF, NOISES_OF_HALF = 1.0, 3.0
@@ -37,6 +39,16 @@ class Frame(NamedTuple):
     """Points of weight 0: their distances are reported, and that is all."""
 
 
+def find_largest(shapes: FloatArray, faces: IntArray) -> int:
+    """Index of the largest shape, whatever the order and the pose of all. *Shape:* ``(K, V, 3), (F, 3)``."""
+    keys = []
+    for x in shapes:
+        coordinates, _, _, scale = to_canonical(x, faces)
+        generic = float(np.sin(np.arange(len(x))) @ coordinates @ GENERIC)
+        keys.append((round(float(np.log(scale)), SIZE_DIGITS), generic))
+    return keys.index(min(keys))
+
+
 class CompletionProblem:
     """Whole shapes and observations, at a size of 100 in the axes of the largest shape, which is the template.
 
@@ -54,7 +66,7 @@ class CompletionProblem:
         self.faces, self.times = faces, times
         self.mesh = Connectivity(faces.numpy(), shapes.shape[1])
         # Not the first: reversed times give the same motion reversed.
-        largest = own_order(list(shapes), faces.numpy())[0]
+        largest = find_largest(shapes, faces.numpy())
         _, self.axes, self.centre, self.scale = to_canonical(shapes[largest], faces.numpy())
         self.whole = torch.from_numpy((shapes - self.centre) @ self.axes.T * self.scale)
         self.template = self.whole[largest]
