@@ -197,7 +197,7 @@ def test_other_units_and_shapes_are_refused(tube):
         ({"normals": torch.zeros(3, 3)}, "normals have the shape"),
         ({"vertices": [0, 1, 2, 3], "normals": torch.ones(4, 3)}, "clouds"),
         ({"corners": torch.zeros(4, 3, dtype=torch.int64)}, "go together"),
-        ({"weights": torch.zeros(4)}, "not all 0"),
+        ({"weights": torch.zeros(4)}, "weight above 0"),
         ({"noise": 0.0}, "above 0"),
         ({"view": torch.zeros(3)}, "direction"),
     ],
@@ -307,7 +307,7 @@ def test_gradients_in_points_of_a_cloud(tube):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("torch_modal.completion.refinement.LastSolve", keep)
-        with pytest.warns(tm.MeshWarning, match="gradients in points of clouds"):
+        with pytest.warns(tm.MeshWarning, match="gradients of clouds"):
             found = tm.complete(x[::2], faces, [seen], times=[0.0, 2.0, 4.0])
     probe = torch.randn(x[1].shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     (slope,) = torch.autograd.grad((found.shapes[0] * probe).sum(), points)

@@ -100,8 +100,8 @@ def complete(
 
     Returns:
         The motion, in the dtype and on the device of the key-frames. Its shapes have first derivatives in the points of
-        the observations, through the last minimisation of all frames: exact ones of markers; where there are clouds,
-        pairs and poses by modes are constants of it, and a warning says so.
+        the observations, through the last minimisation of all frames: exact ones of markers; where there are clouds or
+        noisy meshes, pairs and poses by modes are constants of it, and a warning says so.
 
     Raises:
         ValueError: Key-frames, times or observations do not fit, the points are in other units, or the objective is
@@ -131,8 +131,8 @@ def complete(
     points = torch.cat([one.points.double().cpu() for one in observations])
     if not torch.is_grad_enabled() or not points.requires_grad:
         return completion
-    if any(one.is_cloud and one.points.requires_grad for one in observations):
-        message = "gradients in points of clouds leave out how pairs and poses change: even their sign may be wrong"
+    if solve is not None and not solve.smooth:
+        message = "gradients of clouds and noisy meshes leave out pairs and poses: even their sign may be wrong"
         warnings.warn(f"{message}; those of markers are exact", MeshWarning, stacklevel=3)
     knots = ShapesOfPoints.apply(solve, rows, axes, completion.knots, points)
     when = sorted({*completion.times.tolist(), *([] if completion.path is None else completion.path.times.tolist())})

@@ -28,6 +28,8 @@ class LastSolve(NamedTuple):
     """The rest shapes of each frame, as functions of the shapes of all."""
     points: list[PointEnergy]
     """Of each frame."""
+    smooth: bool
+    """True where the gradients are exact."""
 
     def adjoint(self, grad: Tensor) -> Tensor:
         """Gradient in the points of all pairs, of a gradient in the shapes. *Shape:* ``(T, V, 3) -> (n, 3)``.

@@ -35,6 +35,8 @@ ROUNDS, STEPS, PRODUCTS = 12, 2, 20
 """Rounds of new pairs, in each of which all vertices take steps, each with iterations of conjugate gradients."""
 LAST = 6 * [60]
 """Steps after the last round, and their iterations."""
+MOST_MARKERS = 0.5
+"""Part of the vertices below which these are markers: noisy meshes also need their shapes by modes."""
 STILL, MOST_ROUNDS = 1e-5, 40
 """Largest move of a vertex in a round, at a size of 100, where markers are at rest; rounds until then."""
 
@@ -66,8 +68,9 @@ class Refinement:
     def run(self, poses: list[Tensor], report: ProgressReport) -> tuple[Tensor, LastSolve]:
         """Shapes of the frames from their poses by modes, and how they were found. *Shape:* ``(T, V, 3)``."""
         frames = self.problem.frames
-        # Without clouds, shapes are smooth functions of the points, and are minimised until nothing moves.
-        smooth = all(one.places is not None for frame in frames for one in frame.seen)
+        # With few markers, shapes are smooth functions of the points, and are minimised until nothing moves.
+        few = MOST_MARKERS * len(self.problem.template)
+        smooth = all(one.places is not None and len(one.points) < few for frame in frames for one in frame.seen)
         for i, pose in enumerate(poses):
             surface = SampledSurface(pose.numpy(), self.problem.mesh)
             frames[i] = frames[i]._replace(seen=[one.with_noise(surface) for one in frames[i].seen])
@@ -82,7 +85,8 @@ class Refinement:
         def relax(x: Tensor, products: list[int]) -> LastSolve:
             rows = zip(frames, x.split(1), rests_of(x), strict=True)
             every = [self._relax(frame, one, rests, products, of_known) for frame, one, rests in rows]
-            return LastSolve(torch.cat([one for one, _ in every]), self.fine.energy, rests_of, [p for _, p in every])
+            x, points = torch.cat([one for one, _ in every]), [p for _, p in every]
+            return LastSolve(x, self.fine.energy, rests_of, points, smooth)
 
         for _ in range(ROUNDS):
             x = relax(x, STEPS * [PRODUCTS]).x
