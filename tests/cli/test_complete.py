@@ -107,6 +107,13 @@ def test_exact_keyframes_and_markers(files: Path, capsys: pytest.CaptureFixture[
     assert extras["keyframes"] == [0, 4] and seconds == pytest.approx(0.4)
 
 
+def test_markers_at_the_time_of_a_keyframe_beside_others(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    argv = ["complete", "template.obj", "markers.csv", "--keyframes", "later.obj", "--keyframe-times", "0.5", "2"]
+    assert cli.main([*argv, "--out", "motion.npz", "--frames", "3", "--quiet", "--estimate-times"]) == 0
+    keyframes, _ = tm.load_keyframes(["template.obj", "later.obj"])
+    np.testing.assert_array_equal(np.load("motion.npz")["frames"][[0, -1]], keyframes.numpy())
+
+
 def test_markers_and_keyframes_arrive(files: Path, arrived: dict[str, Any]) -> None:
     argv = ["complete", "template.obj", "markers.csv", SCANS[1], "--keyframes", "later.obj"]
     argv += ["--keyframe-times", "0", "2"]
@@ -184,7 +191,8 @@ def test_what_cannot_work_is_refused_before_the_work(
     argv = [*base, *out, "--keyframes", "later.obj", "--keyframe-times", "3"]
     assert "later.obj; got 1" in misused(capsys, *argv)
     assert "template.obj; got 2" in misused(capsys, *base, *out, "--keyframe-times", "3", "4")
-    assert "must be 2 or more; got 1" in misused(capsys, *base, *out, "--frames", "1")
+    assert "must be 2 or more, and 100000 at most; got 1" in misused(capsys, *base, *out, "--frames", "1")
+    assert "100000 at most; got 100000000" in misused(capsys, *base, *out, "--frames", "100000000")
     assert "required: SEEN" in misused(capsys, "complete", "template.obj", *out)
     assert "noise is a length above 0" in fails(capsys, *base, *out, "--noise", "0")
     assert "2 times for 10 clouds (scans/s-00.ply, " in fails(capsys, *base, *out, "--times", "0", "1")

@@ -19,10 +19,8 @@ from torch_modal.motion.decoder import scale_modes
 from torch_modal.registration.surface import places_between
 
 
-@pytest.fixture(scope="module")
-def tube():
-    """A bending tube, half as thick as it is wide: shapes at five times, faces, and its diagonal."""
-    n, m = 24, 12
+def bending_tube(n, m):
+    """A bending tube of rings, half as thick as it is wide: shapes at five times, faces, and its diagonal."""
     t, a = np.meshgrid(np.linspace(0, 1, n), np.arange(m) * 2 * np.pi / m, indexing="ij")
     radius, shapes = 0.12 - 0.05 * t, []
     for bend in (-1.2, -0.6, 1e-6, 0.6, 1.2):
@@ -39,6 +37,11 @@ def tube():
     faces = np.concatenate([sides, *caps])[:, ::-1].copy()
     x = torch.from_numpy(np.stack(shapes))
     return x, torch.from_numpy(faces), float((x[0].amax(0) - x[0].amin(0)).norm())
+
+
+@pytest.fixture(scope="module")
+def tube():
+    return bending_tube(24, 12)
 
 
 def scanned(x, faces, time, view, seed=0, n=400, noise=0.0):
@@ -194,7 +197,7 @@ def test_other_units_and_shapes_are_refused(tube):
         ({"normals": torch.zeros(3, 3)}, "normals have the shape"),
         ({"vertices": [0, 1, 2, 3], "normals": torch.ones(4, 3)}, "clouds"),
         ({"corners": torch.zeros(4, 3, dtype=torch.int64)}, "go together"),
-        ({"weights": torch.zeros(4)}, "not all 0"),
+        ({"weights": torch.zeros(4)}, "weight above 0"),
         ({"noise": 0.0}, "above 0"),
         ({"view": torch.zeros(3)}, "direction"),
     ],
@@ -265,18 +268,35 @@ def test_points_of_weight_zero_do_not_count_in_a_score(tube):
         assert cloud.score(surface, 1.0) == pytest.approx(score, abs=1e-3)
 
 
-@pytest.mark.parametrize("kind", ["markers", "cloud"])
-def test_gradients_in_points(tube, kind):
+@pytest.mark.parametrize("given", [True, False])
+def test_gradients_of_markers_are_those_of_differences(given):
+    """Through robust weights and neighbours in time, also where the noise is estimated."""
+    x, faces, diagonal = bending_tube(10, 8)
+    vertices, generator = torch.arange(0, x.shape[1], 5), torch.Generator().manual_seed(0)
+    noise, shape = 0.005 * diagonal, (2, len(vertices), 3)
+    drawn, moves = (torch.randn(shape, generator=generator, dtype=x.dtype) for _ in range(2))
+    probe = torch.randn(2, *x.shape[1:], generator=generator, dtype=x.dtype)
+
+    def total(points):
+        options = {"vertices": vertices, "noise": noise if given else None}
+        seen = [tm.Observation(t, p, **options) for t, p in zip((1, 3), points, strict=True)]
+        return (tm.complete(x[[0, 4]], faces, seen, times=[0.0, 4.0]).shapes * probe).sum()
+
+    points = (x[[1, 3]][:, vertices] + noise * drawn).requires_grad_()
+    (slope,) = torch.autograd.grad(total(points), points)
+    step = 1e-4 * diagonal * moves
+    with torch.no_grad():
+        difference = float(total(points + step) - total(points - step)) / 2e-4 / diagonal
+    assert float((slope * moves).sum()) == pytest.approx(difference, rel=1e-3)
+
+
+def test_gradients_in_points_of_a_cloud(tube):
     """Against differences of the last minimisation, with its pairs: every point, in turned and scaled coordinates."""
     x, faces, _ = tube
     turn = torch.linalg.qr(torch.randn(3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(2)))[0]
     turn = turn * turn.det()
     x = 1000 * x @ turn.mT + 5
-    if kind == "markers":
-        vertices = torch.arange(0, len(x[1]), 9)
-        seen = tm.Observation(1.0, (x[1, vertices] + 4).clone(), vertices=vertices, noise=8.0)
-    else:
-        seen = scanned(x[1], faces, 1.0, turn.numpy() @ VIEWS[1], noise=2.0)
+    seen = scanned(x[1], faces, 1.0, turn.numpy() @ VIEWS[1], noise=2.0)
     points = seen.points.clone().requires_grad_()
     seen = tm.Observation(1.0, points, seen.normals, seen.vertices, noise=seen.noise, view=seen.view)
     solves = []
@@ -287,25 +307,27 @@ def test_gradients_in_points(tube, kind):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("torch_modal.completion.refinement.LastSolve", keep)
-        found = tm.complete(x[::2], faces, [seen], times=[0.0, 2.0, 4.0])
+        with pytest.warns(tm.MeshWarning, match="gradients of clouds"):
+            found = tm.complete(x[::2], faces, [seen], times=[0.0, 2.0, 4.0])
     probe = torch.randn(x[1].shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     (slope,) = torch.autograd.grad((found.shapes[0] * probe).sum(), points)
     (same,) = torch.autograd.grad((found(1.0) * probe).sum(), points)
     assert torch.allclose(slope, same, rtol=1e-6, atol=1e-9)
 
     last, step = solves[-1], 1e-3
+    (pairs,), (rests,) = last.points, last.rests(last.x)
     axes = torch.linalg.lstsq(  # of the solve, from the coordinates of points there and here
-        seen.points.detach()[last.points.numbers] - seen.points.detach()[last.points.numbers[0]],
-        last.points.points - last.points.points[0],
+        seen.points.detach()[pairs.numbers] - seen.points.detach()[pairs.numbers[0]],
+        pairs.points - pairs.points[0],
     ).solution
     scale = float(axes.det()) ** (1 / 3)
     moves = torch.randn(points.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
     ends = []
     for sign in (-1, 1):
-        springs = copy.copy(last.points)
-        springs.points = last.points.points + sign * step * (moves @ axes)[last.points.numbers]
+        springs = copy.copy(pairs)
+        springs.points = pairs.points + sign * step * (moves @ axes)[pairs.numbers]
         fine = FineEnergy(Mesh.of(faces, len(x[1])), [part.term for part in last.energy.parts])
-        ends.append(fine.relax(last.x, last.rests, 12 * [200], lambda *_, own=springs: [own]))
+        ends.append(fine.relax(last.x, rests, 12 * [200], lambda *_, own=springs: [own]))
     moved = ((ends[1] - ends[0])[0] / (2 * step)) @ axes.mT / scale**2
     assert float((moved * probe).sum()) == pytest.approx(float((slope * moves).sum()), rel=1e-4)
 

@@ -234,11 +234,12 @@ def test_weights_far_below_zero_come_nearer_to_even_ones() -> None:
     torch.testing.assert_close(found[:, 1:], weights[:, 1:])  # within the bound
 
 
+@pytest.mark.parametrize("factor", [3, 1.01])
 def test_what_no_mixture_meets_falls_back_to_a_keyframe(
-    space: tm.ShapeSpace, bars: Shapes, monkeypatch: pytest.MonkeyPatch
+    space: tm.ShapeSpace, bars: Shapes, monkeypatch: pytest.MonkeyPatch, factor: float
 ) -> None:
     variation = space.variation()
-    monkeypatch.setattr(variation, "relax", lambda x, *_: 3 * x)
+    monkeypatch.setattr(variation, "relax", lambda x, *_: factor * x)
     picked = markers(bars.keyframes[1])
     found = space.fit(bars.keyframes[1][picked], picked)
     assert far(found.shape, bars.keyframes[1]) < 1e-9

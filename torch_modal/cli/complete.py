@@ -8,6 +8,9 @@ from pathlib import Path
 from torch_modal.cli.arguments import pick_options
 from torch_modal.cli.subdivide import add_output, check_files, write_sequence
 
+MOST_FRAMES = 100_000
+"""An hour at 24 a second has 86,400."""
+
 
 def add_arguments(sub: argparse.ArgumentParser) -> None:
     """Arguments of ``complete``."""
@@ -47,8 +50,8 @@ def run(args: argparse.Namespace) -> None:
     whole, times = [args.mesh, *args.keyframes], args.keyframe_times
     if (times or args.keyframes) and len(times or ()) != len(whole):
         args.fail(f"--keyframe-times needs a time for each of {', '.join(map(str, whole))}; got {len(times or ())}")
-    if args.frames is not None and args.frames < 2:
-        args.fail(f"--frames must be 2 or more; got {args.frames}")
+    if args.frames is not None and not 2 <= args.frames <= MOST_FRAMES:
+        args.fail(f"--frames must be 2 or more, and {MOST_FRAMES} at most; got {args.frames}")
     animation = check_files(args, [*whole, *args.observations])
 
     import torch

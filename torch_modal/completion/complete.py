@@ -18,11 +18,11 @@ import torch
 from torch import Tensor
 
 from torch_modal.arrays import FloatArray
-from torch_modal.autograd import outside_inference_mode
+from torch_modal.autograd import disable_compile, full_precision, outside_inference_mode
 from torch_modal.completion.confidence import DOUBTFUL, compare, confidence_of
 from torch_modal.completion.frames import CompletionProblem
 from torch_modal.completion.gradient import LastSolve, ShapesOfPoints
-from torch_modal.completion.observation import Observation, check_observations
+from torch_modal.completion.observation import Observation, check_observations, refuse_transforms
 from torch_modal.completion.poses import FramePoses, times_between
 from torch_modal.completion.refinement import ROUNDS, Refinement
 from torch_modal.errors import MeshWarning
@@ -43,11 +43,11 @@ class Completion(NamedTuple):
     """The shapes then. *Shape:* ``(T, V, 3)``."""
     confidence: Tensor
     """Near 1 where the surface was seen, then or at times nearby, and moves little between its neighbours in time; low
-    where it moves far, above all unseen, or is inferred. *Shape:* ``(T, V)``."""
+    where it moves far, above all unseen, or is inferred; 1 of key-frames. *Shape:* ``(T, V)``."""
     misses: list[Tensor]
     """Of each observation, in the order given, the distance of its points from the shape. *Shape of each:* ``(n,)``."""
     trust: list[Tensor]
-    """Weights that the points ended with: 1, or less for outliers. *Shape of each:* ``(n,)``."""
+    """Of each, what its points ended up counting for: 1, less for outliers, 0 where their weight is 0."""
     knots: Tensor
     """Whole and completed shapes in the order of time. *Shape:* ``(K, V, 3)``."""
     path: Path | None
@@ -67,6 +67,7 @@ class Completion(NamedTuple):
         return self.knots[0].expand(*t.shape, -1, -1)
 
 
+@disable_compile
 def complete(
     keyframes: Tensor,
     faces: Tensor,
@@ -99,14 +100,18 @@ def complete(
 
     Returns:
         The motion, in the dtype and on the device of the key-frames. Its shapes have first derivatives in the points of
-        the observations, through the last minimisation: pairs, rest shapes and poses by modes are constants of it.
+        the observations, through the last minimisation of all frames: exact ones of markers; where there are clouds or
+        noisy meshes, pairs and poses by modes are constants of it, and a warning says so.
 
     Raises:
         ValueError: Key-frames, times or observations do not fit, the points are in other units, or the objective is
-            one of two shapes (``space="paired"``).
+            none, or one of two shapes (``space="paired"``).
+        RuntimeError: Within a transform of ``torch.func``, or forward mode.
         MissingPackageError: ``contact`` without that extra.
     """
     whole = torch.as_tensor(keyframes)
+    if objective is not None and not isinstance(objective, Objective):
+        raise ValueError(f"objective is a torch_modal.Objective; got {objective!r}")
     if whole.dim() == 2 and times is not None:
         raise ValueError("a template of the shape (V, 3) has no time; pass key-frames (1, V, 3) that have one")
     objective = objective or Objective()
@@ -116,17 +121,25 @@ def complete(
     if objective.contact:
         require_contact()
     observations = list(observations)
-    completion, axes, solves = _complete(
+    refuse_transforms("complete", whole)
+    if torch.is_grad_enabled() and whole.requires_grad:
+        message = "completed shapes have no gradients in the key-frames, in the points alone: pass keyframes.detach()"
+        warnings.warn(message, MeshWarning, stacklevel=3)
+    completion, axes, solve, rows = _complete(
         whole.detach(), faces, observations, times, objective, estimate_times, progress
     )
     points = torch.cat([one.points.double().cpu() for one in observations])
     if not torch.is_grad_enabled() or not points.requires_grad:
         return completion
-    knots = ShapesOfPoints.apply(list(solves.values()), axes, completion.knots, points)
-    rows = [list(solves).index(t) for t in completion.times.tolist()]
-    return completion._replace(knots=knots, shapes=knots[rows])
+    if solve is not None and not solve.smooth:
+        message = "gradients of clouds and noisy meshes leave out pairs and poses: even their sign may be wrong"
+        warnings.warn(f"{message}; those of markers are exact", MeshWarning, stacklevel=3)
+    knots = ShapesOfPoints.apply(solve, rows, axes, completion.knots, points)
+    when = sorted({*completion.times.tolist(), *([] if completion.path is None else completion.path.times.tolist())})
+    return completion._replace(knots=knots, shapes=knots[[when.index(t) for t in completion.times.tolist()]])
 
 
+@full_precision
 @outside_inference_mode
 def _complete(
     whole: Tensor,
@@ -136,42 +149,48 @@ def _complete(
     objective: Objective,
     estimate_times: bool,
     progress: Progress,
-) -> tuple[Completion, FloatArray, dict[float, LastSolve | None]]:
-    """The motion; the turn to the axes of the minimisation; and, by time, how each knot was found, None if exact."""
+) -> tuple[Completion, FloatArray, LastSolve | None, list[int]]:
+    """The motion; the turn to the axes of the minimisation, the last one, and the knots that it found."""
     is_template = whole.dim() == 2
     like, shapes, indices = check_arrays(whole[None] if is_template else whole, faces)
     check_observations(observations, shapes.shape[1])
     exact = np.zeros(0) if is_template else check_times(times, len(shapes)).numpy()
     problem = CompletionProblem(shapes, torch.from_numpy(indices), exact, observations)
-    with ProgressReport(len(problem.frames) * (4 + ROUNDS), "completing", progress) as report:
-        poses = FramePoses(problem).search(report)
-        if estimate_times:
-            when = times_between(problem, poses)
-            problem.frames = [frame._replace(time=t) for frame, t in zip(problem.frames, when, strict=True)]
-        x, solves = Refinement(problem, objective).run(poses, report)
-    misses, trust, seen, doubtful = compare(problem, x)
+    shape_at, solve = dict(zip(exact.tolist(), problem.whole, strict=False)), None
+    if problem.frames:
+        with ProgressReport(len(problem.frames) * (4 + ROUNDS), "completing", progress) as report:
+            poses = FramePoses(problem).search(report)
+            if estimate_times:
+                when = times_between(problem, poses)
+                problem.frames = [frame._replace(time=t) for frame, t in zip(problem.frames, when, strict=True)]
+            found, solve = Refinement(problem, objective).run(poses, report)
+        shape_at |= {frame.time: one for frame, one in zip(problem.frames, found, strict=True)}
+    frames = sorted([*problem.frames, *problem.exact], key=lambda frame: frame.time)
+    x = torch.stack([shape_at[frame.time] for frame in frames])
+    misses, trust, seen, doubtful, stray = compare(problem, frames, x)
     sizes = [len(one.points) for one in observations]
     if doubtful:
         some = ", ".join(f"{t:g} ({100 * explained:.0f} %)" for t, explained in list(doubtful.items())[:8])
         warnings.warn(
-            f"the shapes at {some} explain less than {100 * DOUBTFUL:.0f} % of the points seen then: they are "
-            "doubtful, and their confidence is low. Do the points show this body, in its units?",
+            f"the shapes at {some} explain less than {100 * DOUBTFUL:.0f} % of the points seen then: those that are no "
+            "key-frames are doubtful, and their confidence is low. Do the points show this body, in its units?",
             MeshWarning,
-            stacklevel=4,
+            stacklevel=6,
         )
-    moments = [frame.time for frame in problem.frames]
-    whole_at = dict(zip(exact.tolist(), like, strict=False))
-    shape_at = dict(zip(moments, problem.to_caller(x).to(like), strict=True)) | whole_at
-    solve_at = dict(zip(moments, solves, strict=True)) | dict.fromkeys(whole_at)
-    order = sorted(shape_at)
-    knots = torch.stack([shape_at[t] for t in order])
+    if stray:
+        some = "; ".join(stray[:8])
+        message = f"no shape explains {some}: leave them out if they are not of this body, else look at the shape there"
+        warnings.warn(message, MeshWarning, stacklevel=6)
+    order, moments = sorted(shape_at), [frame.time for frame in frames]
+    whole_at = dict(zip(exact.tolist(), like, strict=False))  # bit for bit
+    knots = torch.stack([whole_at[t] if t in whole_at else problem.to_caller(shape_at[t]).to(like) for t in order])
     completion = Completion(
         torch.tensor(moments, dtype=torch.float64, device=like.device),
-        torch.stack([shape_at[t] for t in moments]),
-        confidence_of(problem, x, seen).to(like),
+        knots[[order.index(t) for t in moments]],
+        confidence_of(problem, frames, x, seen).to(like),
         list((misses / problem.scale).to(like).split(sizes)),
         list(trust.to(like).split(sizes)),
         knots,
         Path(knots, problem.faces, times=order, objective=objective) if len(order) > 1 else None,
     )
-    return completion, problem.axes, {t: solve_at[t] for t in order}
+    return completion, problem.axes, solve, [order.index(frame.time) for frame in problem.frames]

@@ -1,12 +1,14 @@
 """Confidence of completed shapes: what was seen of them, what points count for, how far they move."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from torch_modal.completion.frames import CompletionProblem
-from torch_modal.completion.pairs import SampledSurface, robust_weights
+from torch_modal.completion.frames import CompletionProblem, Frame
+from torch_modal.completion.pairs import OUTLIERS, SampledSurface, robust_weights
 from torch_modal.geometry.rigid import best_fit
 
 SEEN_WITHIN = 2.5
@@ -17,53 +19,68 @@ HALF_AFTER = 0.02
 """Motion between neighbours in time, in parts of the diagonal, that halves the confidence of what is half seen."""
 DOUBTFUL = 0.5
 """Part of the points that a shape has to explain."""
+STRAY, STRAY_BEYOND = 0.02, 2.0
+"""Part of a cloud that makes a group, and the distance from the surface, at a size of 100, beyond which that is named.
+"""
 
 
-def compare(problem: CompletionProblem, x: Tensor) -> tuple[Tensor, Tensor, Tensor, dict[float, float]]:
+def compare(
+    problem: CompletionProblem, frames: Sequence[Frame], x: Tensor
+) -> tuple[Tensor, Tensor, Tensor, dict[float, float], list[str]]:
     """Compare shapes with what was seen.
 
     Args:
-        problem: What was seen, with its noise.
-        x: The shapes at its times. *Shape:* ``(T, V, 3)``.
+        problem: The mesh.
+        frames: What was seen.
+        x: The shapes then. *Shape:* ``(T, V, 3)``.
 
     Returns:
-        The distances of all observed points at a size of 100, and what they count for, *shape* ``(n,)``; what of each
-        shape was seen then, *shape* ``(T, V)``; and the times of doubtful shapes with the part of the points that they
-        explain.
+        The distances of all observed points at a size of 100, and their final weights, *shape* ``(n,)``; what of each
+        shape was seen then, *shape* ``(T, V)``; the times of doubtful shapes with the part of the points that they
+        explain; and, in words, groups of points that no shape explains.
     """
-    doubtful, seen = dict[float, float](), x.new_zeros(x.shape[:2])
-    misses, trust = np.zeros((2, sum(len(one.points) for frame in problem.frames for one in frame.seen)))
-    for i, frame in enumerate(problem.frames):
+    doubtful, stray, seen = dict[float, float](), list[str](), x.new_zeros(x.shape[:2])
+    misses, trust = np.zeros((2, sum(len(one.points) for frame in frames for one in (*frame.seen, *frame.unused))))
+    for i, frame in enumerate(frames):
         surface = SampledSurface(x[i].numpy(), problem.mesh)
-        for one in frame.seen:
+        for one in frame.unused:
+            misses[one.numbers] = one.misses(surface)[0]
+        for one in [one.with_noise(surface) for one in frame.seen]:
             distances, agree = one.misses(surface)
             weights = agree * robust_weights(distances, one.noise)
             misses[one.numbers], trust[one.numbers] = distances, weights
             gaps, nearest = cKDTree(one.points).query(surface.vertices, 3)
             close = (weights[nearest] * np.exp(-0.5 * (gaps / SEEN_WITHIN) ** 2)).max(1)
-            explained = float(weights.mean())
+            explained = float(np.average(weights, weights=one.weights))
             if explained < DOUBTFUL:
                 doubtful[frame.time] = explained
             seen[i] = torch.maximum(seen[i], min(1.0, explained / DOUBTFUL) * torch.from_numpy(close))
-    return torch.from_numpy(misses), torch.from_numpy(trust), seen, doubtful
+            n, reach = len(one.points), max(STRAY_BEYOND, OUTLIERS * one.noise)
+            for group in one.find_unexplained(surface, reach, max(4, int(STRAY * n))) if one.places is None else ():
+                place = problem.to_caller(torch.from_numpy(one.points[group].mean(0)))
+                where = ", ".join(f"{coordinate:.4g}" for coordinate in place.tolist())
+                stray.append(f"{len(group)} of {n} points at {frame.time:g} around ({where})")
+    return torch.from_numpy(misses), torch.from_numpy(trust), seen, doubtful, stray
 
 
-def confidence_of(problem: CompletionProblem, x: Tensor, seen: Tensor) -> Tensor:
+def confidence_of(problem: CompletionProblem, frames: Sequence[Frame], x: Tensor, seen: Tensor) -> Tensor:
     """Confidence from what was seen at each time, there and nearby, and from the motion. *Shape:* ``(T, V)``.
 
-    What moves far between its neighbours in time is less certain.
+    What moves far between its neighbours in time is less certain; whole shapes are certain.
     """
     whole = [(float(t), one, torch.ones_like(one[:, 0])) for t, one in zip(problem.times, problem.whole, strict=False)]
-    times = {frame.time for frame in problem.frames}
-    frames = [(frame.time, *one) for frame, *one in zip(problem.frames, x, seen, strict=True)]
-    every = sorted([*frames, *(one for one in whole if one[0] not in times)], key=lambda one: one[0])
+    times = {frame.time for frame in frames}
+    found = [(frame.time, *one) for frame, *one in zip(frames, x, seen, strict=True) if frame.time not in problem.times]
+    every = sorted([*found, *whole], key=lambda one: one[0])
     shapes, near = torch.stack([one[1] for one in every]), torch.stack([one[2] for one in every])
     for order in (range(1, len(near)), range(len(near) - 2, -1, -1)):
         for i in order:
             near[i] = torch.maximum(near[i], NEIGHBOURS * near[i - order.step])
     half = HALF_AFTER * float((problem.template.amax(0) - problem.template.amin(0)).norm())
-    confidence = torch.zeros_like(seen)
+    confidence = torch.ones_like(seen)
     for row, i in enumerate(i for i, one in enumerate(every) if one[0] in times):
+        if every[i][0] in problem.times:
+            continue
         neighbours = [j for j in (i - 1, i + 1) if 0 <= j < len(shapes)]
         others = shapes[neighbours] if neighbours else problem.whole[:1]
         moved = (best_fit(others, shapes[i].expand_as(others)).apply(others) - shapes[i]).norm(dim=-1).mean(0)

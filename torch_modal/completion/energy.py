@@ -7,6 +7,7 @@ import torch
 from scipy import sparse
 from torch import Tensor
 
+from torch_modal.arrays import FloatArray
 from torch_modal.completion.pairs import SLIDE, ObservedPoints
 from torch_modal.elastic.steps import Point
 
@@ -18,9 +19,11 @@ class PointEnergy:
 
     Args:
         pairs: The places, each between three vertices at most, at one shape.
+        trust: Robust weights of the pairs that follow the distances; 1 of those that are constants. *Shape:* ``(n,)``.
     """
 
-    def __init__(self, pairs: Sequence[ObservedPoints]) -> None:
+    def __init__(self, pairs: Sequence[ObservedPoints], trust: FloatArray | None = None) -> None:
+        self.trust = np.ones(sum(len(one.points) for one in pairs)) if trust is None else trust
         self.places = sparse.vstack([one.places for one in pairs]).tocsr()
         self.points = torch.from_numpy(np.concatenate([one.points for one in pairs]))
         #: The observed point of each pair. *Shape:* ``(n,)``.
@@ -38,12 +41,25 @@ class PointEnergy:
         upper = self.stiffness.flatten(1)[:, [0, 1, 2, 4, 5, 8]]
         self.diagonal = 2 * torch.from_numpy(squares.T @ upper.numpy())
 
-    def forces(self, field: Tensor, points: Tensor | float = 0.0) -> tuple[Tensor, Tensor]:
+    def forces(
+        self, field: Tensor, points: Tensor | float = 0.0, stiffness: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
         """Differences from the points, and the forces on them. *Shape:* ``(1, V, 3) -> (n, 3), (n, 3)``."""
         off = torch.from_numpy(self.places @ field[0].numpy()) - points
-        return off, (self.stiffness @ off[..., None])[..., 0]
+        return off, ((self.stiffness if stiffness is None else stiffness) @ off[..., None])[..., 0]
 
-    def _spread(self, forces: Tensor) -> Tensor:
+    def tangent(self, x: Tensor) -> Tensor:
+        r"""Derivative of the forces where weights of known places are those of the distances. *Shape:* ``(n, 3, 3)``.
+
+        With :math:`w(d) = (1 + (d / c)^2)^{-2}` it is :math:`w (I - 4 (1 - \sqrt w) \hat d \hat d^T)`.
+        """
+        off = self.forces(x, self.points)[0]
+        towards = off / off.norm(dim=1, keepdim=True).clamp_min(torch.finfo(off.dtype).tiny)
+        lost = 4 * (1 - torch.from_numpy(self.trust) ** 0.5)[:, None, None] * towards[:, :, None] * towards[:, None]
+        return self.stiffness - self.stiffness @ lost
+
+    def spread(self, forces: Tensor) -> Tensor:
+        """Gradient in the vertices of forces on places. *Shape:* ``(n, 3) -> (1, V, 3)``."""
         return 2 * torch.from_numpy(self.places.T @ forces.numpy())[None]
 
     def value(self, x: Tensor) -> Tensor:
@@ -53,7 +69,7 @@ class PointEnergy:
     def at(self, x: Tensor) -> Point:
         """*Shape:* ``(1, V, 3)``."""
         off, forces = self.forces(x, self.points)
-        gradient = self._spread(forces)
+        gradient = self.spread(forces)
         return Point(
-            (off * forces).sum()[None], gradient, self.diagonal[None], lambda d: self._spread(self.forces(d)[1])
+            (off * forces).sum()[None], gradient, self.diagonal[None], lambda d: self.spread(self.forces(d)[1])
         )

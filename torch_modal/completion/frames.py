@@ -1,4 +1,4 @@
-"""Observations by their times, at a size of 100 in the axes of the first shape."""
+"""Observations by their times, at a size of 100 in the axes of the template."""
 
 from typing import NamedTuple
 
@@ -6,16 +6,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torch_modal.arrays import FloatArray
+from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.completion.observation import Observation
 from torch_modal.completion.pairs import NOISES, ObservedPoints
-from torch_modal.geometry.canonical import to_canonical
+from torch_modal.geometry.canonical import CANONICAL_SIZE, GENERIC, to_canonical
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.keyframes.arrays import require_units
 from torch_modal.registration.surface import places_between
 
 SWAY, SOFT = 2.0, 3e-5
 """Standard deviation of the amplitude of the first mode, at a size of 100; least stiffness of the modes."""
+SIZE_DIGITS = 6
+"""Digits of the logarithm of a size: equal ones, as of mirrored poses, differ by rounding."""
 NOISE = 0.5
 """Of points before it is estimated, at a size of 100."""
 HALF, NOISES_OF_HALF = 1.0, 3.0
@@ -31,10 +33,24 @@ class Frame(NamedTuple):
     """Stiffness of the modes that the observations leave, if amplitudes have the standard deviation :data:`SWAY`."""
     unit: float
     """Distance at which half of a miss counts."""
+    weight: float
+    """Mean of the points' weights: those of ``seen`` are relative to it, and add up to 1 in each, on average."""
+    unused: list[ObservedPoints]
+    """Points of weight 0: their distances are reported, and that is all."""
+
+
+def find_largest(shapes: FloatArray, faces: IntArray) -> int:
+    """Index of the largest shape, whatever the order and the pose of all. *Shape:* ``(K, V, 3), (F, 3)``."""
+    keys = []
+    for x in shapes:
+        coordinates, _, _, scale = to_canonical(x, faces)
+        generic = float(np.sin(np.arange(len(x))) @ coordinates @ GENERIC)
+        keys.append((round(float(np.log(scale)), SIZE_DIGITS), generic))
+    return keys.index(min(keys))
 
 
 class CompletionProblem:
-    """Whole shapes and observations, at a size of 100 in the axes of the first shape.
+    """Whole shapes and observations, at a size of 100 in the axes of the largest shape, which is the template.
 
     Args:
         shapes: Whole ones. *Shape:* ``(K, V, 3)``.
@@ -49,15 +65,17 @@ class CompletionProblem:
     def __init__(self, shapes: FloatArray, faces: Tensor, times: FloatArray, observations: list[Observation]) -> None:
         self.faces, self.times = faces, times
         self.mesh = Connectivity(faces.numpy(), shapes.shape[1])
-        _, self.axes, self.centre, self.scale = to_canonical(shapes[0], faces.numpy())
+        # Not the first: reversed times give the same motion reversed.
+        largest = find_largest(shapes, faces.numpy())
+        _, self.axes, self.centre, self.scale = to_canonical(shapes[largest], faces.numpy())
         self.whole = torch.from_numpy((shapes - self.centre) @ self.axes.T * self.scale)
-        self.template = self.whole[0]
+        self.template = self.whole[largest]
         ends = np.cumsum([len(one.points) for one in observations])
-        seen = [(one, self._sample(one, int(end))) for one, end in zip(observations, ends, strict=True)]
-        self.frames = [
-            self._frame(t, [sample for one, sample in seen if one.time == t])
-            for t in sorted({one.time for one in observations})
-        ]
+        seen = [(one.time, self._sample(one, int(end))) for one, end in zip(observations, ends, strict=True)]
+        every = [self._frame(t, [one for time, one in seen if time == t]) for t in sorted({time for time, _ in seen})]
+        #: Those whose shapes are to be found, and those at the times of whole shapes.
+        self.frames = [frame for frame in every if frame.time not in times]
+        self.exact = [frame for frame in every if frame.time in times]
 
     def to_canonical(self, x: Tensor, direction: bool = False) -> FloatArray:
         """Points, or directions, in its axes. *Shape:* ``(..., 3)``."""
@@ -69,19 +87,30 @@ class CompletionProblem:
         return (x / self.scale) @ torch.from_numpy(self.axes) + torch.from_numpy(self.centre)
 
     @staticmethod
-    def _frame(time: float, seen: list[ObservedPoints]) -> Frame:
-        soft = min((one.noise or NOISE) ** 2 / (SWAY**2 * len(one.points)) for one in seen)
-        return Frame(time, seen, max(SOFT, soft), max(HALF, NOISES_OF_HALF * max(one.noise for one in seen)))
+    def _frame(time: float, every: list[ObservedPoints]) -> Frame:
+        weight = float(np.mean([one.weights[one.weights > 0].mean() for one in every]))
+        seen, unused = ([one.select(f(one.weights, 0)) for one in every] for f in (np.greater, np.equal))
+        seen = [one._replace(weights=one.weights / (weight * len(one.weights))) for one in seen]
+        soft = min((one.noise or NOISE) ** 2 / (SWAY**2 * weight * len(one.points)) for one in seen)
+        unit = max(HALF, NOISES_OF_HALF * max(one.noise for one in seen))
+        return Frame(time, seen, max(SOFT, soft), unit, weight, unused)
 
     def _sample(self, one: Observation, end: int) -> ObservedPoints:
         points, known = self.to_canonical(one.points), self.template[self.faces.unique()]
         weights = np.ones(len(points)) if one.weights is None else one.weights.cpu().double().numpy()
+        counts = weights > 0
         normals, view = (None if x is None else self.to_canonical(x, True) for x in (one.normals, one.view))
         noise, places = 0.0 if one.noise is None else max(one.noise * self.scale, NOISES[0]), None
         if not one.is_cloud:
             corners, barycentric = one.places()
             places = places_between(corners.cpu().numpy(), barycentric.cpu().double().numpy(), len(self.template))
-            known = torch.from_numpy(places @ self.template.numpy())
-        require_units(f"{one}: the points", torch.from_numpy(points), "the first shape", known[None], 1 / self.scale)
+            known = torch.from_numpy(places[counts] @ self.template.numpy())
+        seen = torch.from_numpy(points[counts])
+        require_units(f"{one}: the points", seen, "the template", known[None], 1 / self.scale)
+        if noise > CANONICAL_SIZE:
+            raise ValueError(
+                f"{one}: noise is {one.noise:g}, and the body's size {CANONICAL_SIZE / self.scale:.3g}; give the "
+                "standard deviation of the points, in their unit"
+            )
         numbers = np.arange(end - len(points), end)
-        return ObservedPoints(points, normals, weights / weights.sum(), numbers, noise, places, view)
+        return ObservedPoints(points, normals, weights, numbers, noise, places, view)

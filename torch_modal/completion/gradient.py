@@ -1,63 +1,92 @@
 """Gradients of completed shapes in the observed points, by the implicit function theorem."""
 
-from collections.abc import Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
+from scipy.sparse.linalg import LinearOperator, gmres
 from torch import Tensor
 
 from torch_modal.arrays import FloatArray
 from torch_modal.autograd import is_double_backward
 from torch_modal.completion.energy import PointEnergy
 from torch_modal.elastic.energy import Energy, RestShapes
-from torch_modal.elastic.steps import TermsTowards, conjugate_gradients, inverse_of_symmetric
+from torch_modal.elastic.steps import TermsTowards, inverse_of_symmetric
 
-TOLERANCE, PRODUCTS = 1e-8, 2000
-"""Relative residual of the solution with the Hessian, and most products."""
+TOLERANCE, RESTART, RESTARTS = 1e-6, 200, 6
+"""Relative residual of the adjoint, products until GMRES begins again, and how often at most."""
 
 
 class LastSolve(NamedTuple):
-    """The last minimisation of a frame, at a size of 100."""
+    """The last minimisation of all frames, at a size of 100."""
 
     x: Tensor
-    """The minimiser. *Shape:* ``(1, V, 3)``."""
+    """The minimisers. *Shape:* ``(T, V, 3)``."""
     energy: Energy
-    rests: RestShapes
-    points: PointEnergy
+    rests: Callable[[Tensor], list[RestShapes]]
+    """The rest shapes of each frame, as functions of the shapes of all."""
+    points: list[PointEnergy]
+    """Of each frame."""
+    smooth: bool
+    """True where the gradients are exact."""
 
     def adjoint(self, grad: Tensor) -> Tensor:
-        """Gradient in the point of each pair, of a gradient in the shape. *Shape:* ``(V, 3) -> (n, 3)``."""
-        terms = TermsTowards(self.energy, self.rests.reference(self.energy, self.x, relative=True))
+        """Gradient in the points of all pairs, of a gradient in the shapes. *Shape:* ``(T, V, 3) -> (n, 3)``.
+
+        Frames are rest shapes of each other, so that the matrix is not symmetric.
+        """
         with torch.enable_grad():
-            x = self.x.detach().requires_grad_()
-            slope = torch.autograd.grad(terms.value(x).sum(), x, create_graph=True)[0]
-        springs = self.points.at(self.x)
-        inverse = inverse_of_symmetric((terms.at(self.x).diagonal + springs.diagonal)[0].mT)
-        solution = conjugate_gradients(
-            lambda d: torch.autograd.grad(slope, x, d, retain_graph=True)[0] + springs.product(d),
-            lambda residual: torch.einsum("ijv,bvj->bvi", inverse, residual),
-            lambda a, b: (a * b).sum(),
-            grad[None],
-            PRODUCTS,
-            TOLERANCE,
-        )
-        return 2 * self.points.forces(solution)[1]
+            x, others = (self.x.detach().requires_grad_() for _ in range(2))
+            terms = [
+                TermsTowards(self.energy, rests.reference(self.energy, other, relative=True), rests.anchors)
+                for rests, other in zip(self.rests(others), others[:, None], strict=True)
+            ]
+            values = [term.value(one).sum() for term, one in zip(terms, x[:, None], strict=True)]
+            slope = torch.autograd.grad(torch.stack(values).sum(), x, create_graph=True)[0]
+        springs = [points.at(one[None]) for points, one in zip(self.points, self.x, strict=True)]
+        tangents = [points.tangent(one[None]) for points, one in zip(self.points, self.x, strict=True)]
+        diagonal = torch.cat([term.at(one[None]).diagonal for term, one in zip(terms, self.x, strict=True)])
+        diagonal = diagonal + torch.cat([one.diagonal for one in springs])
+        inverse = inverse_of_symmetric(diagonal.detach().movedim(-1, 0))
+
+        def transposed(flat: FloatArray) -> FloatArray:
+            field = torch.from_numpy(flat).view_as(self.x)
+            parts = torch.autograd.grad(slope, (x, others), field, retain_graph=True, allow_unused=True)
+            pulls = [
+                p.spread(p.forces(one[None], stiffness=k)[1])
+                for p, one, k in zip(self.points, field, tangents, strict=True)
+            ]
+            return sum([part for part in parts if part is not None], torch.cat(pulls)).numpy().ravel()
+
+        def precondition(flat: FloatArray) -> FloatArray:
+            return torch.einsum("ijtv,tvj->tvi", inverse, torch.from_numpy(flat).view_as(self.x)).numpy().ravel()
+
+        n = grad.numel()
+        matrix, preconditioner = (LinearOperator((n, n), f, dtype=np.float64) for f in (transposed, precondition))
+        options = {"rtol": TOLERANCE, "restart": RESTART, "maxiter": RESTARTS}
+        flat, _ = gmres(matrix, grad.numpy().ravel(), M=preconditioner, **options)
+        solution = torch.from_numpy(flat).view_as(self.x)
+        forces = [
+            p.forces(one[None], stiffness=k)[1] for p, one, k in zip(self.points, solution, tangents, strict=True)
+        ]
+        return 2 * torch.cat(forces)
 
 
 class ShapesOfPoints(torch.autograd.Function):
-    """Shapes as functions of all observed points; pairs and rest shapes are constants.
+    """Shapes as functions of all observed points; pairs and shapes by modes are constants.
 
-    Arguments are how each shape was found, None where it is a constant; the matrix that turns the caller's coordinates
-    into the coordinates of the solves, *shape* ``(3, 3)``; the shapes, *shape* ``(T, V, 3)``; and the points, *shape*
-    ``(n, 3)``.
+    Arguments are how the shapes of some rows were found, None where all are constants; these rows; the matrix that
+    turns the caller's coordinates into those of the solve, *shape* ``(3, 3)``; the shapes, *shape* ``(K, V, 3)``; and
+    the points, *shape* ``(n, 3)``.
     """
 
     @staticmethod
     def forward(
-        ctx: Any, solves: Sequence[LastSolve | None], axes: FloatArray, shapes: Tensor, points: Tensor
+        ctx: Any, solve: LastSolve | None, rows: list[int], axes: FloatArray, shapes: Tensor, points: Tensor
     ) -> Tensor:
         """The shapes."""
-        ctx.solves, ctx.axes, ctx.like = solves, axes, points.detach()
+        ctx.solve, ctx.rows, ctx.axes, ctx.like = solve, rows, axes, points.detach()
         return shapes.clone()
 
     @staticmethod
@@ -66,7 +95,8 @@ class ShapesOfPoints(torch.autograd.Function):
         if is_double_backward(grad):
             raise RuntimeError("completed shapes have first derivatives only; take the gradient without create_graph")
         total, axes = torch.zeros(ctx.like.shape, dtype=torch.float64), torch.from_numpy(ctx.axes)
-        for solve, slope in zip(ctx.solves, grad.detach().cpu().double(), strict=True):
-            if solve is not None and slope.any():
-                total.index_add_(0, torch.from_numpy(solve.points.numbers), solve.adjoint(slope @ axes.mT) @ axes)
-        return None, None, None, total.to(ctx.like)
+        slopes = grad.detach().cpu().double()[ctx.rows]
+        if slopes.any():
+            numbers = np.concatenate([points.numbers for points in ctx.solve.points])
+            total.index_add_(0, torch.from_numpy(numbers), ctx.solve.adjoint(slopes @ axes.mT) @ axes)
+        return None, None, None, None, total.to(ctx.like)

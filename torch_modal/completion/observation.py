@@ -7,8 +7,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torch_modal.autograd import is_transformed
+
 LEAST_POINTS = 3
 """Points of an observation, at least: a pose follows from three."""
+SUM_TOLERANCE = 1e-3
+"""Largest difference of a sum of barycentric weights from one: files round them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,13 +30,15 @@ class Observation:
         vertices: The vertex that each point shows: markers, or, with all vertices, a noisy mesh. *Shape:* ``(n,)``.
         corners: The vertices of the triangle that each point lies on: markers between vertices. *Shape:* ``(n, 3)``.
         barycentric: Their weights at each point, with sum one. *Shape:* ``(n, 3)``.
-        weights: Of the points, none below zero; one each by default. *Shape:* ``(n,)``.
+        weights: Of the points, none below zero, comparable among observations: 4 counts as half of the noise. Points of
+            weight 0 have no effect. Default: 1 each. *Shape:* ``(n,)``.
         noise: Standard deviation of the points, in their unit. Default: estimated.
         view: Direction from the surface to the camera of a cloud: what it does not see counts, too. *Shape:* ``(3,)``.
 
     Raises:
         ValueError: Shapes that do not fit, numbers that are not finite, fewer than three points, or arguments that
             exclude each other.
+        RuntimeError: Points within a transform of ``torch.func``, or with a tangent.
     """
 
     time: float
@@ -48,7 +54,12 @@ class Observation:
     def __post_init__(self) -> None:
         values: dict[str, Any] = {"time": float(self.time)}
         object.__setattr__(self, "time", values["time"])  # named by all other messages
+        if self.noise is not None:
+            if torch.as_tensor(self.noise).numel() != 1:
+                raise ValueError(f"{self}: noise is one number; points of different noise have weights, 1 / noise**2")
+            object.__setattr__(self, "noise", float(self.noise))
         points = torch.as_tensor(self.points)
+        refuse_transforms(str(self), points)
         if points.dim() != 2 or points.shape[1] != 3 or len(points) < LEAST_POINTS or not points.is_floating_point():
             raise ValueError(
                 f"{self}: points are floating-point of the shape (n, 3), with n of {LEAST_POINTS} or more; got "
@@ -70,12 +81,15 @@ class Observation:
             if not bool(torch.as_tensor(value).detach().isfinite().all()):
                 raise ValueError(f"{self}: {name} must be finite; leave out what was not observed")
         weights, view = values.get("weights"), values.get("view")
+        sums = values["barycentric"].sum(1) if "barycentric" in values else points.new_ones(1)
+        worst = float(sums[(sums - 1).abs().argmax()])
         for wrong, message in (
             ((self.corners is None) != (self.barycentric is None), "corners and barycentric go together"),
             (self.vertices is not None and self.corners is not None, "markers have vertices or corners; got both"),
             (not self.is_cloud and (self.normals is not None or view is not None), "normals and view are for clouds"),
             (weights is not None and not (weights >= 0).all(), "weights are 0 or more"),
-            (weights is not None and not weights.any(), "weights are not all 0"),
+            (weights is not None and int((weights > 0).sum()) < LEAST_POINTS, "3 points or more have a weight above 0"),
+            (abs(worst - 1) > SUM_TOLERANCE, f"barycentric weights of a point have the sum one; got {worst:.6g}"),
             (self.noise is not None and not 0 < self.noise < torch.inf, "noise is a length above 0, in their unit"),
             (view is not None and not view.any(), "view is a direction; got a vector of length 0"),
         ):
@@ -102,6 +116,12 @@ class Observation:
         assert self.vertices is not None
         first = self.points.new_tensor([1.0, 0.0, 0.0]).expand(len(self.points), 3)
         return self.vertices[:, None].expand(-1, 3), first
+
+
+def refuse_transforms(what: str, x: Tensor) -> None:
+    """Raise a RuntimeError within a transform of ``torch.func``, or forward mode."""
+    if is_transformed(x):
+        raise RuntimeError(f"{what}: no transforms of torch.func and no forward mode; take torch.autograd.grad")
 
 
 def check_observations(observations: Sequence[Any], n_vertices: int) -> None:

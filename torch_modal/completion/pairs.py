@@ -24,10 +24,14 @@ LEAST_COSINE = 0.3
 CELL, DEPTH, GRAZING = 2.0, 3.0, 0.15
 # Neighbours of a point of a cloud, and how many of their usual distances are a gap.
 N_NEIGHBOURS, GAP = 8, 3.0
+# Points, about, from which the usual distance is found; cells of a gap, to which points are rounded.
+N_SPACING, CELLS_OF_GAP = 1000, 6
 # Distance, in standard deviations of the noise, at which a point loses three quarters of its weight.
 OUTLIERS = 4.0
 # Least noise, and the largest that is estimated, at a size of 100.
 NOISES = 0.1, 2.0
+# Steps in a factor of two, to which an estimated noise is rounded.
+NOISE_STEPS = 4
 
 
 class ObservedPoints(NamedTuple):
@@ -52,19 +56,35 @@ class ObservedPoints(NamedTuple):
         """With places on a coarse mesh, by the coarse vertex of each vertex. *Shape:* ``(V, V_coarse)``."""
         return self if self.places is None else self._replace(places=self.places @ select)
 
+    def select(self, chosen: IntArray | BoolArray) -> "ObservedPoints":
+        """Some of the points."""
+        normals, places = (None if rows is None else rows[chosen] for rows in (self.normals, self.places))
+        points, weights, numbers = self.points[chosen], self.weights[chosen], self.numbers[chosen]
+        return self._replace(points=points, normals=normals, weights=weights, numbers=numbers, places=places)
+
+    def main_part(self, gap: float) -> "ObservedPoints":
+        """The points of a cloud without clusters that are a gap away from the one of the largest extent."""
+        if self.places is not None:
+            return self
+        labels = label_clusters(self.points, gap)
+        extents = [np.ptp(self.points[labels == k], axis=0).max() for k in range(labels.max() + 1)]
+        return self.select(labels == np.argmax(extents))
+
     def thin(self, n: int) -> "ObservedPoints":
-        """At most n points of a cloud, chosen at random, always the same."""
+        """At most n points of a cloud, chosen at random, always the same, of the same sum of weights."""
         if self.places is not None or len(self.points) <= n:
             return self
-        chosen = np.random.default_rng(0).permutation(len(self.points))[:n]
-        points, weights, numbers = self.points[chosen], self.weights[chosen], self.numbers[chosen]
-        normals = None if self.normals is None else self.normals[chosen]
-        return self._replace(points=points, normals=normals, weights=weights / weights.sum(), numbers=numbers)
+        some = self.select(np.random.default_rng(0).permutation(len(self.points))[:n])
+        return some._replace(weights=some.weights * (self.weights.sum() / some.weights.sum()))
 
     def with_noise(self, surface: "SampledSurface") -> "ObservedPoints":
-        """The noise, where it is not known, from the median of distances from a surface, or from points."""
+        """The noise, where it is not known, from the median of distances from a surface, or from points.
+
+        It is rounded, and so a constant of gradients: the median follows a single point.
+        """
         median = float(np.median(self.misses(surface)[0])) / (0.6745 if self.places is None else 1.538)
-        return self._replace(noise=self.noise or float(np.clip(median, *NOISES)))
+        rounded = 2.0 ** (round(NOISE_STEPS * np.log2(np.clip(median, *NOISES))) / NOISE_STEPS)
+        return self._replace(noise=self.noise or float(rounded))
 
     def distances(self, x: FloatArray) -> FloatArray:
         """Distances of the points from their places on a shape. *Shape:* ``(V, 3) -> (n,)``."""
@@ -105,7 +125,8 @@ class ObservedPoints(NamedTuple):
         seen, faces, nearest = seen[agree], faces[agree], nearest[agree]
         if len(seen):
             places = places_between(surface.faces[faces], _PLACES[seen % len(_PLACES)], len(surface.vertices))
-            points, normals, weights = self.points[nearest], self.normals[nearest], np.full(len(seen), 1 / len(seen))
+            points, normals = self.points[nearest], self.normals[nearest]
+            weights = np.full(len(seen), self.weights.sum() / len(seen))
             pairs.append(ObservedPoints(points, normals, weights, self.numbers[nearest], self.noise, places))
         return pairs
 
@@ -116,20 +137,34 @@ class ObservedPoints(NamedTuple):
         if self.view is not None:
             seen = surface.samples[surface.visible(self.view)]
             gap = (cKDTree(self.points).query(seen)[0] / (3 * unit)) ** 2
-            total += float((gap / (1 + gap)).mean()) if len(seen) else 1.0
+            total += float(self.weights.sum() * ((gap / (1 + gap)).mean() if len(seen) else 1.0))
         return total
 
-    def find_unexplained(self, surface: "SampledSurface", reach: float, least: int) -> list[IntArray]:
-        """Connected groups of points that are far from the surface, the largest first."""
+    def find_unexplained(
+        self, surface: "SampledSurface", reach: float, least: int, near: float = np.inf
+    ) -> list[IntArray]:
+        """Connected groups of points that are far from the surface, but near other points, the largest first."""
         distances, agree = self.misses(surface)
-        off = np.flatnonzero(~agree | (distances > reach))
+        far = ~agree | (distances > reach)
+        off = np.flatnonzero(far)
         if len(off) < least:
             return []
-        neighbours = cKDTree(self.points).query(self.points, min(N_NEIGHBOURS, len(self.points)))[0]
-        gap = GAP / 2 * float(np.median(neighbours[:, -1]))
-        pieces = label_pieces(cKDTree(self.points[off]).query_pairs(gap, output_type="ndarray"), len(off))
-        sizes = np.bincount(pieces)
-        return [off[pieces == k] for k in np.argsort(-sizes, kind="stable") if sizes[k] >= least]
+        some = self.points[:: max(1, len(self.points) // N_SPACING)]
+        neighbours = cKDTree(self.points).query(some, min(N_NEIGHBOURS, len(self.points)))[0]
+        pieces = label_clusters(self.points[off], max(NOISES[0], GAP / 2 * float(np.median(neighbours[:, -1]))))
+        away = cKDTree(self.points[~far]).query(self.points[off])[0] if len(off) < len(far) else np.zeros(len(off))
+        sizes, gaps = np.bincount(pieces), np.full(pieces.max() + 1, np.inf)
+        np.minimum.at(gaps, pieces, away)
+        return [off[pieces == k] for k in np.argsort(-sizes, kind="stable") if sizes[k] >= least and gaps[k] <= near]
+
+
+def label_clusters(points: FloatArray, gap: float) -> IntArray:
+    """Connected component of each point, where points nearer than about a gap are connected. *Shape:* ``(n,)``.
+
+    Points are rounded to a fraction of the gap: pairs of all that lie in one place would not fit into memory.
+    """
+    cells, cell = np.unique(np.round(points * (CELLS_OF_GAP / gap)), axis=0, return_inverse=True)
+    return label_pieces(cKDTree(cells).query_pairs(CELLS_OF_GAP, output_type="ndarray"), len(cells))[cell.ravel()]
 
 
 def robust_weights(distances: FloatArray, noise: float) -> FloatArray:

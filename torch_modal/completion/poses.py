@@ -22,13 +22,15 @@ from torch_modal.motion.path import Path
 from torch_modal.progress import ProgressReport
 
 N_MODES = 60
-"""Modes of the first shape in which poses are searched."""
+"""Modes of the template in which poses are searched, at most."""
 COARSE_FACES = 2500
 """Faces of the mesh on which they are searched; of fewer, it is the caller's."""
 SHIFTS = (-0.17, 0.17)
 """Times at which a motion may be instead of where its neighbours say, in parts of the gap between these."""
 TRUSTED, N_ALIKE = 0.34, 2
 """Part of the frames, those that explain most, from which the others are searched again; starts from their shapes."""
+EQUALLY_NEAR = 1e-9
+"""Relative difference of gaps in time that are equal but for rounding."""
 TIME_ROUNDS, LATEST, UNCHANGED = 6, 0.5, 10.0
 """Rounds in which times are estimated; the largest change, in parts of the gap between neighbours, and its weight."""
 
@@ -48,7 +50,8 @@ class FramePoses:
 
     def __init__(self, problem: CompletionProblem) -> None:
         self.problem, self.faces = problem, problem.faces
-        basis = extract_bases(problem.template[None], self.faces, N_MODES)[0]
+        n_modes = min(N_MODES, 3 * len(problem.mesh.used) - 6)
+        basis = extract_bases(problem.template[None], self.faces, n_modes)[0]
         modes = scale_modes(basis.modes, 100.0)
         self.bending = ModalBending(problem.template, self.faces, modes)
         whole = problem.whole.numpy()
@@ -89,9 +92,10 @@ class FramePoses:
 
     def _outward(self, fits: dict[int, ModalFit], before: dict[int, ModalFit], report: ProgressReport) -> None:
         """Add all other frames, those near in time to what is known first; none is worse than it was before."""
+        scores = dict[tuple[int, float], float]()
         while left := [i for i in range(len(self.frames)) if i not in fits]:
             known = self._knots(fits)
-            i = min(left, key=lambda i: min(abs(self.frames[i].time - t) for t, _ in known))
+            i = self._nearest_in_time(left, known, scores)
             starts = self._starts(self.frames[i].time, known)
             if before:
                 starts += self._alike(i, [x for _, x in known])
@@ -99,6 +103,24 @@ class FramePoses:
             if i in before:
                 fits[i] = min(fits[i], before[i], key=lambda one: one.score)
             report.update()
+
+    def _nearest_in_time(
+        self, left: list[int], known: list[tuple[float, Tensor]], scores: dict[tuple[int, float], float]
+    ) -> int:
+        """The frame nearest in time to a known shape; of equally near ones, the one that such a shape explains best.
+
+        Not the first: reversed times give the same motion reversed.
+        """
+        gaps = {(i, t): abs(self.frames[i].time - t) for i in left for t, _ in known}
+        least, shapes = (1 + EQUALLY_NEAR) * min(gaps.values()), dict(known)
+        near = [pair for pair, gap in gaps.items() if gap <= least]
+        if len({i for i, _ in near}) > 1:
+            still = self.poses.bending.still()
+            for i, t in near:
+                if (i, t) not in scores:
+                    scores[i, t] = self.poses.score(self._coarsen(shapes[t]), still, self.frames[i])
+            near.sort(key=lambda pair: scores[pair])
+        return near[0][0]
 
     def _knots(self, fits: dict[int, ModalFit]) -> list[tuple[float, Tensor]]:
         """Times and shapes of frames, and of whole ones, in the order of time."""
@@ -115,14 +137,14 @@ class FramePoses:
         times, shapes = np.array([time for time, _ in known]), torch.stack([x for _, x in known])
         nearest = np.argsort(np.abs(times - t))
         bases = [shapes[nearest[0]]]
-        if times[0] < t < times[-1] and t not in times:
+        if times[0] < t < times[-1]:
             path = Path(shapes, self.faces, times=times.tolist())
             gap = np.diff(times)[np.searchsorted(times, t) - 1]
             bases = [path(shapes, t)]
             for shift in SHIFTS:
                 other = path(shapes, float(np.clip(t + shift * gap, times[0], times[-1])))
                 bases.append(best_fit(other, bases[0]).apply(other))
-        elif t not in times and len(known) > 1:
+        elif len(known) > 1:
             bases.append(self._beyond(shapes[nearest[1], None], shapes[nearest[0], None])[0])
         return [(x, self.bending.still()) for x in bases]
 
@@ -149,7 +171,7 @@ class FramePoses:
 
 
 def times_between(problem: CompletionProblem, shapes: list[Tensor]) -> list[float]:
-    """Times at which the path through all other shapes is nearest to each; the first, the last and exact ones stay.
+    """Times at which the path through all other shapes is nearest to each; the first and the last stay.
 
     Args:
         problem: Has the frames with the times that are known.
@@ -163,7 +185,7 @@ def times_between(problem: CompletionProblem, shapes: list[Tensor]) -> list[floa
         known.sort(key=lambda one: one[0])
         axis = np.array([t for t, _ in known])
         after = int(np.searchsorted(axis, times[i]))
-        if times[i] in exact or not 0 < after < len(axis):
+        if not 0 < after < len(axis):
             continue
         gap = LATEST * (axis[after] - axis[after - 1])
         around = slice(max(0, after - 2), after + 2)

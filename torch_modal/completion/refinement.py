@@ -3,6 +3,7 @@
 import numpy as np
 import torch
 from scipy import sparse
+from scipy.optimize import NoConvergence, anderson
 from torch import Tensor
 
 from torch_modal.completion.energy import PointEnergy
@@ -34,6 +35,10 @@ ROUNDS, STEPS, PRODUCTS = 12, 2, 20
 """Rounds of new pairs, in each of which all vertices take steps, each with iterations of conjugate gradients."""
 LAST = 6 * [60]
 """Steps after the last round, and their iterations."""
+MOST_MARKERS = 0.5
+"""Part of the vertices below which these are markers: noisy meshes also need their shapes by modes."""
+STILL, MOST_ROUNDS = 1e-5, 40
+"""Largest move of a vertex in a round, at a size of 100, where markers are at rest; rounds until then."""
 
 
 ANCHOR = 1e-4
@@ -60,33 +65,55 @@ class Refinement:
         #: Fixed points of the terms. *Shape:* ``(1, P, 3)``.
         self.anchors = None if points is None else torch.from_numpy(problem.to_canonical(points))[None]
 
-    def run(self, poses: list[Tensor], report: ProgressReport) -> tuple[Tensor, list[LastSolve]]:
-        """Shapes of the frames from their poses by modes, and how each was found. *Shape:* ``(T, V, 3)``."""
+    def run(self, poses: list[Tensor], report: ProgressReport) -> tuple[Tensor, LastSolve]:
+        """Shapes of the frames from their poses by modes, and how they were found. *Shape:* ``(T, V, 3)``."""
         frames = self.problem.frames
+        # With few markers, shapes are smooth functions of the points, and are minimised until nothing moves.
+        few = MOST_MARKERS * len(self.problem.template)
+        smooth = all(one.places is not None and len(one.points) < few for frame in frames for one in frame.seen)
         for i, pose in enumerate(poses):
             surface = SampledSurface(pose.numpy(), self.problem.mesh)
             frames[i] = frames[i]._replace(seen=[one.with_noise(surface) for one in frames[i].seen])
         followed = torch.stack([self._follow(frame, pose) for frame, pose in zip(frames, poses, strict=True)])
-        (numbers, weights), solves = self._rests(), list[LastSolve]()
-        x, of_known = followed, OF_KNOWN
-        for k in range(ROUNDS + 1):
+        (numbers, weights), x, of_known = self._rests(0.0 if smooth else OWN), followed, OF_KNOWN
+
+        def rests_of(x: Tensor) -> list[RestShapes]:
             shapes = torch.cat([followed, self.problem.whole, x])[numbers]
-            products, solves = LAST if k == ROUNDS else STEPS * [PRODUCTS], []
-            for i, frame in enumerate(frames):
-                rests = RestShapes(shapes[i : i + 1], weights[i : i + 1], self.stiffness, self.anchors)
-                solves.append(self._relax(frame, x[i : i + 1], rests, products, of_known))
-                report.update(k < ROUNDS)
-            x = torch.cat([solve.x for solve in solves])
+            rows = zip(shapes.split(1), weights.split(1), strict=True)
+            return [RestShapes(*row, self.stiffness, self.anchors) for row in rows]
+
+        def relax(x: Tensor, products: list[int]) -> LastSolve:
+            rows = zip(frames, x.split(1), rests_of(x), strict=True)
+            every = [self._relax(frame, one, rests, products, of_known) for frame, one, rests in rows]
+            x, points = torch.cat([one for one, _ in every]), [p for _, p in every]
+            return LastSolve(x, self.fine.energy, rests_of, points, smooth)
+
+        for _ in range(ROUNDS):
+            x = relax(x, STEPS * [PRODUCTS]).x
+            report.update(len(frames))
             # Points of known places are missed by their noise, neither more nor less (Morozov's discrepancy).
             ratios = [
-                np.mean(np.minimum(one.distances(shape) / one.noise, OUTLIERS) ** 2) / 3
+                frame.weight * (one.weights @ np.minimum(one.distances(shape) / one.noise, OUTLIERS) ** 2) / 3
                 for frame, shape in zip(frames, x.numpy(), strict=True)
                 for one in frame.seen
                 if one.places is not None
             ]
             if ratios:
                 of_known = float(np.clip(of_known * np.clip(np.median(ratios), 0.5, 2.0) ** 2, *STIFFNESSES))
-        return self._separate(solves) if self.contact else x, solves
+        if smooth:
+            of_known = 2.0 ** round(np.log2(of_known))  # a constant of the gradient
+            options = {"alpha": 1.0, "line_search": None, "f_tol": STILL, "maxiter": MOST_ROUNDS}
+            try:
+                # SciPy divides infinite steps where nothing moves at the start.
+                with np.errstate(invalid="ignore"):
+                    moved = anderson(
+                        lambda x: relax(torch.from_numpy(x), STEPS * [PRODUCTS]).x.numpy() - x, x.numpy(), **options
+                    )
+            except NoConvergence as error:
+                moved = error.args[0]
+            x = torch.from_numpy(moved)
+        solve = relax(x, LAST)
+        return self._separate(solve) if self.contact else solve.x, solve
 
     def _follow(self, frame: Frame, pose: Tensor) -> Tensor:
         """The shape after as-rigid-as-possible steps towards the clouds of a frame. *Shape:* ``(V, 3)``."""
@@ -105,35 +132,39 @@ class Refinement:
             x = elastic.follow(x, pulls)
         return torch.from_numpy(x)
 
-    def _relax(self, frame: Frame, x: Tensor, rests: RestShapes, products: list[int], of_known: float) -> LastSolve:
-        """Steps of all vertices of a frame, with pairs found where they start. *Shape:* ``(1, V, 3)``."""
-        surface, springs = SampledSurface(x[0].numpy(), self.problem.mesh), []
+    def _relax(
+        self, frame: Frame, x: Tensor, rests: RestShapes, products: list[int], of_known: float
+    ) -> tuple[Tensor, PointEnergy]:
+        """Steps of all vertices of a frame, with pairs found where they start, and these. *Shape:* ``(1, V, 3)``."""
+        surface, springs, trusts = SampledSurface(x[0].numpy(), self.problem.mesh), [], []
         for seen in frame.seen:
             pairs, factor = seen.pair(surface), STIFFNESS if seen.places is None else of_known
             trust = robust_weights(pairs.distances(surface.vertices), seen.noise)
-            weights = factor / seen.noise**2 * len(seen.points) * pairs.weights * trust
+            weights = factor / seen.noise**2 * frame.weight * len(seen.points) * pairs.weights * trust
             springs.append(pairs._replace(weights=weights))
-        points = PointEnergy(springs)
-        x = self.fine.relax(x, rests, products, lambda *_: [points])
-        return LastSolve(x, self.fine.energy, rests, points)
+            trusts.append(np.ones(len(trust)) if seen.places is None else trust)
+        points = PointEnergy(springs, np.concatenate(trusts))
+        return self.fine.relax(x, rests, products, lambda *_: [points]), points
 
-    def _separate(self, solves: list[LastSolve]) -> Tensor:
+    def _separate(self, solve: LastSolve) -> Tensor:
         """Push apart the parts of each shape that pass through each other, but for what whole shapes do.
 
         *Shape:* ``(T, V, 3)``.
         """
         problem, shapes = self.problem, []
         search = ContactSearch(self.backend, problem.mesh, problem.whole, problem.template, 1)
-        for solve in solves:
+        for x, rests, points in zip(solve.x.split(1), solve.rests(solve.x), solve.points, strict=True):
 
-            def relax(x: Tensor, _: Tensor, extra: ExtraEnergies, solve: LastSolve = solve) -> Tensor:
-                return self.fine.relax(x, solve.rests, [PRODUCTS], lambda *chunk: [solve.points, *extra(*chunk)])
+            def relax(
+                x: Tensor, _: Tensor, extra: ExtraEnergies, rests: RestShapes = rests, points: PointEnergy = points
+            ) -> Tensor:
+                return self.fine.relax(x, rests, [PRODUCTS], lambda *chunk: [points, *extra(*chunk)])
 
             search.watched[:] = False  # each shape by itself
-            shapes.append(separate(solve.x, relax, search)[0])
+            shapes.append(separate(x, relax, search)[0])
         return torch.cat(shapes)
 
-    def _rests(self) -> tuple[Tensor, Tensor]:
+    def _rests(self, own: float) -> tuple[Tensor, Tensor]:
         """Rest shapes of each frame, and their weights: its own by modes, whole ones, and neighbours in time.
 
         Numbers count frames by modes, then whole shapes, then frames as they are. *Shape of each:* ``(T, 5)``.
@@ -143,7 +174,7 @@ class Refinement:
         whole, completed = np.arange(n, n + len(exact)), np.arange(n + n_whole, 2 * n + n_whole)
         rows, weights = [], []
         for i, frame in enumerate(frames):
-            by_modes = OWN_OF_CLOUDS if any(one.places is None for one in frame.seen) else OWN
+            by_modes = OWN_OF_CLOUDS if any(one.places is None for one in frame.seen) else own
             every = np.append(whole, np.delete(completed, i)), np.append(exact, np.delete(times, i))
             row, shares = [i], [by_modes]
             for share, numbers, when in ((WHOLE, whole, exact), (1 - by_modes - WHOLE, *every)):

@@ -28,6 +28,8 @@ LARGEST_STEP = 6.0
 PRIOR = 3e-5
 # Distance at which points are unexplained; part of a cloud that makes a group.
 REACH, PART_OF_GROUP = 2.0, 300
+# Distance of a group from all other points beyond which it belongs to no limb.
+ISOLATED = 15.0
 # Ends of limbs that are tried for a group, of how many, how far away, with which weight; rounds of such trials; and the
 # gain that they need, which stiffer modes may lose.
 N_TRIED, N_TIPS, MOST_AWAY, WEIGHT, ROUNDS, GAIN = 3, 12, 40.0, 3.0, 3, 1e-3
@@ -63,10 +65,14 @@ class PoseSearch:
         return total + sum(seen.score(surface, frame.unit) for seen in frame.seen)
 
     def rigid(self, base: Tensor, frame: Frame) -> tuple[ModalPose, float]:
-        """The pose alone, from the centroid of what was seen on, and its score."""
-        points = np.concatenate([seen.points for seen in frame.seen])
-        start = self.bending.still()._replace(move=torch.from_numpy(np.median(points, 0)) - base.median(0).values)
-        pose = self.descend(base, start, frame._replace(soft=1.0), (2 * FAR, FAR), 1.0, rigid=True)
+        """The pose alone, from the centroid of what was seen on, with and without stray clusters; and its score."""
+        main, poses = frame._replace(seen=[one.main_part(ISOLATED) for one in frame.seen], soft=1.0), []
+        parted = sum(len(one.points) for one in main.seen) < sum(len(one.points) for one in frame.seen)
+        for every in (main, frame._replace(soft=1.0))[: 1 + parted]:
+            centre = np.median(np.concatenate([seen.points for seen in every.seen]), 0)
+            start = self.bending.still()._replace(move=torch.from_numpy(centre) - base.median(0).values)
+            poses.append(self.descend(base, start, every, (2 * FAR, FAR), 1.0, rigid=True))
+        pose = min(poses, key=lambda pose: self.score(base, pose, main))
         return pose, self.score(base, pose, frame)
 
     def descend(
@@ -123,19 +129,21 @@ class PoseSearch:
             best, pose = min(scores), others[int(np.argmin(scores))]
         return pose, best
 
-    def _limbs(self, base: Tensor, pose: ModalPose, frame: Frame) -> list[tuple[FloatArray, float, int]]:
-        """Groups of points that nothing explains, the weight of a point, and the end of a limb that might."""
+    def _limbs(self, base: Tensor, pose: ModalPose, frame: Frame) -> list[tuple[FloatArray, FloatArray, int]]:
+        """Groups of points that nothing explains, their weights, and the end of a limb that might."""
         surface, limbs = self.surface(base, pose), []
         for cloud in [one for one in frame.seen if one.places is None]:
-            for group in cloud.find_unexplained(surface, REACH, max(4, len(cloud.points) // PART_OF_GROUP))[:2]:
+            least = max(4, len(cloud.points) // PART_OF_GROUP)
+            for group in cloud.find_unexplained(surface, REACH, least, ISOLATED)[:2]:
                 points = cloud.points[group]
                 away = np.linalg.norm(surface.vertices[self.tips] - points.mean(0), axis=1)
                 nearest = np.argsort(away)[:N_TRIED]
-                limbs += [(points, WEIGHT / len(cloud.points), int(tip)) for tip in nearest if away[tip] < MOST_AWAY]
+                weights = WEIGHT * cloud.weights[group]
+                limbs += [(points, weights, int(tip)) for tip in nearest if away[tip] < MOST_AWAY]
         return limbs
 
     def _try_limb(
-        self, base: Tensor, pose: ModalPose, frame: Frame, points: FloatArray, weight: float, tip: int
+        self, base: Tensor, pose: ModalPose, frame: Frame, points: FloatArray, weights: FloatArray, tip: int
     ) -> ModalPose:
         """A pose in which a limb explains points that nothing explained; its former pairs are released."""
         extent = 2 * float(np.percentile(np.linalg.norm(points - points.mean(0), axis=1), 90))
@@ -146,7 +154,7 @@ class PoseSearch:
             shift = 0 if k else points.mean(0) - x[vertices].mean(0)
             nearest = vertices[cKDTree(x[vertices] + shift).query(points)[1]]
             places = sparse.identity(len(limb), format="csr")[nearest]
-            return ObservedPoints(points, None, np.full(len(points), weight), np.arange(len(points)), 0.0, places)
+            return ObservedPoints(points, None, weights, np.arange(len(points)), 0.0, places)
 
         distances = MOST_AWAY, MOST_AWAY
         pose = self.descend(base, pose, frame, distances, frame.soft, STEPS // 2, released=limb, springs=springs)
