@@ -19,8 +19,6 @@ from torch_modal.contact.acceleration import AccelerationLimit
 from torch_modal.contact.active import GAP, ContactEnergy, Contacts, ContactSearch, Pull
 from torch_modal.elastic.steps import ExtraEnergies
 
-LOOKED_AT = 8
-"""Number of shapes that are tested first: without intersections there, nothing is done."""
 SOLVED = 16
 """Number of shapes that take steps; the others follow along a cubic spline."""
 BESIDE = 0.125
@@ -44,7 +42,6 @@ def separate(
     relax: Callable[[Tensor, Tensor, ExtraEnergies], Tensor],
     search: ContactSearch,
     limit: AccelerationLimit | None = None,
-    in_modes: Callable[[Tensor, ContactEnergy, Tensor], Tensor] | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Separate the parts of T shapes that pass through each other; the shapes as they are, where none do.
 
@@ -57,29 +54,18 @@ def separate(
             energies. *Shape:* ``(S, V, 3), (S,) -> (S, V, 3)``.
         search: Search for contacts between the known shapes.
         limit: Of shapes at even times between two ends, which have no displacement; None for one shape alone.
-        in_modes: First displacement of some of the shapes, from their indices, contacts and second differences in time.
-            *Shape:* ``(S,), (N, S) -> (S, V, 3)``.
 
     Returns:
         The shapes, and the number of far pairs of triangles that are left in each. *Shape:* ``(T, V, 3), (T,)``.
     """
     n, areas = len(start), search.areas
     every = torch.arange(n, device=start.device)
-    stride = -(-n // LOOKED_AT)
-    if not bool(search.count(start[stride - 1 :: stride]).any()):
-        return start, torch.zeros_like(every)
     active, n_before = search(start, every)
     if not len(active.shapes):
         return start, n_before
     search.watch(active, AROUND)
     chosen = every if limit is None else _choose_shapes(limit.times, search)
-    x = start
-    if limit is not None and in_modes is not None:
-        spline = spline_weights(limit.times[chosen], limit.times)
-        bend = (limit.differences[:n] @ spline.double()).to(start)
-        first = in_modes(chosen, ContactEnergy(active.rows(chosen), areas, start), bend)
-        x = start + torch.tensordot(spline, first, 1)
-    n_far, best, n_best = n_before, start, n_before
+    x, n_far, best, n_best = start, n_before, start, n_before
     most = MOST_MOVED * search.depth(start[0]) if limit is None else math.inf
     # Shapes that relax on their own, what the bound took from them so far, and springs of the vertices it limits.
     alone, dual, springs = x, torch.zeros_like(x), torch.zeros_like(x[0, :, 0])
@@ -98,16 +84,14 @@ def separate(
             x = start + field
             dual = dual.index_add(0, chosen, (alone - x)[chosen])
             springs[limited] = PULL * areas[limited]
-        some = torch.unique(torch.cat([active.shapes, torch.nonzero(n_far).flatten()]))
-        some = every if k == SEPARATION_ROUNDS[0] else some
-        contacts, counts = search(x, some)
-        active, n_far = contacts.with_former(active), n_far.index_copy(0, some, counts)
-        if k < SEPARATION_ROUNDS[0]:
-            continue
+        contacts, n_far = search(x, every)
+        active = contacts.with_former(active)
         moved, n_left = float((x - start).detach().norm(dim=-1).max()), int(n_far.sum())
         if moved <= most and n_left <= int(n_best.sum()) and n_left < int(n_before.sum()):
             best, n_best = x, n_far
-        if not bool(n_far.any()):
+        if k < SEPARATION_ROUNDS[0]:
+            continue
+        if not n_left:
             break
         chosen = torch.unique(torch.cat([chosen, torch.nonzero(n_far).flatten()]))
     if limit is None or best is start:

@@ -52,7 +52,7 @@ class InBetween(InBetweenLayer):
         contact: bool | None = None,
     ) -> None:
         chosen = settings(preset, objective, solver, contact=contact)
-        ends = basis_buffers(bases, chosen.objective.modal_space is not None, chosen.objective.contact)
+        ends = basis_buffers(bases, chosen.objective.modal_space is not None)
         if not 1 <= len(ends) <= 2:
             raise ValueError(
                 f"an in-between lies between two bases, got {len(ends)}; Path and Blend take more: pass "

@@ -78,6 +78,13 @@ def solid_volumes(tetrahedra: Tetrahedra) -> FloatArray:
     return volumes if tetrahedra.inside is None else volumes * tetrahedra.inside
 
 
+def edge_lengths(tetrahedra: Tetrahedra) -> FloatArray:
+    """Length of each edge, once. *Shape:* ``(E,)``."""
+    edges = np.unique(np.sort(tetrahedra.tets[:, EDGES].reshape(-1, 2), axis=1), axis=0)
+    lengths: FloatArray = np.linalg.norm(np.diff(tetrahedra.vertices[edges], axis=1)[:, 0], axis=1)
+    return lengths
+
+
 def orient(tetrahedra: Tetrahedra) -> Tetrahedra:
     """Orient tetrahedra to positive volumes; remove degenerate ones and unused vertices."""
     volumes = tet_volumes(tetrahedra)
