@@ -77,13 +77,14 @@ def test_commands_and_trees(
     shapes = torch.stack([roll(0.0), roll(1.0)])
     files = save_frames(shapes.numpy(), TRIANGLES, tmp_path / "in" / "roll", fmt="obj")
     out = ["--out", str(tmp_path / "frames"), "--modes", "8", "--levels", "1", "--no-cache"]
+    modal = ["--format", "obj", "--preset", "modal"]
     with caplog.at_level(logging.INFO, "torch_modal"):
-        assert cli.main(["subdivide", *map(str, files), *out, "--format", "obj"]) == 0
+        assert cli.main(["subdivide", *map(str, files), *out, *modal]) == 0
     assert "modes of the surface itself, not of a solid: key-frame 0 is open" in caplog.text
     frames, _ = tm.load_keyframes(sorted((tmp_path / "frames").glob("*.obj")))
     assert strain(frames[1]) < 2e-3
     asked = ["--method", "solid", "--overwrite"]
-    assert cli.main(["subdivide", *map(str, files), *out, "--format", "obj", *asked]) == 1
+    assert cli.main(["subdivide", *map(str, files), *out, *modal, *asked]) == 1
     assert "the surface is flat" in capsys.readouterr().err
 
     tree = ["precompute", str(tmp_path / "in"), "--out", str(tmp_path / "bases"), "--modes", "8"]
