@@ -29,8 +29,6 @@ SHIFTS = (-0.17, 0.17)
 """Times at which a motion may be instead of where its neighbours say, in parts of the gap between these."""
 TRUSTED, N_ALIKE = 0.34, 2
 """Part of the frames, those that explain most, from which the others are searched again; starts from their shapes."""
-EQUALLY_NEAR = 1e-9
-"""Relative difference of gaps in time that are equal but for rounding."""
 TIME_ROUNDS, LATEST, UNCHANGED = 6, 0.5, 10.0
 """Rounds in which times are estimated; the largest change, in parts of the gap between neighbours, and its weight."""
 
@@ -92,10 +90,9 @@ class FramePoses:
 
     def _outward(self, fits: dict[int, ModalFit], before: dict[int, ModalFit], report: ProgressReport) -> None:
         """Add all other frames, those near in time to what is known first; none is worse than it was before."""
-        scores = dict[tuple[int, float], float]()
         while left := [i for i in range(len(self.frames)) if i not in fits]:
             known = self._knots(fits)
-            i = self._nearest_in_time(left, known, scores)
+            i = min(left, key=lambda i: min(abs(self.frames[i].time - t) for t, _ in known))
             starts = self._starts(self.frames[i].time, known)
             if before:
                 starts += self._alike(i, [x for _, x in known])
@@ -103,24 +100,6 @@ class FramePoses:
             if i in before:
                 fits[i] = min(fits[i], before[i], key=lambda one: one.score)
             report.update()
-
-    def _nearest_in_time(
-        self, left: list[int], known: list[tuple[float, Tensor]], scores: dict[tuple[int, float], float]
-    ) -> int:
-        """The frame nearest in time to a known shape; of equally near ones, the one that such a shape explains best.
-
-        Not the first: reversed times give the same motion reversed.
-        """
-        gaps = {(i, t): abs(self.frames[i].time - t) for i in left for t, _ in known}
-        least, shapes = (1 + EQUALLY_NEAR) * min(gaps.values()), dict(known)
-        near = [pair for pair, gap in gaps.items() if gap <= least]
-        if len({i for i, _ in near}) > 1:
-            still = self.poses.bending.still()
-            for i, t in near:
-                if (i, t) not in scores:
-                    scores[i, t] = self.poses.score(self._coarsen(shapes[t]), still, self.frames[i])
-            near.sort(key=lambda pair: scores[pair])
-        return near[0][0]
 
     def _knots(self, fits: dict[int, ModalFit]) -> list[tuple[float, Tensor]]:
         """Times and shapes of frames, and of whole ones, in the order of time."""
