@@ -22,17 +22,17 @@ import torch
 import torch_modal as tm
 
 BOUNDS = {
-    "lines of code": 16210,
-    "functions": 1473,
+    "lines of code": 16484,
+    "functions": 1484,
     "docstrings that begin with no noun": 0,
-    "functions of in-between": 142,
-    "files of in-between": 34,
-    "functions of in-between, forward and backward": 172,
-    "files of in-between, forward and backward": 34,
-    "functions of subdivide": 159,
-    "files of subdivide": 36,
-    "functions of making a layer": 132,
-    "files of making a layer": 38,
+    "functions of in-between": 90,
+    "files of in-between": 23,
+    "functions of in-between, forward and backward": 115,
+    "files of in-between, forward and backward": 24,
+    "functions of subdivide": 162,
+    "files of subdivide": 35,
+    "functions of making a layer": 107,
+    "files of making a layer": 32,
 }
 SLACK = 0.02
 """Relative growth that no commit has to explain."""
