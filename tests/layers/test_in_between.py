@@ -83,7 +83,7 @@ class TestValues:
         no_steps = InBetween(bars.bases[1:], bars.faces, "modal", solver=Solver(max_steps=0))
         truth = no_steps.solve(*x, times(0.3)).shapes[0]
         torch.testing.assert_close(found.shapes[1], truth, rtol=0, atol=1e-12)
-        with pytest.raises(ValueError, match="act through modes, and there are none: pass bases"):
+        with pytest.raises(ValueError, match="minimise in modes, and there are none: pass bases"):
             InBetween(x, bars.faces, "paper")
 
     def test_where_the_blend_is_far_worse_than_straight_lines_they_are_returned(

@@ -152,7 +152,7 @@ class Refinement:
         *Shape:* ``(T, V, 3)``.
         """
         problem, shapes = self.problem, []
-        search = ContactSearch(self.backend, problem.mesh, problem.whole, 1)
+        search = ContactSearch(self.backend, problem.mesh, problem.whole, problem.template, 1)
         for x, rests, points in zip(solve.x.split(1), solve.rests(solve.x), solve.points, strict=True):
 
             def relax(

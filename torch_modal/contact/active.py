@@ -65,14 +65,15 @@ class ContactSearch:
         backend: Finds the pairs of triangles that cross.
         mesh: Their connectivity.
         known: Shapes whose own intersections stay as they are, in the frame. *Shape:* ``(K, V, 3)``.
+        like: The shape whose lengths and areas count. *Shape:* ``(V, 3)``.
         n_shapes: T.
     """
 
-    def __init__(self, backend: TorchBackend, mesh: Connectivity, known: Tensor, n_shapes: int) -> None:
-        shapes = _numbers(known)
-        self.search = Search(mesh, shapes, search=backend.crossings(mesh, shapes[0]))
+    def __init__(self, backend: TorchBackend, mesh: Connectivity, known: Tensor, like: Tensor, n_shapes: int) -> None:
+        reference = _numbers(like)
+        self.search = Search(mesh, _numbers(known), reference, backend.crossings(mesh, reference))
         #: Areas of the vertices, constants of the gradient. *Shape:* ``(V,)``.
-        self.areas = torch.from_numpy(np.mean([vertex_areas(x, mesh.faces) for x in shapes], 0)).to(known)
+        self.areas = torch.from_numpy(vertex_areas(reference, mesh.faces)).to(known)
         self.watched = np.zeros((n_shapes, known.shape[1]), dtype=bool)
 
     def __call__(self, x: Tensor, some: Tensor) -> tuple[Contacts, Tensor]:

@@ -8,16 +8,18 @@ from torch import Tensor
 
 from torch_modal import trees
 from torch_modal.contact.acceleration import AccelerationLimit
-from torch_modal.contact.active import ContactSearch, refuse_transforms
+from torch_modal.contact.active import ContactEnergy, ContactSearch, refuse_transforms
+from torch_modal.contact.modal import modal_displacement
 from torch_modal.contact.separate import separate, spline_weights
 from torch_modal.elastic.energy import RestShapes
 from torch_modal.elastic.minimise import Solution
 from torch_modal.elastic.steps import ExtraEnergies
 from torch_modal.inbetween.alignment import Pose
+from torch_modal.inbetween.joint import JointSpace
 from torch_modal.inbetween.results import InBetweenResult, Samples
 from torch_modal.inbetween.solver import InBetweenSolver
 
-PRODUCTS = 40
+PRODUCTS = 20
 """Iterations of conjugate gradients in a Newton step with contacts, which are stiff."""
 
 
@@ -86,7 +88,7 @@ def push_apart(
     """Find the displacement that separates the parts of shapes between two key-frames.
 
     Args:
-        core: Has the energy.
+        core: Has the energy and, where there are some, the modes.
         x: The shapes in the frame. *Shape:* ``(T, V, 3)``.
         u: Their times, even, between 0 and 1. *Shape:* ``(T,)``.
         rests: Rest shapes of the energy of each.
@@ -98,20 +100,27 @@ def push_apart(
     seen = torch.cat([ends[1, :1], core.alignment.to_caller(x, pose), ends[1, 1:]]) * scale
     limit = AccelerationLimit(seen, pose.rotation, goes_on)
 
+    def in_modes(some: Tensor, contact: ContactEnergy, accelerations: Tensor) -> Tensor:
+        space = core.space
+        placement = space.place(x[some], trees.rows(rests, some), u[some])
+        zeros = x.new_zeros(len(some), space.n_amplitudes)
+        at = space.derivatives(zeros, placement, second_order=False)
+        stiffness = at.gauss_newton - space.anchor * torch.eye(zeros.shape[1]).to(at.gauss_newton)
+        basis = space.basis, core.alignment.weights, at.gradient.to(u), stiffness.to(u)
+        return modal_displacement(*basis, x[some], contact, accelerations)
+
     search = contact_search(core, ends[0], len(u))
-    pushed, n_crossing = separate(x, _steps(core, rests), search, limit)
+    start = in_modes if isinstance(core.space, JointSpace) else None
+    pushed, n_crossing = separate(x, _steps(core, rests), search, limit, start)
     field = pushed - x if pushed is not x or bool(n_crossing.any()) else None
     return Displacement(field, u, n_crossing, search)
 
 
 def contact_search(core: InBetweenSolver, ends: Tensor, n_shapes: int) -> ContactSearch:
     """Search in shapes between key-frames. *Shape:* ``(K, V, 3)``."""
-    return ContactSearch(core.backend, core.mesh.connectivity, ends, n_shapes)
+    return ContactSearch(core.backend, core.mesh.connectivity, ends, core.alignment.reference, n_shapes)
 
 
 def _steps(core: InBetweenSolver, rests: RestShapes) -> Callable[[Tensor, Tensor, ExtraEnergies], Tensor]:
-    """Newton steps of all vertices of some of the shapes, with further energies.
-
-    Contacts flatten triangles: softened, these would yield more and more from round to round.
-    """
-    return lambda x, some, extra: core.fine.relax(x, trees.rows(rests, some), [PRODUCTS], extra, soften=False)
+    """Newton steps of all vertices of some of the shapes, with further energies."""
+    return lambda x, some, extra: core.fine.relax(x, trees.rows(rests, some), [PRODUCTS], extra)

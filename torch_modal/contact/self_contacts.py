@@ -71,8 +71,8 @@ def self_contacts(x: Any, faces: Any, ignore: Any = None) -> SelfContacts:
             message = f"ignore has {ignored.shape[-2]} vertices, the shapes have {shapes.shape[1]}; they must be equal"
             raise MeshError(message)
         known = check_arrays(ignored.reshape(-1, *ignored.shape[-2:]), faces)[1]
-    mesh, like = Connectivity(corners, shapes.shape[1]), known if len(known) else shapes[:1]
-    search = Search(mesh, known, like, choose("auto").crossings(mesh, like[0]))
+    mesh, like = Connectivity(corners, shapes.shape[1]), known[0] if len(known) else shapes[0]
+    search = Search(mesh, known, like, choose("auto").crossings(mesh, like))
     if not search.diagonal > 0:
         raise MeshError("all vertices of a shape lie at one place: it has no size")
     pairs = [search.pairs(shape) for shape in shapes]

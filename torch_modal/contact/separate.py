@@ -19,13 +19,15 @@ from torch_modal.contact.acceleration import AccelerationLimit
 from torch_modal.contact.active import GAP, ContactEnergy, Contacts, ContactSearch, Pull
 from torch_modal.elastic.steps import ExtraEnergies
 
+LOOKED_AT = 8
+"""Number of shapes that are tested first: without intersections there, nothing is done."""
 SOLVED = 16
 """Number of shapes that take steps; the others follow along a cubic spline."""
 BESIDE = 0.125
 """Duration next to a key-frame that intersects itself, in which all shapes take steps."""
 AROUND = 2
 """Neighbours in time of shapes with contacts, in which the same vertices are watched."""
-SEPARATION_ROUNDS = 4, 12
+SEPARATION_ROUNDS = 4, 8
 """Least and largest number of rounds."""
 WIDER = 0.075
 """Growth of the gap of a shape alone in each further round: edges of long triangles cross before a vertex is inside."""
@@ -42,6 +44,7 @@ def separate(
     relax: Callable[[Tensor, Tensor, ExtraEnergies], Tensor],
     search: ContactSearch,
     limit: AccelerationLimit | None = None,
+    in_modes: Callable[[Tensor, ContactEnergy, Tensor], Tensor] | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Separate the parts of T shapes that pass through each other; the shapes as they are, where none do.
 
@@ -54,18 +57,29 @@ def separate(
             energies. *Shape:* ``(S, V, 3), (S,) -> (S, V, 3)``.
         search: Search for contacts between the known shapes.
         limit: Of shapes at even times between two ends, which have no displacement; None for one shape alone.
+        in_modes: First displacement of some of the shapes, from their indices, contacts and second differences in time.
+            *Shape:* ``(S,), (N, S) -> (S, V, 3)``.
 
     Returns:
         The shapes, and the number of far pairs of triangles that are left in each. *Shape:* ``(T, V, 3), (T,)``.
     """
     n, areas = len(start), search.areas
     every = torch.arange(n, device=start.device)
+    stride = -(-n // LOOKED_AT)
+    if not bool(search.count(start[stride - 1 :: stride]).any()):
+        return start, torch.zeros_like(every)
     active, n_before = search(start, every)
     if not len(active.shapes):
         return start, n_before
     search.watch(active, AROUND)
     chosen = every if limit is None else _choose_shapes(limit.times, search)
-    x, n_far, best, n_best = start, n_before, start, n_before
+    x = start
+    if limit is not None and in_modes is not None:
+        spline = spline_weights(limit.times[chosen], limit.times)
+        bend = (limit.differences[:n] @ spline.double()).to(start)
+        first = in_modes(chosen, ContactEnergy(active.rows(chosen), areas, start), bend)
+        x = start + torch.tensordot(spline, first, 1)
+    n_far, best, n_best = n_before, start, n_before
     most = MOST_MOVED * search.depth(start[0]) if limit is None else math.inf
     # Shapes that relax on their own, what the bound took from them so far, and springs of the vertices it limits.
     alone, dual, springs = x, torch.zeros_like(x), torch.zeros_like(x[0, :, 0])
@@ -84,14 +98,16 @@ def separate(
             x = start + field
             dual = dual.index_add(0, chosen, (alone - x)[chosen])
             springs[limited] = PULL * areas[limited]
-        contacts, n_far = search(x, every)
-        active = contacts.with_former(active)
+        some = torch.unique(torch.cat([active.shapes, torch.nonzero(n_far).flatten()]))
+        some = every if k == SEPARATION_ROUNDS[0] else some
+        contacts, counts = search(x, some)
+        active, n_far = contacts.with_former(active), n_far.index_copy(0, some, counts)
+        if k < SEPARATION_ROUNDS[0]:
+            continue
         moved, n_left = float((x - start).detach().norm(dim=-1).max()), int(n_far.sum())
         if moved <= most and n_left <= int(n_best.sum()) and n_left < int(n_before.sum()):
             best, n_best = x, n_far
-        if k < SEPARATION_ROUNDS[0]:
-            continue
-        if not n_left:
+        if not bool(n_far.any()):
             break
         chosen = torch.unique(torch.cat([chosen, torch.nonzero(n_far).flatten()]))
     if limit is None or best is start:

@@ -37,18 +37,15 @@ class KernelFineEnergy(FineEnergy):
         self.further = Energy(mesh, [terms[i] for i in self.others]) if self.others else None
         self.kernels = KernelEnergy(shell, [term for term in parts if term is not None])
 
-    def relax_chunk(
-        self, x: Tensor, rests: RestShapes, products: Sequence[int], extra: Sequence[FreeEnergy], soften: bool = True
-    ) -> Tensor:
+    def relax_chunk(self, x: Tensor, rests: RestShapes, products: Sequence[int], extra: Sequence[FreeEnergy]) -> Tensor:
         """Overrides the base class. With further terms or energies, gradients are left to torch."""
         alone = self.further is None and not extra
         tensors = trees.leaves((x, *rests))  # the start may have no gradient where stiffnesses have one
         recorded = torch.is_grad_enabled() and any(value.requires_grad for value in tensors)
         if not (alone and self.kernels.exact) and (recorded or not is_eager(*tensors)):
-            return super().relax_chunk(x, rests, products, extra, soften)
+            return super().relax_chunk(x, rests, products, extra)
         others = [*extra, *([] if self.further is None else [TermsTowards.of_terms(self.further, self.others, rests)])]
-        own = rests._replace(stiffness=[rests.stiffness[i] for i in self.own])
-        to = self.kernels.reference(own, x if soften else None, relative=True)
+        to = self.kernels.reference(rests._replace(stiffness=[rests.stiffness[i] for i in self.own]), x, relative=True)
         if alone:
             return _Relaxation(self.kernels, products)(x, *to.records)[0].to(x)
         with torch.no_grad():

@@ -258,37 +258,19 @@ class FineEnergy(nn.Module):
         self.energy = Energy(mesh, terms)
 
     def relax(
-        self,
-        x: Tensor,
-        rests: RestShapes,
-        products: Sequence[int],
-        extra: ExtraEnergies = lambda *_: (),
-        soften: bool = True,
+        self, x: Tensor, rests: RestShapes, products: Sequence[int], extra: ExtraEnergies = lambda *_: ()
     ) -> Tensor:
-        """Steps of all vertices, never uphill, by :func:`descend`. *Shape:* ``(B, V, 3)``.
-
-        Args:
-            x: Where to start.
-            rests: Rest shapes of each.
-            products: Iterations of conjugate gradients in each step.
-            extra: Further energies.
-            soften: True for less bending stiffness at needles that the rest shapes do not have.
-        """
+        """Steps of all vertices, never uphill, by :func:`descend`. *Shape:* ``(B, V, 3)``."""
         most = VERTICES_AT_ONCE_OF_CPU if x.device.type == "cpu" else VERTICES_AT_ONCE_OF_GPU
         n = max(1, most // x.shape[1])
         if len(x) <= n:
-            return self.relax_chunk(x, rests, products, extra(slice(None), x), soften)
+            return self.relax_chunk(x, rests, products, extra(slice(None), x))
         chunks = [slice(i, i + n) for i in range(0, len(x), n)]
-        return torch.cat(
-            [self.relax_chunk(x[i], trees.rows(rests, i), products, extra(i, x[i]), soften) for i in chunks]
-        )
+        return torch.cat([self.relax_chunk(x[i], trees.rows(rests, i), products, extra(i, x[i])) for i in chunks])
 
-    def relax_chunk(
-        self, x: Tensor, rests: RestShapes, products: Sequence[int], extra: Sequence[FreeEnergy], soften: bool = True
-    ) -> Tensor:
+    def relax_chunk(self, x: Tensor, rests: RestShapes, products: Sequence[int], extra: Sequence[FreeEnergy]) -> Tensor:
         """:meth:`relax` of samples that fit into the caches, with their own further energies."""
-        reference = rests.reference(self.energy, x if soften else None, relative=True)
-        terms = TermsTowards(self.energy, reference, rests.anchors)
+        terms = TermsTowards(self.energy, rests.reference(self.energy, x, relative=True), rests.anchors)
         return descend(SumOfEnergies([terms, *extra]), x, products)
 
     def descend_towards(

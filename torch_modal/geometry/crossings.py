@@ -4,7 +4,6 @@ Pairs come from the tree of boxes and the exact predicates of ``libigl``, as do 
 ``contact`` and is imported when it is first needed.
 """
 
-import functools
 from collections.abc import Callable
 from functools import cached_property
 
@@ -45,8 +44,7 @@ class Crossings:
     Args:
         mesh: The connectivity.
         known: Shapes whose own crossings are tolerated. *Shape:* ``(K, V, 3)``.
-        like: Shapes in which lengths are measured, each where it is least: a part that one of them stretches must not
-            widen all searches. *Shape:* ``(N, V, 3)``. Default: ``known``.
+        like: The shape whose lengths say what is far along the surface. Default: the first of ``known``.
         search: Finds what :meth:`pairs` does, in any order, and may find more. *Shape:* ``(V, 3) -> (P, 2)``.
             Default: by ``libigl``.
     """
@@ -59,14 +57,14 @@ class Crossings:
         search: Callable[[FloatArray], IntArray] | None = None,
     ) -> None:
         self.mesh, self.known, self._search = mesh, known, search
-        self.like = known if like is None else like
-        self.diagonal = float(np.linalg.norm(np.ptp(self.like[:, mesh.used], axis=1), axis=1).min())
+        self.like = known[0] if like is None else like
+        self.diagonal = float(np.linalg.norm(np.ptp(self.like[mesh.used], axis=0)))
 
     # ------------------------------------------------------------------------------------------------- once for a mesh
     @cached_property
     def lengths(self) -> sparse.csr_matrix:
         """Edge lengths as a graph. *Shape:* ``(V, V)``."""
-        return functools.reduce(sparse.csr_matrix.minimum, [edge_graph(x, self.mesh.edges) for x in self.like])
+        return edge_graph(self.like, self.mesh.edges)
 
     @cached_property
     def adjacency(self) -> sparse.csr_matrix:

@@ -38,7 +38,7 @@ class InBetweenSolver(nn.Module):
 
     Args:
         references: Of the bases, float64 on the CPU. *Shape:* ``(K, V, 3)``.
-        modes: Of the bases, if the objective has a modal space. *Shape of each:* ``(k, V, 3)``.
+        modes: Of the bases, if the objective has a modal space, or contact. *Shape of each:* ``(k, V, 3)``.
         mesh: The caller's mesh.
         terms: The terms of the energy, Eq. 5 first; the layer owns them.
         objective: What is minimised.
@@ -63,10 +63,12 @@ class InBetweenSolver(nn.Module):
         self.products = [LOCAL_PRODUCTS] * solver.local_steps + [POLISH_PRODUCTS] * solver.polish
         self.has_anchors = any(term.anchors is not None for term in terms)
         self.distortion = backend.distortion(mesh, Energy(mesh, others) if others else None)
-        paired, self.modal = objective.modal_space == "paired", objective.modal_space is not None
+        paired = objective.space == "paired"
         self.blend = None if paired else RotationBlend(mesh.connectivity, self.alignment.references, backend)
-        #: The space of the modal solve.
-        self.space: Any = self._space(modes, objective) if self.modal else None
+        #: The space of the modal solve, or of the displacements that separate contacts.
+        self.space: Any = self._space(modes, objective) if any(len(each) for each in modes) else None
+        #: True where amplitudes are minimised before the steps of all vertices.
+        self.modal = self.space is not None and objective.modal_space is not None
         self.local: LocalInterpolation | None = None
         if solver.regions and isinstance(self.space, PairedSpace):
             region = worst_regions(self.space, self.alignment.references, solver.regions)

@@ -40,25 +40,26 @@ Bases = ModalBasis | Sequence[ModalBasis | BasisBuffers] | Tensor | FloatArray |
 """Bases of one connectivity, or key-frames without modes, *shape* ``(K, V, 3)``."""
 
 
-def basis_buffers(bases: Bases, in_modes: bool) -> list[BasisBuffers]:
+def basis_buffers(bases: Bases, required: bool, kept: bool = False) -> list[BasisBuffers]:
     """The buffers of each basis, or of key-frames, which have no modes.
 
     Args:
         bases: Bases or key-frames.
-        in_modes: Whether shapes are minimised in modes. Otherwise these are left out.
+        required: Whether modes are minimised in.
+        kept: Whether modes serve for something else where there are some. Otherwise they are left out.
 
     Raises:
-        ValueError: There is nothing, neither bases of one mesh nor key-frames, or there are no modes to minimise in.
+        ValueError: There is nothing, neither bases of one mesh nor key-frames, or there are no modes where required.
     """
-    n = None if in_modes else 0
+    n = None if required or kept else 0
     buffers = [
         basis if isinstance(basis, BasisBuffers) else BasisBuffers(basis.reference, basis.modes[:n])
         for basis in as_bases(bases)
     ]
-    if in_modes and not any(len(each.modes) for each in buffers):
+    if required and not any(len(each.modes) for each in buffers):
         raise ValueError(
-            'preset="modal" and "paper", and energy terms of your own, act through modes, and there are none: pass '
-            'bases (tm.extract_bases) instead of key-frames, or take preset="accurate" or "fast" without such terms'
+            'preset="modal" and "paper" minimise in modes, and there are none: pass bases (tm.extract_bases) instead '
+            'of key-frames, or take preset="accurate" or "fast"'
         )
     return buffers
 

@@ -56,7 +56,7 @@ class Blend(InBetweenLayer):
         chosen = settings(preset, objective, solver)
         if chosen.objective.space == "paired" or chosen.objective.contact:
             raise ValueError("contact and space='paired' are of two key-frames; a blend has neither")
-        several = basis_buffers(bases, chosen.objective.modal_space is not None)
+        several = basis_buffers(bases, chosen.objective.space is not None, bool(chosen.objective.terms))
         super().__init__(several * 2 if len(several) == 1 else several, faces, chosen)
 
     @disable_compile

@@ -1,5 +1,7 @@
 """Shapes between two key-frames at any time, as a differentiable layer."""
 
+import warnings
+
 import torch
 from torch import Tensor
 
@@ -52,7 +54,15 @@ class InBetween(InBetweenLayer):
         contact: bool | None = None,
     ) -> None:
         chosen = settings(preset, objective, solver, contact=contact)
-        ends = basis_buffers(bases, chosen.objective.modal_space is not None)
+        objective = chosen.objective
+        ends = basis_buffers(bases, objective.space is not None, bool(objective.terms) or objective.contact)
+        if objective.terms and not any(len(end.modes) for end in ends):
+            warnings.warn(
+                "without modes, further energy terms act on the local steps alone, which reach a few edges far: pass "
+                "bases (tm.extract_bases) instead of key-frames",
+                UserWarning,
+                stacklevel=3,
+            )
         if not 1 <= len(ends) <= 2:
             raise ValueError(
                 f"an in-between lies between two bases, got {len(ends)}; Path and Blend take more: pass "

@@ -39,13 +39,13 @@ class Path(PreciseModule):
     """Shapes at any time of a motion through key-frames.
 
     With three key-frames or more, the rotations and sizes of triangles and the rigid motion follow splines
-    (:mod:`torch_modal.motion.spline`): nothing is minimised unless there are terms beyond Eq. 5. Velocities
+    (:mod:`torch_modal.motion.spline`): nothing is minimised unless there are contacts or terms beyond Eq. 5. Velocities
     are continuous at the key-frames, which are reproduced exactly. They are limited to three times the slower one of
     both sides, triangle by triangle, so that what stops does stop. The ends have no acceleration. Two key-frames alone
     give the shapes of :class:`torch_modal.InBetween`.
 
     Args:
-        bases: The key-frames, *shape* ``(K, V, 3)``, or, where modes are needed, the basis of each
+        bases: The key-frames, *shape* ``(K, V, 3)``, or, where modes are needed or wanted, the basis of each
             (:func:`torch_modal.extract_bases`).
         faces: Vertex indices. *Shape:* ``(F, 3)``.
         times: When the key-frames are, ascending; if cyclic, one more, when the first comes again. Default: 0, 1, 2,
@@ -94,8 +94,8 @@ class Path(PreciseModule):
         if n < 2:
             raise ValueError(f"a path needs two key-frames or more, got {n}")
         self.cyclic, self.smooth = cyclic, bool(smooth) and (n > 2 or cyclic)
-        in_modes = objective.modal_space is not None and not self.smooth
-        buffers = basis_buffers(several, in_modes or bool(objective.terms))
+        in_modes = objective.space is not None and not self.smooth
+        buffers = basis_buffers(several, in_modes, bool(objective.terms) or objective.contact)
         #: True where shapes are pushed apart: per interval, not per time as in a layer, to stay continuous.
         self.contact = objective.contact
         self.objective = replace(objective, contact=False)

@@ -51,8 +51,8 @@ def subdivide(
     """Fill a sequence of key-frames with physically plausible shapes.
 
     With three key-frames or more, the result follows a :class:`torch_modal.Path`, smooth in time. Two key-frames give
-    the shapes of :class:`torch_modal.InBetween`. Neither needs modes unless there are terms beyond Eq. 5, or
-    with ``preset="modal"`` for pairs. With ``preset="paper"`` each level inserts a mid-shape between all neighbours,
+    the shapes of :class:`torch_modal.InBetween`. Neither needs modes unless there are contacts or terms beyond Eq. 5,
+    or with ``preset="modal"`` for pairs. With ``preset="paper"`` each level inserts a mid-shape between all neighbours,
     which then serves as a key-frame of the next level with the modes of the nearest key-frame (section 3.3 of the
     paper).
 
@@ -113,7 +113,7 @@ def subdivide(
     smooth = not recursive and n_keys > 2 if smooth is None else smooth
     objective = chosen.objective
     in_modes = bool(objective.terms) or (objective.modal_space is not None and not (smooth and n_keys > 2))
-    if made is None and n_modes and in_modes:
+    if made is None and n_modes and (in_modes or objective.contact):
         if callable(bases):
             made = bases(keyframes, faces)
         else:
