@@ -36,7 +36,7 @@ class Solution(NamedTuple):
     amplitudes: Tensor
     """*Shape:* ``(B, n)``."""
     energy: Tensor
-    """*Shape:* ``(B,)``."""
+    """Of the amplitudes; 0 where none are minimised. *Shape:* ``(B,)``."""
     gradient_norm: Tensor
     """Relative to the gradient norm at the start. *Shape:* ``(B,)``."""
     n_steps: Tensor
