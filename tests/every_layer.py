@@ -63,7 +63,9 @@ class Random(torch.nn.Module):
 
     def __init__(self, kind: type[tm.ShapeAugmentation], shapes: Shapes) -> None:
         super().__init__()
-        self.own = kind(p=1.0, space=space(shapes))
+        # Draws laid on the key-frames depend on no shape that is passed.
+        options = {"on_keyframes": False} if kind is tm.RandomBlend else {}
+        self.own = kind(p=1.0, space=space(shapes), **options)
 
     def forward(self, x: Tensor) -> Tensor:
         with torch.random.fork_rng():
