@@ -17,7 +17,7 @@ if sys.platform != "linux":
 from hostile_files import CASES, RIGHT
 
 TESTS = Path(__file__).parents[1]
-SECONDS, MEGABYTES = 1.0, 200.0
+SECONDS, MEGABYTES = 4.0, 200.0
 
 
 @pytest.fixture(scope="module")
