@@ -1,5 +1,7 @@
 """Confidence: criteria one by one, symmetric and smooth bodies, and meshes that are too small for a map."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import trimesh
@@ -34,7 +36,8 @@ def judged(
 ) -> tuple[float, tuple[str, ...]]:
     """Confidence and messages of a perfect result but for what is given."""
     errors = np.array(landmark_errors, dtype=float)
-    return judge(quality, map_score, likeness, errors, mirrored_lead, lead, freedom, same_subject)
+    confidence, _, messages = judge(quality, map_score, likeness, errors, mirrored_lead, lead, freedom, same_subject)
+    return confidence, messages
 
 
 def off(mean: float) -> Distances:
@@ -204,3 +207,15 @@ def test_meshes_too_small_for_a_map_are_refused(tiny: str) -> None:
     template, target = (meshes[0] if tiny == "target" else line, line if tiny == "target" else meshes[0])
     with pytest.raises(tm.MeshError, match=f"the {tiny}'s.*an area of 0"):
         register(*template, *target, cache=False, progress=False)
+
+
+@pytest.mark.slow
+def test_no_vertex_is_trusted_in_an_exchanged_map(data_dir: Path) -> None:
+    """A woman without head and shoulders is taken the wrong way round: her surface is met, her curves are not."""
+    import registration
+
+    name, (at, *_) = "mh-woman", registration.HOLES["mh-woman"][2]
+    hole = registration.with_hole(name, at, 0.2, False)
+    trusted = hole.found.vertex_confidence.numpy() >= 0.5
+    assert (hole.errors > 5).mean() > 0.5
+    assert (hole.errors[trusted] < 5).all()

@@ -27,7 +27,7 @@ BESIDE = 0.125
 """Duration next to a key-frame that intersects itself, in which all shapes take steps."""
 AROUND = 2
 """Neighbours in time of shapes with contacts, in which the same vertices are watched."""
-SEPARATION_ROUNDS = 4, 8
+SEPARATION_ROUNDS = 4, 12
 """Least and largest number of rounds."""
 WIDER = 0.075
 """Growth of the gap of a shape alone in each further round: edges of long triangles cross before a vertex is inside."""

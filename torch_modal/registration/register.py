@@ -29,7 +29,7 @@ from torch_modal.registration.pair import MeshPair
 from torch_modal.registration.report import LEAD, SLIDING, TRUSTED, Quality, Registration, judge, measure, ramp
 from torch_modal.registration.surface import MeshSurface, beside_holes
 
-VERSION = 11  # part of the cache key: raise it when the algorithm changes
+VERSION = 12  # part of the cache key: raise it when the algorithm changes
 MIN_LANDMARKS = 5  # minimum number of landmarks between different subjects: fewer do not determine the map
 _SURE_SCORE = 0.62  # score of a spectral map below which more initial maps are tried
 _SCORE_SHARE = 0.5  # weight of a map's score and likeness relative to the stretch of its fit
@@ -305,11 +305,12 @@ class _RegistrationProblem(MeshPair):
         quality = quality._replace(unsupported_area=max(quality.unsupported_area, lost))
         freedom = sliding_freedom(self.first, self.mark_vertices[:, 0])
         mirrored = float(self.mirrored - (score - distortion))
-        confidence, warnings = judge(quality, score, best.likeness, errors, mirrored, lead, freedom, self.same_subject)
+        given = quality, score, best.likeness, errors, mirrored, lead, freedom, self.same_subject
+        confidence, right, warnings = judge(*given)
         vertex_confidence = np.full(len(everything), confidence)
         unique = np.minimum(self.unique[near], ramp(freedom, *SLIDING))
         sure = ~beside_holes(self.template.with_vertices(x), self.target)
-        vertex_confidence[self.used] = np.minimum(supported * sure, unique)
+        vertex_confidence[self.used] = np.minimum(np.minimum(supported * sure, unique), right)
         closest = self.target.closest(everything)
         corners = self.target_vertices[self.target.faces[closest.faces]]
         return Registration(

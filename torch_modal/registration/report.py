@@ -98,7 +98,10 @@ class Registration(NamedTuple):
     confidence: float
     """From 0 to 1; below 0.5 the result is doubtful, and ``warnings`` gives the reasons."""
     vertex_confidence: torch.Tensor
-    """From 0 to 1 for each vertex: low where the target has no part for it. *Shape:* ``(V,)``."""
+    """From 0 to 1 for each vertex: low where the target has no part for it, and of a map that may be wrong.
+
+    *Shape:* ``(V,)``.
+    """
     map_score: float
     """Oriented area minus three times the round-trip error of the coarse map; at most 1."""
     distortion: float
@@ -198,8 +201,8 @@ def judge(
     lead: float,
     freedom: float,
     same_subject: bool,
-) -> tuple[float, tuple[str, ...]]:
-    """Confidence, the minimum of several criteria, and a message for each criterion that fails."""
+) -> tuple[float, float, tuple[str, ...]]:
+    """Confidence, the minimum of several criteria; the probability that the map is right; messages for what fails."""
     distance, missing = max(quality.to_target.mean, quality.from_target.mean), quality.unsupported_area
     criteria = {
         f"the mean distance of the surfaces is {distance:.2f} % of the diagonal": ramp(distance, 1.0, 0.3),
@@ -208,6 +211,7 @@ def judge(
         "the template is so smooth that it can slide along the target": ramp(freedom, *SLIDING),
         "another map fits nearly as well": ramp(lead, *LEAD),
     }
+    right = 1.0
     if same_subject or not len(landmark_errors):
         losses = {
             f"the map scores {map_score:.2f}, right ones mostly 0.6 and more": SCORE[0] * (SCORE[1] - map_score),
@@ -216,7 +220,8 @@ def judge(
             f"edges change by {100 * quality.stretch:.0f} % in the mean": STRETCH[0] * (quality.stretch - STRETCH[1]),
         }
         reasons = "; ".join(what for what, loss in losses.items() if 2 * loss > max(losses.values()))
-        criteria[reasons] = 1 / (1 + np.exp(sum(max(loss, 0) for loss in losses.values()) - LOG_ODDS))
+        right = float(1 / (1 + np.exp(sum(max(loss, 0) for loss in losses.values()) - LOG_ODDS)))
+        criteria[reasons] = right
         criteria["the target looks like a mirror image of the template"] = ramp(mirrored_lead, *MIRRORED_LEAD)
     advice = "look at the result, and give landmarks (five or more) on both meshes"
     if len(landmark_errors):
@@ -224,4 +229,4 @@ def judge(
         criteria[f"landmark {worst} is {error:.1f} % off its place"] = ramp(error, 8.0, 2.0)
         advice += ", or more of them"
     warnings = tuple(f"{what}; {advice}" for what, value in criteria.items() if value < TRUSTED)
-    return float(min(criteria.values())), warnings
+    return float(min(criteria.values())), right, warnings
