@@ -123,8 +123,10 @@ def test_one_observation_is_one_shape(tube):
     found = tm.complete(x[2], faces, [seen], progress=False)
     assert found.path is None
     assert error(found(3.0), x[1], diagonal) < 0.7
-    with pytest.raises(ValueError, match="one shape alone"):
-        found(4.0)
+    assert found(torch.tensor([3.0, 3.0])).shape == (2, *x[1].shape)
+    for t in (4.0, torch.tensor([3.0, 4.0])):
+        with pytest.raises(ValueError, match="one shape alone"):
+            found(t)
 
 
 def test_a_loose_part_that_was_not_seen_stays_with_the_body(tube):

@@ -11,10 +11,11 @@ import torch
 from test_completion import VIEWS, error, scanned
 
 import torch_modal as tm
+from torch_modal.completion import poses
 from torch_modal.completion.confidence import compare, confidence_of
 from torch_modal.completion.frames import CompletionProblem
 from torch_modal.completion.pairs import ObservedPoints, SampledSurface
-from torch_modal.completion.poses import FramePoses, ModalFit
+from torch_modal.completion.poses import FramePoses, ModalFit, times_between
 from torch_modal.progress import ProgressReport
 
 tube = test_completion.tube
@@ -201,16 +202,17 @@ def test_noise_is_estimated(tube, kind, noise):
 
 
 # ----------------------------------------------------------------------------------------------------------- confidence
-def test_what_neighbours_in_time_saw_of_a_still_body_is_known(tube):
+@pytest.mark.parametrize("seen_at", [(0, 2), (0,), (2,)], ids=["around", "before", "after"])
+def test_what_neighbours_in_time_saw_of_a_still_body_is_known(tube, seen_at):
     x, faces, diagonal = tube
     sides = [
-        scanned(x[2], faces, t, side * VIEWS[1], n=1500, noise=1e-4 * diagonal) for t, side in enumerate((1, -1, 1))
+        scanned(x[2], faces, t, (1 if t in seen_at else -1) * VIEWS[1], n=1500, noise=1e-4 * diagonal) for t in range(3)
     ]
     problem = CompletionProblem(x[2:3].numpy(), faces, np.zeros(0), sides)
     still = problem.whole.expand(3, -1, -1)
     _, _, seen, *_ = compare(problem, problem.frames, still)
     confidence = confidence_of(problem, problem.frames, still, seen)
-    by_others = (seen[1] < 0.2) & (seen[0] > 0.8)
+    by_others = (seen[1] < 0.2) & (seen[seen_at[0]] > 0.8)
     assert int(by_others.sum()) > 50
     assert float(confidence[1, by_others].min()) > 0.6
     assert float(confidence[1, by_others].max()) < float(confidence[1, seen[1] > 0.9].max())
@@ -224,6 +226,17 @@ def test_reversed_time_gives_the_motion_reversed(tube):
     one = tm.complete(x[[0, 4]], faces, seen, times=TIMES).shapes
     other = tm.complete(x[[4, 0]], faces, back, times=TIMES).shapes
     assert error(other.flip(0), one, diagonal) < 1e-2
+
+
+def test_estimated_times_keep_their_order(monkeypatch):
+    """Also where a shape lies further along the path than the next one."""
+    monkeypatch.setattr(poses, "TIME_ROUNDS", 1)
+    x, faces, _ = test_completion.bending_tube(8, 6)
+    seen = [tm.Observation(t, x[1], vertices=torch.arange(len(x[1]))) for t in (0.99, 1.01)]
+    problem = CompletionProblem(x[::2].numpy(), faces, np.array([0.0, 2.0, 4.0]), seen)
+    path = tm.Path(problem.whole, faces, times=[0.0, 2.0, 4.0])
+    first, second = times_between(problem, list(path(problem.whole, torch.tensor([1.1, 0.9]))))
+    assert 0 < first < second < 2
 
 
 @pytest.mark.parametrize("sums", [0.9, 1.1])

@@ -445,11 +445,16 @@ def test_nothing_changes_where_nothing_touches(bars: Shapes) -> None:
     torch.testing.assert_close(found, plain, rtol=0, atol=1e-12)
 
 
-def test_crossings_of_keyframes_are_said_and_stay(hand: Shapes) -> None:
-    """The tip of the little finger goes into its neighbour, in the open hand."""
+def with_crossed_fingers(hand: Shapes) -> Tensor:
+    """The tip of the little finger goes into its neighbour, in the open hand. *Shape:* ``(2, V, 3)``."""
     crossed = hand.keyframes.clone()
     reach = (crossed[0] - crossed[0, crossed[0, :, 0].argmin()]).norm(dim=-1)
     crossed[0, :, 0] += 0.22 * torch.exp(-((reach / 0.12) ** 2))
+    return crossed
+
+
+def test_crossings_of_keyframes_are_said_and_stay(hand: Shapes) -> None:
+    crossed = with_crossed_fingers(hand)
     both = Shapes(crossed, hand.faces, hand.bases)
     pairs = int(tm.self_contacts(crossed[0], hand.faces).number)
     assert pairs > 10
@@ -460,6 +465,27 @@ def test_crossings_of_keyframes_are_said_and_stay(hand: Shapes) -> None:
     assert int(far(frames, both).sum()) <= int(far(plain, both).sum())
     assert peak_acceleration(frames) < 1.3 * peak_acceleration(plain)
     assert torch.equal(frames[[0, -1]], crossed)
+
+
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)], ids=["first", "last"])
+def test_what_crosses_in_either_keyframe_is_not_counted_beside_it(hand: Shapes, order: tuple[int, int]) -> None:
+    both = Shapes(with_crossed_fingers(hand), hand.faces, hand.bases).pick(*order)
+    path = tm.Path(both.bases, both.faces, contact=True)
+    with torch.no_grad():
+        shapes, solution, *_ = path.solve(both.keyframes, abs(order[0] - torch.tensor([0.02, 0.1], dtype=DOUBLE)))
+    assert bool((tm.self_contacts(shapes, both.faces).number > 10).all())
+    assert torch.equal(solution.n_crossing, far(shapes, both)) and int(solution.n_crossing[0]) == 0
+
+
+def test_in_betweens_that_still_cross_are_counted(hand: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Shapes, not pairs of triangles."""
+    monkeypatch.setattr(contact_layer, "separate", lambda x, relax, search, *others: (x, search.count(x)))
+    with pytest.warns(tm.MeshWarning) as told:
+        frames = tm.subdivide(hand.keyframes, hand.faces, 3, contact=True, bases=hand.bases, progress=False)
+    crossing = far(frames, hand)
+    assert 0 < int((crossing > 0).sum()) < int(crossing.sum())
+    message = f"in {int((crossing > 0).sum())} of 7 in-betweens, parts still go through each other"
+    assert any(message in str(one.message) for one in told)
 
 
 def test_space_draws_from_tables_without_crossings(hand: Shapes) -> None:

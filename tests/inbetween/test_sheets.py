@@ -17,7 +17,7 @@ from torch_modal.elastic.minimise import Status
 from torch_modal.elastic.term import Mesh
 from torch_modal.elastic.volume import encloses
 from torch_modal.geometry.connectivity import Connectivity
-from torch_modal.inbetween.coarse import coarsen_until_resolved
+from torch_modal.inbetween.coarse import ENOUGH_FACES, coarsen_until_resolved
 from torch_modal.modes.coarsening import coarsen, collapse
 
 BACKENDS = ["torch", "warp"]
@@ -137,9 +137,13 @@ def _sphere() -> tuple[Tensor, np.ndarray]:
 
 
 def test_the_coarse_mesh_is_that_of_the_curved_key_frame() -> None:
-    """Edge collapses of a flat sheet are arbitrary, and leave no more edges where it is going to bend."""
+    """Edge collapses of a flat sheet are arbitrary, and leave no more edges where it is going to bend.
+
+    It does not show how many are needed there: all that a coarse mesh may have are kept.
+    """
     shapes, whole = torch.stack([fold(0), fold(1)]) * 20, Mesh(Connectivity(strip()[1]))
     found = coarsen_until_resolved(shapes, whole, 100, ())
+    assert len(found.faces) >= min(ENOUGH_FACES, len(strip()[1]))
     curved = collapse(shapes[1].numpy(), strip()[1], len(found.faces))
     np.testing.assert_array_equal(found.clusters, curved.clusters)
     both_flat = coarsen_until_resolved(shapes[:1].repeat(2, 1, 1), whole, 100, ())

@@ -1,6 +1,7 @@
 """Weighted in-betweens of several key-frames: invariances, gradients, what goes in and comes out."""
 
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -19,6 +20,7 @@ from torch_modal.geometry.rigid import best_fit
 from torch_modal.geometry.rotations import about, arc, conjugate, mean, product
 from torch_modal.geometry.triangle_frames import sides
 from torch_modal.geometry.vectors import cross
+from torch_modal.inbetween.results import ConvergenceError
 from torch_modal.layers.blend import Blend
 from torch_modal.layers.in_between import InBetween
 
@@ -151,6 +153,11 @@ class TestInvariances:
         assert int(result.solution.status) == Status.CONVERGED
         assert apart(result.shapes, poses[0]) < 0.5
 
+    def test_a_weight_of_one_beside_others_is_not_all_the_weight(self, layer: Blend, poses: Tensor) -> None:
+        near, on, beyond = (layer(poses, pulls(1 - d, 0.1, d - 0.1)) for d in (1e-4, 0.0, -1e-4))
+        assert apart(near + beyond, 2 * on) < 1e-4  # no jump to the key-frame
+        assert apart(on, poses[0]) > 1e-2
+
 
 class TestGradients:
     def test_at_a_key_frame_there_is_one(self, layer: Blend, poses: Tensor) -> None:
@@ -248,6 +255,7 @@ class TestErrors:
         [
             (pulls(0.5, 0.2, 0.2), "add up to 1"),
             (pulls(0.9, 0.4, -0.3), "below zero to -0.25"),
+            (pulls(1.4, -0.2, -0.2), "below zero to -0.25"),
             (pulls(0.5, torch.nan, 0.5), "add up to 1"),
             (pulls(0.5, 0.5), r"keyframes must be .* \(\.\.\., 2, 164, 3\)"),
             (torch.tensor([1, 0, 0]), "floating-point"),
@@ -279,6 +287,15 @@ class TestErrors:
         ):
             with pytest.raises(ValueError, match="add up to 1"):
                 call()
+
+    def test_unconverged_samples_are_reported(self, bars: Shapes, poses: Tensor) -> None:
+        layer = Blend(bars.bases, bars.faces, **modal(coarse_faces=200, max_steps=0))
+        weights = torch.stack([pulls(0.5, 0.2, 0.3), pulls(0.2, 0.3, 0.5)])
+        with pytest.warns(tm.ConvergenceWarning, match="2 of 2 in-betweens did not converge in 0 steps"):
+            layer(poses, weights)
+        layer.solver = replace(layer.solver, unconverged="raise")
+        with pytest.raises(ConvergenceError, match="2 of 2"):
+            layer(poses.clone().requires_grad_(), weights)
 
     def test_settings_of_pairs(self, bars: Shapes) -> None:
         for changes in ({"space": "paired"}, {"contact": True}):

@@ -20,6 +20,7 @@ import torch_modal as tm
 from torch_modal.elastic import implicit
 from torch_modal.elastic.minimise import Status
 from torch_modal.elastic.shell import ShellEnergy
+from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.inbetween.joint import JointSpace
 from torch_modal.inbetween.results import ConvergenceError, ConvergenceWarning
 from torch_modal.inbetween.settings import Solver
@@ -370,6 +371,29 @@ def test_a_state_that_is_refused_changes_nothing(kind: Any, wrong: str, bars: Sh
         torch.nn.Sequential(layer).load_state_dict({f"0.{name}": value for name, value in state.items()})
     for name, value in layer.state_dict().items():
         assert torch.equal(value, before[name])
+
+
+def test_a_loaded_state_does_not_reach_the_bases(bars: Shapes) -> None:
+    """The basis that a layer was made from stays as it is."""
+    own = [replace(basis, reference=basis.reference.clone(), modes=basis.modes.clone()) for basis in bars.bases[:2]]
+    layer, other = (InBetween(bases, bars.faces, "modal") for bases in (own, bars.bases[1:]))
+    layer.load_state_dict(other.state_dict())
+    assert torch.equal(layer.bases[0].modes, bars.bases[1].modes)
+    for basis, before in zip(own, bars.bases, strict=False):
+        assert torch.equal(basis.reference, before.reference) and torch.equal(basis.modes, before.modes)
+
+
+def test_stiffnesses_that_reach_a_few_edges_are_told(bars: Shapes) -> None:
+    """One that is learned, or of each edge, is enough; the modal solve minimises with them."""
+    n_edges = len(Connectivity(bars.faces.numpy()).edges)
+    stiffnesses = torch.tensor(500.0, dtype=DOUBLE, requires_grad=True), torch.full((n_edges,), 500.0, dtype=DOUBLE)
+    for alpha in stiffnesses:
+        with pytest.warns(UserWarning, match="act on the local steps alone"):
+            InBetween(bars.keyframes[:2], bars.faces, objective=tm.Objective(alpha=alpha))
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            InBetween(bars.bases[:2], bars.faces, objective=tm.Objective(space="joint", alpha=alpha))
+            InBetween(bars.keyframes[:2], bars.faces, objective=tm.Objective(alpha=alpha.detach().mean()))
 
 
 def test_other_bases_in_functional_call_are_refused(bars: Shapes) -> None:

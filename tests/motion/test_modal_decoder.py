@@ -11,6 +11,7 @@ from conftest import Shapes
 from torch import Tensor
 
 import torch_modal as tm
+from torch_modal.geometry.rotations import exp
 
 DOUBLE = torch.float64
 TIMES = torch.tensor([0.0, 1.0, 3.0], dtype=DOUBLE)
@@ -32,6 +33,19 @@ def test_loose_pieces_come_along_with_a_loaded_state(small_bars: Shapes) -> None
     values(decoder)
     decoder.load_state_dict(other.state_dict())
     torch.testing.assert_close(values(decoder), values(other), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("unit", [1.0, 1000.0])
+def test_motions_turn_about_the_centre_and_move_by_diagonals(unit: float, small_bars: Shapes) -> None:
+    """After all else, in any units; the diagonal is the reference's."""
+    x, basis = unit * small_bars.keyframes, small_bars.bases[1]
+    decoder = tm.ModalDecoder(x, small_bars.faces, TIMES, x[1], basis.modes)
+    t, diagonal = torch.tensor([0.3, 2.2], dtype=DOUBLE), (x[1].amax(0) - x[1].amin(0)).norm()
+    turn, move = torch.tensor([0.3, -0.8, 0.5], dtype=DOUBLE), torch.tensor([0.1, -0.2, 0.4], dtype=DOUBLE)
+    still, found = (decoder(AMPLITUDES, t, motions) for motions in (None, torch.cat([turn, move])))
+    centre = still.mean(1, keepdim=True)
+    expected = (still - centre) @ exp(turn).mT + centre + diagonal * move
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-12 * float(diagonal))
 
 
 def exported(layer: tm.ModalDecoder, given: tuple[Tensor, ...]) -> torch.export.ExportedProgram:

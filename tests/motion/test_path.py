@@ -499,10 +499,13 @@ def test_times_in_float32_reach_the_key_frames(motion: Shapes) -> None:
 
 
 def test_an_inserted_key_frame_borrows_the_modes_around_it(motion: Shapes) -> None:
-    x, path = motion.keyframes, Path(motion.bases, motion.faces, smooth=False)
-    pinned = path(x, 1.3) + 0.05
-    found = path.insert(1.3)(torch.cat([x[:2], pinned[None], x[2:]]), times(1.15, 1.65))
-    borrowed = dataclasses.replace(motion.bases[1], reference=path(x, 1.3))
-    for shape, ends, other in zip(found, ((x[1], pinned), (pinned, x[2])), (1, 2), strict=True):
-        bases = [motion.bases[1], borrowed] if other == 1 else [borrowed, motion.bases[2]]
-        torch.testing.assert_close(shape, tm.InBetween(bases, motion.faces)(*ends, 0.5), rtol=0, atol=1e-9)
+    """Those of the nearer one."""
+    x, path = motion.keyframes, Path(motion.bases, motion.faces, smooth=False, preset="modal")
+    for t, nearer in ((1.3, 1), (1.7, 2)):
+        pinned = path(x, t) + 0.05
+        found = path.insert(t)(torch.cat([x[:2], pinned[None], x[2:]]), times(0.5 + 0.5 * t, 0.5 * t + 1))
+        borrowed = dataclasses.replace(motion.bases[nearer], reference=path(x, t))
+        for shape, ends, other in zip(found, ((x[1], pinned), (pinned, x[2])), (1, 2), strict=True):
+            bases = [motion.bases[1], borrowed] if other == 1 else [borrowed, motion.bases[2]]
+            expected = tm.InBetween(bases, motion.faces, "modal")(*ends, 0.5)
+            torch.testing.assert_close(shape, expected, rtol=0, atol=1e-9)

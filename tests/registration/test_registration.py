@@ -2,6 +2,7 @@
 
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -120,7 +121,7 @@ def test_a_hole_is_not_covered_and_what_is_left_is_as_good(
 
 
 def test_report_measures_what_it_says(pair: tuple[Mesh, Mesh, np.ndarray], found: tm.Registration) -> None:
-    """The places on the target are exact, and the report has their largest distance."""
+    """The places on the target are exact, and the report has their largest distance, and the mean by area."""
     there = trimesh.Trimesh(*pair[1], process=False)
     below = (found.barycentric.numpy()[..., None] * pair[1][0][found.target_corners.numpy()]).sum(1)
     exact = np.linalg.norm(found.positions.numpy() - below, axis=1)
@@ -129,6 +130,9 @@ def test_report_measures_what_it_says(pair: tuple[Mesh, Mesh, np.ndarray], found
     size = np.linalg.norm(np.ptp(pair[1][0], axis=0))
     assert (exact <= sampled + 1e-9).all() and (sampled < exact + 0.01 * size).all()
     assert found.to_target.max == pytest.approx(100 * exact.max() / size)
+    areas = MeshSurface(found.positions.numpy(), pair[0][1]).vertex_areas
+    assert found.to_target.mean == pytest.approx(100 * np.average(exact, weights=areas) / size)
+    assert found.to_target.mean != pytest.approx(100 * exact.mean() / size, rel=1e-3)
 
 
 def test_dtype_and_units_follow_the_inputs(pair: tuple[Mesh, Mesh, np.ndarray]) -> None:
@@ -390,6 +394,33 @@ def test_key_frames_of_any_connectivity(files: list[Path], found: tm.Registratio
         tm.load_keyframes(files)
     with pytest.raises(tm.MeshError, match="register=True"):
         tm.load_keyframes(files, landmarks=np.zeros((1, 3), dtype=int))
+
+
+def test_each_mesh_is_registered_from_the_one_before(
+    pair: tuple[Mesh, Mesh, np.ndarray],
+    files: list[Path],
+    found: tm.Registration,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """With the landmarks of these two meshes."""
+    points, faces, _ = shuffled(pair[1][0] + 1, pair[1][1], seed=1)
+    paths, asked = [*files[:2], save_mesh(points, faces, tmp_path / "d.obj")], []
+
+    def recorded(template: np.ndarray, faces: np.ndarray, target: np.ndarray, *_: np.ndarray, **options: Any) -> Any:
+        asked.append((template, target, options["landmarks"]))
+        return found
+
+    monkeypatch.setattr(register_module, "register", recorded)
+    marks = np.array([[0, 7, 3], [50, 9, 200], [4, 5, 6]])
+    tm.load_keyframes(paths, register=True, landmarks=marks, progress=False)
+    meshes = [tm.load_keyframes([path]).keyframes[0].numpy() for path in paths]
+    assert len(asked) == 2
+    for k, (template, target, landmarks) in enumerate(asked):
+        np.testing.assert_array_equal(template, found.positions if k else meshes[0])
+        np.testing.assert_array_equal(target, meshes[k + 1])
+        places = [meshes[i][marks[:, i]] for i in (k, k + 1)]
+        np.testing.assert_array_equal(landmarks, np.stack(places, axis=1))
 
 
 def test_doubtful_key_frames_are_refused(files: list[Path], tmp_path: Path) -> None:
