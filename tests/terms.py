@@ -1,8 +1,11 @@
 """Energy terms of a user's own."""
 
+from __future__ import annotations
+
 import torch
 from torch import Tensor
 
+from torch_modal.elastic.bind import Scalar, Vector, Vectors, dot, rows, sqrt
 from torch_modal.elastic.term import Mesh, Term
 
 
@@ -69,26 +72,28 @@ class Pull(Spring):
         return torch.stack([torch.full_like(vertices, mesh.first_anchor), vertices], 1)
 
 
+def squared(e: Vector) -> Scalar:
+    """Formulas may call others."""
+    return dot(e, e)
+
+
+def fibre_length(x: Vectors) -> Scalar:
+    return sqrt(squared(x[0]))
+
+
+def linearised_fibre(x: Vectors) -> tuple[Scalar, Vectors]:
+    size = sqrt(squared(x[0]))
+    return size, rows(x[0] / size)
+
+
 def fibres() -> type[Term]:
     """Lengths of edges along an axis, also for kernels."""
-    import warp as wp
 
-    edge = wp.types.matrix(shape=(1, 3), dtype=wp.float64)
+    class Fibres(Term):
+        formula, linearised = staticmethod(fibre_length), staticmethod(linearised_fibre)
 
-    @wp.func
-    def squared(edge_vectors: edge):  # type: ignore[no-untyped-def, valid-type]
-        return wp.dot(edge_vectors[0], edge_vectors[0])  # type: ignore[index]
-
-    @wp.func
-    def length(edge_vectors: edge):  # type: ignore[no-untyped-def, valid-type]
-        return wp.sqrt(squared(edge_vectors))  # type: ignore[no-untyped-call]
-
-    @wp.func
-    def direction(edge_vectors: edge):  # type: ignore[no-untyped-def, valid-type]
-        return wp.matrix_from_rows(wp.normalize(edge_vectors[0]))  # type: ignore[index]
-
-    class Fibres(Edges):
-        kernel_measure, kernel_gradient = length, direction
+        def elements(self, mesh: Mesh) -> Tensor:
+            return mesh.edges
 
         def weights(self, edge_vectors: Tensor, measures: Tensor) -> Tensor:
             return edge_vectors[0, 1] ** 4 / measures**5

@@ -390,7 +390,7 @@ class TestLayers:
         """The same numbers as torch's, with a gradient and without; its kernels compute them."""
         kind = fibres()
         if not exact:
-            kind.kernel_gradient = None
+            kind.linearised = None
         x, found = bars.keyframes[:2], []
         for backend_name in ("warp", "torch"):
             solver = tm.Solver(backend=backend_name, tolerance=1e-12)
@@ -412,7 +412,7 @@ class TestLayers:
     def test_gradients_in_the_stiffness_alone(self, bars: Shapes, name: str) -> None:
         """With constant key-frames, nothing but the stiffness has a gradient."""
         kind, found = Area if name == "beside the kernels" else fibres(), []
-        kind.kernel_gradient = None
+        kind.linearised = None
         for backend_name in ("warp", "torch"):
             stiffness = torch.nn.Parameter(torch.tensor([1e3], dtype=DOUBLE))
             objective, solver = tm.Objective(terms=(kind(stiffness),)), tm.Solver(backend=backend_name)

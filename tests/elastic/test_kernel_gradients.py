@@ -36,7 +36,7 @@ def test_kernels_that_differentiate_can_be_differentiated() -> None:
                     off = alias or "enable_backward=False" in map(ast.unparse, _options(one))
                     found[path.name, getattr(scope, "name", ""), one.name] = off
     names = {(file, name) for file, _, name in found}
-    assert ("term.py", "_functions_of_measure") in names
+    assert ("measures.py", "functions_of") in names
     assert [name for name, off in found.items() if off] == []
 
 
@@ -50,8 +50,8 @@ def test_compiling_them_says_nothing(tmp_path: Path) -> None:
     code = (
         "import sys, torch; sys.path.append('tests'); from terms import fibres; "
         "from torch_modal.elastic.kernels import launch; "
-        "kind = fibres(); kind.kernel_gradient = None; "
-        "kernel = launch.of_elements('convex', kind(1.0).kernel_functions(1), None).linearise; "
+        "kind = fibres(); kind.linearised = None; "
+        "kernel = launch.of_elements('convex', kind(1.0).kernel_formulas(1), None).linearise; "
         "launch._load(kernel.module, torch.device('cpu'))"
     )
     given = os.environ | {"WARP_CACHE_PATH": str(tmp_path)}

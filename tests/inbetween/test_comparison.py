@@ -10,8 +10,10 @@ from torch import Tensor
 from torch.autograd import gradcheck
 
 import torch_modal as tm
-from torch_modal.elastic.distortion import BEND, LARGEST_WEIGHT, Distortion
+from torch_modal.elastic.bend import Bend
+from torch_modal.elastic.distortion import Distortion
 from torch_modal.elastic.energy import RestShapes
+from torch_modal.elastic.formulas import LARGEST_WEIGHT
 from torch_modal.elastic.implicit import ConvergenceWarning
 from torch_modal.elastic.minimise import Status
 from torch_modal.elastic.term import Mesh
@@ -163,5 +165,5 @@ class TestDistortion:
         e, b = torch.tensor([1.0, 0, 0]), torch.tensor([0.5, -1e-3, 0])
         edge_vectors = torch.stack([torch.stack([e, torch.tensor([0.5, h, 0]), b]) for h in (0.866, 1e-3, 0.0)], -1)
         hinges = edge_vectors.double()
-        weights = BEND.weights(hinges, BEND.measure(hinges)).clamp_max(LARGEST_WEIGHT)
+        weights = Bend().weights(hinges, Bend().measures(hinges)).clamp_max(LARGEST_WEIGHT)
         assert weights[0] == pytest.approx(2 / 0.867, rel=1e-3) and weights[1:].tolist() == [8.0, 0.0]

@@ -3,10 +3,11 @@
 import torch
 from torch import Tensor
 
+from torch_modal.elastic import formulas
 from torch_modal.elastic.bend import SquaredBend
 from torch_modal.geometry.canonical import size
 from torch_modal.geometry.connectivity import Connectivity
-from torch_modal.geometry.vectors import cross, norm, pick
+from torch_modal.geometry.vectors import pick
 from torch_modal.modes.basis import ModalBasis
 from torch_modal.modes.sheet import THICKNESS
 
@@ -55,7 +56,7 @@ def _bending_strains(modes: Tensor, x: Tensor, mesh: Connectivity) -> tuple[Tens
     angles = (SquaredBend().linearise(rest)[1][:, :, None] * moves).sum((0, 1))
     e, a, b = rest
     tiny = torch.finfo(x.dtype).tiny
-    areas = 0.5 * (norm(cross(e, a)) + norm(cross(e, b)))
-    apart = 2 * areas / (3 * norm(e)).clamp_min(tiny)  # of the centroids
+    areas = formulas.triangle_area(e, a) + formulas.triangle_area(e, b)
+    apart = 2 * areas / (3 * formulas.length(e)).clamp_min(tiny)  # of the centroids
     thickness = THICKNESS * size(x.numpy(), mesh.faces)
     return 0.5 * thickness * angles / apart.clamp_min(tiny), areas

@@ -13,12 +13,13 @@ import torch
 from torch import Tensor
 
 from torch_modal.arrays import FloatArray, IntArray
+from torch_modal.elastic import bend, stretch, volume
 from torch_modal.elastic.crossings import WarpPairs
 from torch_modal.elastic.distortion import Distortion, KernelDistortion
 from torch_modal.elastic.energy import Energy
 from torch_modal.elastic.kernel_energy import volumes_by_kernel
 from torch_modal.elastic.kernel_steps import KernelFineEnergy
-from torch_modal.elastic.kernels.launch import kernels, launch, load_kernels
+from torch_modal.elastic.kernels.launch import kernels, launch, load_kernels, of_elements
 from torch_modal.elastic.procrustes import mean_pose as mean_pose_by_kernel
 from torch_modal.elastic.rotations import WarpRotations
 from torch_modal.elastic.steps import FineEnergy
@@ -59,6 +60,13 @@ class TorchBackend:
         return None
 
 
+def _make_kernels() -> None:
+    """Kernels of Eq. 5 without gradients."""
+    for formulas in (stretch.KERNEL_FORMULAS, bend.KERNEL_FORMULAS, volume.KERNEL_FORMULAS):
+        of_elements("forward", formulas)
+    of_elements("convex", bend.KERNEL_FORMULAS, stretch.KERNEL_FORMULAS)
+
+
 class WarpBackend(TorchBackend):
     """Parts that do in one pass over the elements what torch does in dozens, in float64.
 
@@ -66,7 +74,6 @@ class WarpBackend(TorchBackend):
         MissingPackageError: Warp is not installed.
     """
 
-    load = staticmethod(load_kernels)
     mean_pose, volumes_of = staticmethod(mean_pose_by_kernel), staticmethod(volumes_by_kernel)
     rotations = staticmethod(WarpRotations)
     fine_energy = staticmethod(KernelFineEnergy)
@@ -75,6 +82,10 @@ class WarpBackend(TorchBackend):
     def __init__(self) -> None:
         if importlib.util.find_spec("warp") is None:
             raise MissingPackageError("backend='warp' needs warp-lang, which is not installed: pip install warp-lang")
+
+    def load(self) -> None:
+        """Kernels of in-betweens without gradients."""
+        load_kernels(("distortion", "procrustes", "rotations", "steps", "volume"), _make_kernels)
 
     @staticmethod
     @cache

@@ -12,11 +12,10 @@ import torch
 from torch import Tensor, nn
 
 from torch_modal.autograd import is_eager
-from torch_modal.elastic import volume
 from torch_modal.elastic.bend import NEEDLE, NEEDLE_OF_STEPS
 from torch_modal.elastic.energy import AssembledTerm, Energy, Reference, RestShapes
 from torch_modal.elastic.kernels.function import Operation
-from torch_modal.elastic.kernels.launch import launch, make_once, of_elements
+from torch_modal.elastic.kernels.launch import kernels, launch, of_elements
 from torch_modal.elastic.term import Mesh
 from torch_modal.elastic.volume import Volume
 from torch_modal.geometry.rigid import volumes_of
@@ -70,19 +69,19 @@ class KernelTerm(nn.Module):
         self.n_elements = len(elements)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Without functions and kernels, which are no data."""
-        return {name: value for name, value in self.__dict__.items() if name != "functions"} | {"bound": {}}
+        """Without formulas and kernels, which are no data."""
+        return {name: value for name, value in self.__dict__.items() if name != "formulas"} | {"bound": {}}
 
     @cached_property
-    def functions(self) -> Any:
-        """The functions that kernels are made from."""
-        return self.term.kernel_functions(self.n)
+    def formulas(self) -> Any:
+        """The formulas that kernels are made from."""
+        return self.term.kernel_formulas(self.n)
 
     def launch(self, name: str, dim: int, *arguments: Any, adjoints: Sequence[Tensor | None] = ()) -> None:
         """Run a kernel over the elements of so many samples, or its adjoint."""
         key = name, bool(adjoints)
         if key not in self.bound:
-            self.bound[key] = getattr(of_elements("backward" if adjoints else "forward", self.functions), name)
+            self.bound[key] = getattr(of_elements("backward" if adjoints else "forward", self.formulas), name)
         launch(self.bound[key], (dim, self.n_elements), [self.elements, *arguments], adjoints and [None, *adjoints])
 
     def shapes_to_merge(self, shapes: Tensor) -> tuple[Tensor, Tensor | None]:
@@ -90,7 +89,7 @@ class KernelTerm(nn.Module):
 
         *Shape:* ``(N, V, 3) -> (N, n, 3), (N,)``.
         """
-        if not self.functions.uses_mean:
+        if not self.formulas.uses_mean:
             return shapes, None
         total = shapes.new_zeros(len(shapes))
         self.launch("total", len(shapes), shapes.shape[1], shapes, total)
@@ -139,7 +138,7 @@ class KernelVolume(KernelTerm):
         extended, sizes = self.extend(x), x.new_zeros(len(x), 2, 3)
         normal = torch.zeros_like(extended) if gradient else None
         arguments = [self.faces, extended.shape[1], extended, sizes, self.n_faces if area else 0, normal]
-        launch(make_once(volume.kernels).sizes, (len(x), len(self.faces)), arguments)
+        launch(kernels("volume").sizes, (len(x), len(self.faces)), arguments)
         return sizes, None if normal is None else self.fold(normal)
 
     def shapes_to_merge(self, shapes: Tensor) -> tuple[Tensor, Tensor | None]:
@@ -154,7 +153,7 @@ class KernelVolume(KernelTerm):
         normal = None if to_normal is None else torch.empty_like(to_normal)
         values = [self.faces, extended.shape[1], extended, torch.empty_like(to_sizes), self.n_faces, normal]
         adjoints = [None, None, to_extended, to_sizes, None, to_normal]
-        launch(make_once(volume.kernels).sizes, (len(x), len(self.faces)), values, adjoints)
+        launch(kernels("volume").sizes, (len(x), len(self.faces)), values, adjoints)
         if not self.closed:
             to_x.add_(self.fold(to_extended))
 
@@ -166,7 +165,7 @@ def volumes_by_kernel(x: Tensor, faces: Tensor) -> Tensor:
     shapes = x.detach().double().flatten(0, -3).contiguous()
     sizes = shapes.new_zeros(len(shapes), 2, 3)
     arguments = [faces, shapes.shape[1], shapes, sizes, 0, None]
-    launch(make_once(volume.kernels).sizes, (len(shapes), len(faces)), arguments)
+    launch(kernels("volume").sizes, (len(shapes), len(faces)), arguments)
     return sizes[:, 1, 0].view(x.shape[:-2]).to(x)
 
 
@@ -179,7 +178,7 @@ def by_kernels(energy: Energy, mesh: Mesh) -> list[KernelTerm | None]:
             terms.append(KernelVolume(summand, mesh, energy.used))
             continue
         fits = summand.term.anchors is None and 1 <= n <= 3 and bool((summand.corners < mesh.n_vertices).all())
-        serves = fits and not energy.sampled and summand.term.kernel_functions(n) is not None
+        serves = fits and not energy.sampled and summand.term.kernel_formulas(n) is not None
         terms.append(KernelTerm(summand) if serves else None)
     return terms
 
@@ -210,7 +209,7 @@ class Pass(nn.Module):
             alone = torch.cat([edges, edges[:, :1].expand(-1, n - 2)], 1)
             elements = torch.where((own < 0)[:, None], alone, elements[own.clamp_min(0)]).contiguous()
         #: Numbers of elements of the term and the rider, and of the factors of each: gradient, and two stiffnesses.
-        self.sizes = [part and (part.n_elements, 3 * part.functions.n + 2) for part in (self.term, self.rider)]
+        self.sizes = [part and (part.n_elements, 3 * part.formulas.n + 2) for part in (self.term, self.rider)]
         self.n_elements, self.n_own = len(elements), self.term.n_elements
         self.register_buffer("elements", elements, persistent=False)
         self.register_buffer("own", None if own is None else own.int(), persistent=False)
@@ -219,8 +218,8 @@ class Pass(nn.Module):
         """Run a kernel over the elements of so many samples, or its adjoint."""
         key = name, bool(adjoints)
         if key not in self.bound:
-            functions = self.term.functions, self.rider and self.rider.functions
-            self.bound[key] = getattr(of_elements("convex_adjoint" if adjoints else "convex", *functions), name)
+            given = self.term.formulas, self.rider and self.rider.formulas
+            self.bound[key] = getattr(of_elements("convex_adjoint" if adjoints else "convex", *given), name)
         arguments = self.elements, self.own, self.n_own, *arguments
         launch(self.bound[key], (dim, self.n_elements), arguments, adjoints and [None] * 3 + [*adjoints])
 
@@ -233,10 +232,10 @@ def _passes(parts: Sequence[KernelTerm], n_vertices: int) -> list[Pass]:
     """The terms but the volume in as few passes as may be: edges ride on elements that begin with them."""
     terms = [(i, part) for i, part in enumerate(parts) if not isinstance(part, KernelVolume)]
     ends = torch.tensor([n_vertices, 1])
-    for edges in (term for term in terms if term[1].functions.even):
+    for edges in (term for term in terms if term[1].formulas.even):
         keys = edges[1].elements.long().sort(1)[0] @ ends
         order = keys.argsort()
-        for term in (term for term in terms if term[1].functions.n > 1):
+        for term in (term for term in terms if term[1].formulas.n > 1):
             keys_of_term = term[1].elements[:, :2].long().sort(1)[0] @ ends
             at = order[torch.searchsorted(keys[order], keys_of_term).clamp_max(len(keys) - 1)]
             if len(keys_of_term) and bool((keys[at] == keys_of_term).all()) and len(at.unique()) == len(at):
@@ -262,12 +261,12 @@ class KernelEnergy(nn.Module):
         self.volumes = [i for i, term in enumerate(parts) if isinstance(term, KernelVolume)]
         self.terms = [i for i in range(len(parts)) if i not in self.volumes]
         #: Numbers of the terms whose rest shapes are merged by kernels, and by torch.
-        self.weighed = [i for i, term in enumerate(parts) if term.functions.weight is not None]
+        self.weighed = [i for i, term in enumerate(parts) if term.formulas.weight is not None]
         self.unweighed = [i for i in range(len(parts)) if i not in self.weighed]
         #: The terms in passes over elements, each alone or with another that rides on it.
         self.passes: Any = nn.ModuleList(_passes(parts, energy.n_vertices))
         #: True if kernels know the adjoints of all terms.
-        self.exact = all(term.functions.exact for term in parts)
+        self.exact = all(parts[i].formulas.exact for i in self.terms)
 
     def reference(self, rests: RestShapes, start: Tensor | None = None, relative: bool = False) -> Reference:
         """Merge rest shapes into one reference (Eq. 8); arguments as :meth:`RestShapes.reference`."""
@@ -395,7 +394,7 @@ class _MergeRests(Operation):
         """Arguments of the kernel before its results, or their gradients."""
         (x, total), (shapes, weights, *stiffness) = seen, tensors
         start = stiffness[-1] if len(stiffness) > len(self.parts) else None
-        soft = None if self.parts[i].functions.fullness is None else start
+        soft = None if self.parts[i].formulas.fullness is None else start
         relative = self.relative and soft is not None
         needle = NEEDLE_OF_STEPS if relative else NEEDLE
         sizes = needle**2, int(relative), shapes.shape[1], stiffness[i].shape[1]
@@ -406,7 +405,8 @@ class _MergeRests(Operation):
         constant = shapes.new_zeros(len(shapes))
         for i, term in enumerate(self.parts):
             seen = term.shapes_to_merge(shapes.flatten(0, 1))
-            records.append(shapes.new_empty(len(shapes), term.n_elements, term.functions.potential.n_rows))
+            n_rows = 6 if term.formulas.periodic else 2  # formulas.periodic_record, square_record
+            records.append(shapes.new_empty(len(shapes), term.n_elements, n_rows))
             term.launch("merge", len(shapes), *self._arguments(i, seen, tensors), records[i], constant)
             if kept is not None:
                 kept.append(seen)

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from torch_modal.arrays import IntArray
-from torch_modal.elastic.stretch import MIN_RELATIVE_LENGTH
+from torch_modal.elastic.formulas import MIN_RELATIVE_LENGTH
 from torch_modal.elastic.term import Mesh
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.inspect import is_flat

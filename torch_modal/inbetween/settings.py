@@ -105,7 +105,7 @@ class Solver:
             the bases: no gradient goes through the choice. Two bases of one reference have none.
         backend: ``"warp"`` (kernels of NVIDIA Warp for the local rotations and the local steps), ``"torch"``, or
             ``"auto"`` (kernels where Warp is installed). Kernels, and the modal solve, compute in float64, also in a
-            layer of float32. Terms of your own without a :attr:`~torch_modal.Term.kernel_measure` are computed by
+            layer of float32. Terms of your own without a :attr:`~torch_modal.Term.formula` are computed by
             torch.
 
     Raises:

@@ -6,11 +6,12 @@ import torch
 from torch import Tensor
 
 from torch_modal.autograd import outside_inference_mode
+from torch_modal.elastic import formulas
 from torch_modal.elastic.energy import Rest
 from torch_modal.elastic.shell import ShellEnergy
 from torch_modal.geometry.canonical import CANONICAL_SIZE
 from torch_modal.geometry.connectivity import Connectivity
-from torch_modal.geometry.vectors import cross, inverse, norm, pick
+from torch_modal.geometry.vectors import inverse, pick
 from torch_modal.keyframes.arrays import as_faces
 
 BEND, VOLUME = 1e-6, 1e-4
@@ -72,7 +73,7 @@ class ShellLoss(ShellEnergy):
         rows = self._rows(x_rest)
         (length, angle, volume), (per_length, bend, _) = self.energy.rest(rows)
         first, second, third = (pick(rows, corner) for corner in self.faces.T)
-        areas = 0.5 * norm(cross(second - first, third - first))
+        areas = formulas.triangle_area(second - first, third - first)
         area = areas.sum(-1, keepdim=True)
         thirds = (areas / 3).repeat(*[1] * (areas.dim() - 1), 3)
         shares = torch.zeros_like(length).index_add(-1, self.sides, thirds) * inverse(area, area <= 0)

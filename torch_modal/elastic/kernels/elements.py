@@ -10,15 +10,18 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from torch_modal.elastic.bend import LEAST_FULLNESS
+from torch_modal.elastic import formulas
+from torch_modal.elastic.bind import for_kernels
+from torch_modal.elastic.kernels.measures import functions_of
 from torch_modal.elastic.kernels.types import block, place, real, symmetric, vec3
-from torch_modal.elastic.term import KernelFunctions
+from torch_modal.elastic.term import Formulas
 
 
 @cache
-def _common(f: KernelFunctions) -> SimpleNamespace:
+def _common(f: Formulas) -> SimpleNamespace:
     """Types and functions of elements of as many vertices."""
-    n, kind, across_of, tense = f.n, f.potential.kind, f.across, f.across is not None
+    own = functions_of(f)
+    n, kind, across_of, tense = f.n, own.potential.kind, own.across, own.across is not None
     vectors, corners = wp.types.matrix(shape=(n, 3), dtype=real), wp.types.vector(length=n + 1, dtype=wp.int32)
 
     @wp.struct
@@ -93,11 +96,11 @@ def _common(f: KernelFunctions) -> SimpleNamespace:
 
 
 @cache
-def _merging(f: KernelFunctions) -> SimpleNamespace:
+def _merging(f: Formulas) -> SimpleNamespace:
     """Functions that merge the rest shapes of an element."""
-    c, potential, fullness, weight = _common(f), f.potential, f.fullness, f.weight
+    c, own, softness_of = _common(f), functions_of(f), for_kernels(formulas.softness)
+    potential, fullness, weight, measure = own.potential, own.fullness, own.weight, own.measure
     vectors, corners, edge_vectors, sums = c.vectors, c.corners, c.edge_vectors, potential.sums
-    least = wp.constant(real(LEAST_FULLNESS))
 
     if fullness is None:
 
@@ -110,8 +113,7 @@ def _merging(f: KernelFunctions) -> SimpleNamespace:
         """bend.Bend.softening."""
         result = at_start
         if relative > 0:
-            ratio = wp.min(at_start / wp.max(usual, least), real(1.0))
-            result = ratio * ratio * (real(3.0) - real(2.0) * ratio)
+            result = softness_of(at_start, usual)
         return result
 
     @wp.func
@@ -131,7 +133,7 @@ def _merging(f: KernelFunctions) -> SimpleNamespace:
         usual = real(0.0)
         for r in range(first, last):
             e = edge_vectors(x, r * n_vertices, q)
-            m = f.measure(e)
+            m = measure(e)
             result += potential.moments(m, weights[r] * weight(e, m, mean_of(whole, r, n_elements)))
             if relative > 0:
                 usual += weights[r] * fullness(e, altitude)
@@ -140,31 +142,31 @@ def _merging(f: KernelFunctions) -> SimpleNamespace:
     return SimpleNamespace(**locals())
 
 
-def _module(f: KernelFunctions, kind: str) -> "wp.Module":
+def _module(f: Formulas, kind: str) -> "wp.Module":
     """A module of the kernels of a term, which Warp compiles as a whole."""
     return wp.get_module(f"{__name__}.{f.name}.{kind}")
 
 
-def _kernel(f: KernelFunctions, module: "wp.Module") -> Callable[[Callable[..., None]], "wp.Kernel"]:
+def _kernel(f: Formulas, module: "wp.Module") -> Callable[[Callable[..., None]], "wp.Kernel"]:
     """The decorator of kernels that are not differentiated, but for gradients of a measure by ``wp.grad``."""
     return wp.kernel(enable_backward=not f.exact, module=module)
 
 
 @cache
-def _rider(f: KernelFunctions | None) -> SimpleNamespace:
+def _rider(f: Formulas | None) -> SimpleNamespace:
     """Functions of a term of edges that rides on one of larger elements, on their first edge vectors; or of none."""
     if f is None:
         return SimpleNamespace(record=real, Factors=real)
-    c, potential = _common(f), f.potential
-    record, Factors = potential.record, c.Factors
+    c, own = _common(f), functions_of(f)
+    potential, record, Factors = own.potential, own.potential.record, c.Factors
 
     @wp.func
     def energy(e: vec3, rests: wp.array[record], at: int):
-        return potential.energy(f.measure(wp.matrix_from_rows(e)), rests[at])
+        return potential.energy(own.measure(wp.matrix_from_rows(e)), rests[at])
 
     @wp.func
     def linearise(e: vec3, rests: wp.array[record], at: int, factors: wp.array[Factors]):
-        m, g = f.linearise(wp.matrix_from_rows(e))
+        m, g = own.linearise(wp.matrix_from_rows(e))
         rest = rests[at]
         slope = potential.slope(m, rest)
         square = symmetric()
@@ -183,13 +185,14 @@ def _rider(f: KernelFunctions | None) -> SimpleNamespace:
 
 
 @cache
-def convex(f: KernelFunctions, rider: KernelFunctions | None) -> SimpleNamespace:
+def convex(f: Formulas, rider: Formulas | None) -> SimpleNamespace:
     """Value, gradient and convex Hessian of a term, and of another that rides on its elements.
 
     Where both read and write the same vertices, one pass takes two thirds of the time of two. The elements are then
     those of the rider; ``own`` has the number of the term's element, or -1 where there is none.
     """
-    c, potential, other, n, rides = _common(f), f.potential, _rider(rider), f.n, rider is not None
+    c, functions, other, n, rides = _common(f), functions_of(f), _rider(rider), f.n, rider is not None
+    potential = functions.potential
     vectors, corners, edge_vectors, add = c.vectors, c.corners, c.edge_vectors, c.add
     Factors, record = c.Factors, potential.record
     module = _module(f, f"convex.{rider.name if rider else None}")
@@ -229,7 +232,7 @@ def convex(f: KernelFunctions, rider: KernelFunctions | None) -> SimpleNamespace
                 along = real(0.0)
                 across = real(0.0)
                 if at >= 0:
-                    m, g = f.linearise(e)
+                    m, g = functions.linearise(e)
                     to = rests[place(s * n_own, at)]
                     summed += potential.energy(m, to)
                     slope = potential.slope(m, to)
@@ -250,7 +253,7 @@ def convex(f: KernelFunctions, rider: KernelFunctions | None) -> SimpleNamespace
                 if wp.static(rides):
                     summed += other.energy(e[0], others, edge)
                 if at >= 0:
-                    summed += potential.energy(f.measure(e), rests[place(s * n_own, at)])
+                    summed += potential.energy(functions.measure(e), rests[place(s * n_own, at)])
         wp.atomic_add(total, s, summed)
 
     @kernel
@@ -290,7 +293,7 @@ def convex(f: KernelFunctions, rider: KernelFunctions | None) -> SimpleNamespace
 
 
 @cache
-def convex_adjoint(f: KernelFunctions, rider: KernelFunctions | None) -> SimpleNamespace:
+def convex_adjoint(f: Formulas, rider: Formulas | None) -> SimpleNamespace:
     """Adjoints of :func:`convex`, which Warp generates."""
     module = _module(f, f"convex_adjoint.{rider.name if rider else None}")
     kernels = vars(convex(f, rider))
@@ -298,9 +301,10 @@ def convex_adjoint(f: KernelFunctions, rider: KernelFunctions | None) -> SimpleN
 
 
 @cache
-def forward(f: KernelFunctions) -> SimpleNamespace:
+def forward(f: Formulas) -> SimpleNamespace:
     """Kernels that merge the rest shapes of a term into records (Eq. 8)."""
-    c, potential, module = _common(f), f.potential, _module(f, "forward")
+    c, potential, module = _common(f), functions_of(f).potential, _module(f, "forward")
+    measure = functions_of(f).measure
     corners, edge_vectors, record = c.corners, c.edge_vectors, potential.record
     kernel, merging = _kernel(f, module), _merging(f)
     fullness, softness, merge_rests = merging.fullness, merging.softness, merging.merge
@@ -349,13 +353,13 @@ def forward(f: KernelFunctions) -> SimpleNamespace:
         s = i // threads
         moments_sum = real(0.0)
         for k in range(i - s * threads, elements.shape[0], threads):
-            moments_sum += f.measure(edge_vectors(x, s * n_vertices, elements[place(k, 0)]))
+            moments_sum += measure(edge_vectors(x, s * n_vertices, elements[place(k, 0)]))
         wp.atomic_add(out, s, moments_sum)
 
     return SimpleNamespace(merge=merge, total=total)
 
 
 @cache
-def backward(f: KernelFunctions) -> SimpleNamespace:
+def backward(f: Formulas) -> SimpleNamespace:
     """The adjoint of ``merge``."""
     return SimpleNamespace(merge=wp.kernel(forward(f).merge.func, module=_module(f, "backward")))

@@ -4,7 +4,7 @@ import importlib
 import inspect
 import os
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
 from typing import Any, Literal
@@ -12,7 +12,6 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from torch_modal.elastic import bend, stretch, volume
 from torch_modal.progress import ProgressReport
 
 PACKAGE = "torch_modal.elastic.kernels"
@@ -38,16 +37,12 @@ def of_elements(kind: Literal["convex", "convex_adjoint", "forward", "backward"]
     return make_once(getattr(kernels("elements"), kind), *arguments)
 
 
-def load_kernels() -> None:
-    """Load the kernels of in-betweens without gradients for the CPU, so that the first call does not wait for them."""
+def load_kernels(files: Iterable[str], make: Callable[[], None]) -> None:
+    """Load kernels for the CPU: of files, and those that a function makes."""
     with _LOADING:
-        elements, *_ = map(kernels, ("elements", "procrustes", "rotations", "steps"))
-        shell_functions = bend.kernel_functions(), stretch.kernel_functions()
-        for functions in (*shell_functions, volume.kernel_functions()):
-            elements.forward(functions)
-        elements.convex(*shell_functions)
-        volume.kernels()
-        importlib.import_module("torch_modal.elastic.distortion").kernels()
+        for name in files:
+            kernels(name)
+        make()
         _load(PACKAGE, torch.device("cpu"))
 
 

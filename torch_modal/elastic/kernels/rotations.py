@@ -4,7 +4,9 @@ from math import factorial
 
 import warp as wp
 
-from torch_modal.elastic.kernels.types import HALF, TINIEST, TINY, length_of, place, real, vec3, vec4
+from torch_modal.elastic import formulas
+from torch_modal.elastic.bind import for_kernels
+from torch_modal.elastic.kernels.types import HALF, TINIEST, TINY, place, real, vec3, vec4
 from torch_modal.geometry import rotations, triangle_frames
 
 packed_rotation = wp.types.matrix(shape=(4, 3), dtype=real)
@@ -12,6 +14,7 @@ packed_rotation = wp.types.matrix(shape=(4, 3), dtype=real)
 packed_trajectory = wp.types.matrix(shape=(10, 3), dtype=real)
 """The frame and the stretch of a ``Trajectory``; turn and growth of its step, of its first and of its last part."""
 
+length_of = for_kernels(formulas.length)
 FLAT = wp.constant(real(triangle_frames.FLAT))
 HEIGHT = wp.constant(real(triangle_frames.HEIGHT))
 PER_HEIGHT = wp.constant(real(1 / triangle_frames.HEIGHT))

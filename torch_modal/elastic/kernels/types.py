@@ -21,8 +21,31 @@ def place(start: int, i: int):
 
 
 @wp.func
-def length_of(e: vec3):
-    return wp.sqrt(wp.max(wp.dot(e, e), TINY))
+def vanishes(squared: real):
+    return squared <= TINY
+
+
+@wp.func
+def underflows(x: real):
+    return x <= TINIEST
+
+
+@wp.func
+def root(x: real):
+    return wp.sqrt(wp.max(x, TINY))
+
+
+@wp.func
+def inverse(x: real, zero: bool):
+    result = real(0.0)
+    if not zero:
+        result = real(1.0) / x
+    return result
+
+
+@wp.func
+def above_rounding(number: real, x: real):
+    return number
 
 
 @wp.func
