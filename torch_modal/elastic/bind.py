@@ -107,8 +107,8 @@ def for_kernels(formula: Callable[..., Any], n: int = 1) -> Any:
     """The function of Warp with the text of a formula, of ``n`` edge vectors.
 
     Raises:
-        ValueError: The formula uses a name that kernels do not have, variables of a function around it, or a number that
-            is not ``real(...)``.
+        ValueError: The formula uses a name that kernels do not have, variables of a function around it, or numbers
+            that are not ``real(...)``.
     """
     import warp as wp
 
