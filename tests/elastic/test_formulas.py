@@ -74,6 +74,14 @@ def test_second_derivative_of_an_angle() -> None:
     torch.testing.assert_close(formulas.angle_hessian_product(x, d), wanted, rtol=1e-10, atol=1e-10)
 
 
+def test_gradients_of_small_hinges_in_float32() -> None:
+    """Products of squared areas stay within the range of float32: the gradient grows as the hinge shrinks."""
+    x = vectors(3)[..., :8]
+    wanted = formulas.linearised_phase(x)[1]
+    found = formulas.linearised_phase(1e-4 * x.float())[1]
+    torch.testing.assert_close(1e-4 * found.double(), wanted, rtol=1e-3, atol=1e-3)
+
+
 def test_what_kernels_do_not_have_is_named() -> None:
     """Other modules, variables of a function around, and numbers of another type."""
     factor = 2.0

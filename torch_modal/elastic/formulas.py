@@ -105,7 +105,7 @@ def hinge_phase(x: Vectors) -> Pair:
     n1 = cross(e, x[1])
     n2 = cross(x[2], e)
     flat = is_flat(e, n1, n2)
-    per = inverse(root(dot(n1, n1) * dot(n2, n2)), flat)
+    per = inverse(sqrt(where(flat, ONE, dot(n1, n1) * dot(n2, n2))), flat)
     return pair(where(flat, ONE, per * dot(n1, n2)), -length(e) * per * dot(n1, x[2]))
 
 
@@ -118,7 +118,7 @@ def linearised_phase(x: Vectors) -> tuple[Pair, Vectors]:
     squared1 = dot(n1, n1)
     squared2 = dot(n2, n2)
     size = length(e)
-    per = inverse(root(squared1 * squared2), flat)
+    per = inverse(sqrt(where(flat, ONE, squared1 * squared2)), flat)
     to_a = (-size * per * per * squared2) * n1
     to_b = (-size * per * per * squared1) * n2
     per_size = inverse(size, flat)
@@ -144,7 +144,7 @@ def angle_hessian_product(x: Vectors, d: Vectors) -> Vectors:
     squared2 = dot(n2, n2)
     size = length(e)
     per = inverse(size * size, flat)
-    per_both = inverse(root(squared1 * squared2), flat)
+    per_both = inverse(sqrt(where(flat, ONE, squared1 * squared2)), flat)
     per1 = per_both * per_both * squared2
     per2 = per_both * per_both * squared1
     part_a = per * dot(a, e)
