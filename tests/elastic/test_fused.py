@@ -23,11 +23,11 @@ from torch_modal.elastic.backend import TorchBackend, choose
 from torch_modal.elastic.bend import Bend
 from torch_modal.elastic.distortion import Distortion, KernelDistortion
 from torch_modal.elastic.energy import Energy, Reference, RestShapes
-from torch_modal.elastic.kernel_energy import KernelEnergy, _MergeRests, by_kernels
+from torch_modal.elastic.kernel_energy import KernelEnergy, _MergeRests
 from torch_modal.elastic.kernel_steps import KernelFineEnergy, KernelProblem, _Relaxation
+from torch_modal.elastic.kernel_terms import by_kernels
 from torch_modal.elastic.kernels import launch
-from torch_modal.elastic.procrustes import mean_pose
-from torch_modal.elastic.rotations import WarpRotations
+from torch_modal.elastic.rotations import WarpRotations, mean_pose
 from torch_modal.elastic.steps import FineEnergy, SumOfEnergies, TermsTowards, descend
 from torch_modal.elastic.stretch import Stretch
 from torch_modal.elastic.term import Mesh

@@ -29,7 +29,7 @@ def test_kernels_that_differentiate_can_be_differentiated() -> None:
             those = {name for name, text in texts.items() if "wp.grad(" in text}
             while more := {name for name, text in texts.items() if any(f"{one}(" in text for one in those)} - those:
                 those |= more
-            kernel = "kernel = _kernel(" in ast.unparse(scope)  # on for measures without a gradient alone
+            kernel = "kernel_of" in ast.unparse(scope)  # on for measures without a gradient alone
             for one in functions:
                 if one.name in those:
                     alias = kernel and "kernel" in map(ast.unparse, one.decorator_list)

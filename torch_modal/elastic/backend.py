@@ -17,11 +17,11 @@ from torch_modal.elastic import bend, stretch, volume
 from torch_modal.elastic.crossings import WarpPairs
 from torch_modal.elastic.distortion import Distortion, KernelDistortion
 from torch_modal.elastic.energy import Energy
-from torch_modal.elastic.kernel_energy import volumes_by_kernel
 from torch_modal.elastic.kernel_steps import KernelFineEnergy
+from torch_modal.elastic.kernel_terms import volumes_by_kernel
 from torch_modal.elastic.kernels.launch import kernels, launch, load_kernels, of_elements
-from torch_modal.elastic.procrustes import mean_pose as mean_pose_by_kernel
 from torch_modal.elastic.rotations import WarpRotations
+from torch_modal.elastic.rotations import mean_pose as mean_pose_by_kernel
 from torch_modal.elastic.steps import FineEnergy
 from torch_modal.elastic.term import Mesh, Term
 from torch_modal.errors import MissingPackageError

@@ -10,7 +10,8 @@ from torch import Tensor
 from torch_modal import trees
 from torch_modal.autograd import is_eager
 from torch_modal.elastic.energy import Energy, Reference, RestShapes
-from torch_modal.elastic.kernel_energy import KernelEnergy, KernelPoint, by_kernels
+from torch_modal.elastic.kernel_energy import KernelEnergy, KernelPoint
+from torch_modal.elastic.kernel_terms import by_kernels
 from torch_modal.elastic.kernels.function import Operation
 from torch_modal.elastic.kernels.launch import kernels, launch
 from torch_modal.elastic.steps import (

@@ -1,4 +1,4 @@
-"""Local rotations by Warp kernels, tested against local rotations in torch."""
+"""Poses of pairs of shapes and local rotations by kernels, tested against torch's."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,6 +10,7 @@ from torch import Tensor
 from torch_modal.autograd import is_eager
 from torch_modal.elastic.kernels.function import Operation
 from torch_modal.elastic.kernels.launch import kernels, launch
+from torch_modal.geometry import procrustes
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.local_rotations import LocalRotations, Trajectory
 from torch_modal.geometry.poisson import Poisson
@@ -157,3 +158,31 @@ class _OnTrajectory(Operation):
     def _index(self, packed: Tensor, which: Tensor) -> Tensor:
         first = torch.arange(0, len(packed), max(self.n_pairs, 1), device=which.device)
         return (which.view(max(len(first), 1), -1) + first[:, None]).flatten().int()
+
+
+def mean_pose(to_reference: Tensor, among: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+    """:func:`torch_modal.geometry.procrustes.mean_pose`; of two shapes by a kernel, in float64."""
+    if weights.shape[1] != 2:
+        return procrustes.mean_pose(to_reference, among, weights)
+    rotations, pose = _MeanPose()(to_reference, among, weights)
+    return rotations.to(among), pose.to(among)
+
+
+class _MeanPose(Operation):
+    """*Shape:* ``(B, 2, 3, 3), (B, 2, 2, 3, 3), (B, 2) -> (B, 2, 3, 3), (B, 3, 3)``."""
+
+    n_results = n_differentiable = 2
+    by_torch = staticmethod(procrustes.mean_pose)
+
+    @staticmethod
+    def run(kept: list[Any] | None, *tensors: Tensor) -> tuple[Tensor, ...]:
+        rotations, pose = torch.empty_like(tensors[0]), torch.empty_like(tensors[0][:, 0])
+        launch(kernels("procrustes").mean_pose, (len(pose),), [*tensors, rotations, pose])
+        return rotations, pose
+
+    @staticmethod
+    def back(kept: list[Any], grads: Sequence[Tensor], *tensors: Tensor) -> tuple[Tensor | None, ...]:
+        gradients = [torch.zeros_like(x) for x in tensors]
+        scratch = [torch.empty_like(x) for x in grads]
+        launch(kernels("rotations_adjoint").mean_pose, (len(tensors[0]),), [*tensors, *scratch], [*gradients, *grads])
+        return tuple(gradients)

@@ -10,15 +10,13 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from torch_modal.elastic import formulas
-from torch_modal.elastic.bind import for_kernels
 from torch_modal.elastic.kernels.measures import functions_of
 from torch_modal.elastic.kernels.types import block, place, real, symmetric, vec3
 from torch_modal.elastic.term import Formulas
 
 
 @cache
-def _common(f: Formulas) -> SimpleNamespace:
+def common(f: Formulas) -> SimpleNamespace:
     """Types and functions of elements of as many vertices."""
     own = functions_of(f)
     n, kind, across_of, tense = f.n, own.potential.kind, own.across, own.across is not None
@@ -95,59 +93,12 @@ def _common(f: Formulas) -> SimpleNamespace:
     return SimpleNamespace(**locals())
 
 
-@cache
-def _merging(f: Formulas) -> SimpleNamespace:
-    """Functions that merge the rest shapes of an element."""
-    c, own, softness_of = _common(f), functions_of(f), for_kernels(formulas.softness)
-    potential, fullness, weight, measure = own.potential, own.fullness, own.weight, own.measure
-    vectors, corners, edge_vectors, sums = c.vectors, c.corners, c.edge_vectors, potential.sums
-
-    if fullness is None:
-
-        @wp.func
-        def fullness(e: vectors, altitude: real):
-            return real(1.0)
-
-    @wp.func
-    def softness(at_start: real, usual: real, relative: int):
-        """bend.Bend.softening."""
-        result = at_start
-        if relative > 0:
-            result = softness_of(at_start, usual)
-        return result
-
-    @wp.func
-    def mean_of(whole: wp.array[real], r: int, n_elements: int):
-        result = real(0.0)
-        if whole:
-            result = whole[r] / real(n_elements)
-        return result
-
-    @wp.func
-    def merge(
-        x: wp.array[vec3], n_vertices: int, q: corners, weights: wp.array[real], whole: wp.array[real],
-        n_elements: int, altitude: real, relative: int, first: int, last: int,
-    ):  # fmt: skip
-        """Sums over rest shapes, and their mean fullness if wanted."""
-        result = sums()
-        usual = real(0.0)
-        for r in range(first, last):
-            e = edge_vectors(x, r * n_vertices, q)
-            m = measure(e)
-            result += potential.moments(m, weights[r] * weight(e, m, mean_of(whole, r, n_elements)))
-            if relative > 0:
-                usual += weights[r] * fullness(e, altitude)
-        return result, usual
-
-    return SimpleNamespace(**locals())
-
-
-def _module(f: Formulas, kind: str) -> "wp.Module":
+def module_of(f: Formulas, kind: str) -> "wp.Module":
     """A module of the kernels of a term, which Warp compiles as a whole."""
     return wp.get_module(f"{__name__}.{f.name}.{kind}")
 
 
-def _kernel(f: Formulas, module: "wp.Module") -> Callable[[Callable[..., None]], "wp.Kernel"]:
+def kernel_of(f: Formulas, module: "wp.Module") -> Callable[[Callable[..., None]], "wp.Kernel"]:
     """The decorator of kernels that are not differentiated, but for gradients of a measure by ``wp.grad``."""
     return wp.kernel(enable_backward=not f.exact, module=module)
 
@@ -157,7 +108,7 @@ def _rider(f: Formulas | None) -> SimpleNamespace:
     """Functions of a term of edges that rides on one of larger elements, on their first edge vectors; or of none."""
     if f is None:
         return SimpleNamespace(record=real, Factors=real)
-    c, own = _common(f), functions_of(f)
+    c, own = common(f), functions_of(f)
     potential, record, Factors = own.potential, own.potential.record, c.Factors
 
     @wp.func
@@ -191,12 +142,19 @@ def convex(f: Formulas, rider: Formulas | None) -> SimpleNamespace:
     Where both read and write the same vertices, one pass takes two thirds of the time of two. The elements are then
     those of the rider; ``own`` has the number of the term's element, or -1 where there is none.
     """
-    c, functions, other, n, rides = _common(f), functions_of(f), _rider(rider), f.n, rider is not None
-    potential = functions.potential
-    vectors, corners, edge_vectors, add = c.vectors, c.corners, c.edge_vectors, c.add
-    Factors, record = c.Factors, potential.record
-    module = _module(f, f"convex.{rider.name if rider else None}")
-    kernel = _kernel(f, module) if rider is None or rider.exact else _kernel(rider, module)
+    return SimpleNamespace(linearise=_linearise(f, rider), product=_product(f, rider))
+
+
+def _kernel_of_pass(f: Formulas, rider: Formulas | None) -> Callable[[Callable[..., None]], "wp.Kernel"]:
+    return kernel_of(
+        f if rider is None or rider.exact else rider, module_of(f, f"convex.{rider.name if rider else None}")
+    )
+
+
+def _linearise(f: Formulas, rider: Formulas | None) -> "wp.Kernel":
+    c, functions, other, n, rides = common(f), functions_of(f), _rider(rider), f.n, rider is not None
+    vectors, corners, edge_vectors, add, Factors = c.vectors, c.corners, c.edge_vectors, c.add, c.Factors
+    kernel, potential, record = _kernel_of_pass(f, rider), functions.potential, functions.potential.record
 
     @kernel
     def linearise(
@@ -256,6 +214,13 @@ def convex(f: Formulas, rider: Formulas | None) -> SimpleNamespace:
                     summed += potential.energy(functions.measure(e), rests[place(s * n_own, at)])
         wp.atomic_add(total, s, summed)
 
+    return linearise
+
+
+def _product(f: Formulas, rider: Formulas | None) -> "wp.Kernel":
+    c, kernel, other, rides = common(f), _kernel_of_pass(f, rider), _rider(rider), rider is not None
+    vectors, corners, edge_vectors, add, Factors = c.vectors, c.corners, c.edge_vectors, c.add, c.Factors
+
     @kernel
     def product(
         elements: wp.array[corners], own: wp.array[wp.int32], n_own: int, n_vertices: int, fields: wp.array[vec3],
@@ -289,77 +254,12 @@ def convex(f: Formulas, rider: Formulas | None) -> SimpleNamespace:
         if scalars:
             wp.atomic_add(scalars, first + s, vec3(real(0.0), real(0.0), total))
 
-    return SimpleNamespace(linearise=linearise, product=product)
+    return product
 
 
 @cache
 def convex_adjoint(f: Formulas, rider: Formulas | None) -> SimpleNamespace:
     """Adjoints of :func:`convex`, which Warp generates."""
-    module = _module(f, f"convex_adjoint.{rider.name if rider else None}")
+    module = module_of(f, f"convex_adjoint.{rider.name if rider else None}")
     kernels = vars(convex(f, rider))
     return SimpleNamespace(**{name: wp.kernel(kernel.func, module=module) for name, kernel in kernels.items()})
-
-
-@cache
-def forward(f: Formulas) -> SimpleNamespace:
-    """Kernels that merge the rest shapes of a term into records (Eq. 8)."""
-    c, potential, module = _common(f), functions_of(f).potential, _module(f, "forward")
-    measure = functions_of(f).measure
-    corners, edge_vectors, record = c.corners, c.edge_vectors, potential.record
-    kernel, merging = _kernel(f, module), _merging(f)
-    fullness, softness, merge_rests = merging.fullness, merging.softness, merging.merge
-
-    @kernel
-    def merge(
-        elements: wp.array[corners], n_vertices: int, x: wp.array[vec3], weights: wp.array[real], whole: wp.array[real],
-        stiffness: wp.array[real], start: wp.array[vec3], altitude: real, relative: int, n_shapes: int,
-        n_stiffness: int, out: wp.array[record], constant: wp.array[real], threads: int,
-    ):  # fmt: skip
-        """K rest shapes of each sample as one, softened at the needles of a start, and the energy that remains."""
-        i = wp.tid()
-        s = i // threads
-        left = real(0.0)
-        for k in range(i - s * threads, elements.shape[0], threads):
-            q = elements[place(k, 0)]
-            moments, usual = merge_rests(
-                x,
-                n_vertices,
-                q,
-                weights,
-                whole,
-                elements.shape[0],
-                altitude,
-                relative,
-                s * n_shapes,
-                (s + 1) * n_shapes,
-            )
-            factor = stiffness[place(s * n_stiffness, wp.min(k, n_stiffness - 1))]
-            if start:
-                factor *= softness(fullness(edge_vectors(start, s * n_vertices, q), altitude), usual, relative)
-            to = potential.merge_rests(moments, factor)
-            left += potential.left(moments, factor, to)
-            out[place(s * elements.shape[0], k)] = to
-        wp.atomic_add(constant, s, left)
-
-    if not f.uses_mean:
-        return SimpleNamespace(merge=merge)
-
-    @kernel
-    def total(
-        elements: wp.array[corners], n_vertices: int, x: wp.array[vec3], out: wp.array[real], threads: int,
-    ):  # fmt: skip
-        """All measures together."""
-        i = wp.tid()
-        s = i // threads
-        moments_sum = real(0.0)
-        for k in range(i - s * threads, elements.shape[0], threads):
-            moments_sum += measure(edge_vectors(x, s * n_vertices, elements[place(k, 0)]))
-        wp.atomic_add(out, s, moments_sum)
-
-    return SimpleNamespace(merge=merge, total=total)
-
-
-@cache
-def backward(f: Formulas) -> SimpleNamespace:
-    """The adjoint of ``merge``."""
-    return SimpleNamespace(merge=wp.kernel(forward(f).merge.func, module=_module(f, "backward")))

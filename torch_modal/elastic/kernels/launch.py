@@ -26,15 +26,10 @@ def kernels(name: str) -> Any:
     return importlib.import_module(f"{PACKAGE}.{name}")
 
 
-def make_once(make: Callable[..., Any], *arguments: Any) -> Any:
-    """Kernels of one module that a function makes and caches, once for all threads."""
-    with _LOADING:
-        return make(*arguments)
-
-
 def of_elements(kind: Literal["convex", "convex_adjoint", "forward", "backward"], *arguments: Any) -> Any:
-    """Kernels of a module that one or two terms have."""
-    return make_once(getattr(kernels("elements"), kind), *arguments)
+    """Kernels of a module that one or two terms have: of the energy, or of the merging of rest shapes."""
+    with _LOADING:
+        return getattr(kernels("elements" if kind.startswith("convex") else "merging"), kind)(*arguments)
 
 
 def load_kernels(files: Iterable[str], make: Callable[[], None]) -> None:

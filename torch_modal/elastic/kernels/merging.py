@@ -1,0 +1,117 @@
+"""Kernels that merge the rest shapes of a term into records (Eq. 8), and their adjoints."""
+
+from functools import cache
+from types import SimpleNamespace
+
+import warp as wp
+
+from torch_modal.elastic import formulas
+from torch_modal.elastic.bind import for_kernels
+from torch_modal.elastic.kernels.elements import common, kernel_of, module_of
+from torch_modal.elastic.kernels.measures import functions_of
+from torch_modal.elastic.kernels.types import place, real, vec3
+from torch_modal.elastic.term import Formulas
+
+
+@cache
+def _merging(f: Formulas) -> SimpleNamespace:
+    """Functions that merge the rest shapes of an element."""
+    c, own, softness_of = common(f), functions_of(f), for_kernels(formulas.softness)
+    potential, fullness, weight, measure = own.potential, own.fullness, own.weight, own.measure
+    vectors, corners, edge_vectors, sums = c.vectors, c.corners, c.edge_vectors, potential.sums
+
+    if fullness is None:
+
+        @wp.func
+        def fullness(e: vectors, altitude: real):
+            return real(1.0)
+
+    @wp.func
+    def softness(at_start: real, usual: real, relative: int):
+        """bend.Bend.softening."""
+        result = at_start
+        if relative > 0:
+            result = softness_of(at_start, usual)
+        return result
+
+    @wp.func
+    def mean_of(whole: wp.array[real], r: int, n_elements: int):
+        result = real(0.0)
+        if whole:
+            result = whole[r] / real(n_elements)
+        return result
+
+    @wp.func
+    def merge(
+        x: wp.array[vec3], n_vertices: int, q: corners, weights: wp.array[real], whole: wp.array[real],
+        n_elements: int, altitude: real, relative: int, first: int, last: int,
+    ):  # fmt: skip
+        """Sums over rest shapes, and their mean fullness if wanted."""
+        result = sums()
+        usual = real(0.0)
+        for r in range(first, last):
+            e = edge_vectors(x, r * n_vertices, q)
+            m = measure(e)
+            result += potential.moments(m, weights[r] * weight(e, m, mean_of(whole, r, n_elements)))
+            if relative > 0:
+                usual += weights[r] * fullness(e, altitude)
+        return result, usual
+
+    return SimpleNamespace(**locals())
+
+
+@cache
+def forward(f: Formulas) -> SimpleNamespace:
+    """Kernels that merge the rest shapes of a term into records (Eq. 8)."""
+    c, potential, module = common(f), functions_of(f).potential, module_of(f, "forward")
+    measure = functions_of(f).measure
+    corners, edge_vectors, record = c.corners, c.edge_vectors, potential.record
+    kernel, merging = kernel_of(f, module), _merging(f)
+    fullness, softness, merge_rests = merging.fullness, merging.softness, merging.merge
+
+    @kernel
+    def merge(
+        elements: wp.array[corners], n_vertices: int, x: wp.array[vec3], weights: wp.array[real], whole: wp.array[real],
+        stiffness: wp.array[real], start: wp.array[vec3], altitude: real, relative: int, n_shapes: int,
+        n_stiffness: int, out: wp.array[record], constant: wp.array[real], threads: int,
+    ):  # fmt: skip
+        """K rest shapes of each sample as one, softened at the needles of a start, and the energy that remains."""
+        i = wp.tid()
+        s = i // threads
+        left = real(0.0)
+        for k in range(i - s * threads, elements.shape[0], threads):
+            q = elements[place(k, 0)]
+            first, last = s * n_shapes, (s + 1) * n_shapes
+            moments, usual = merge_rests(
+                x, n_vertices, q, weights, whole, elements.shape[0], altitude, relative, first, last
+            )
+            factor = stiffness[place(s * n_stiffness, wp.min(k, n_stiffness - 1))]
+            if start:
+                factor *= softness(fullness(edge_vectors(start, s * n_vertices, q), altitude), usual, relative)
+            to = potential.merge_rests(moments, factor)
+            left += potential.left(moments, factor, to)
+            out[place(s * elements.shape[0], k)] = to
+        wp.atomic_add(constant, s, left)
+
+    if not f.uses_mean:
+        return SimpleNamespace(merge=merge)
+
+    @kernel
+    def total(
+        elements: wp.array[corners], n_vertices: int, x: wp.array[vec3], out: wp.array[real], threads: int,
+    ):  # fmt: skip
+        """All measures together."""
+        i = wp.tid()
+        s = i // threads
+        moments_sum = real(0.0)
+        for k in range(i - s * threads, elements.shape[0], threads):
+            moments_sum += measure(edge_vectors(x, s * n_vertices, elements[place(k, 0)]))
+        wp.atomic_add(out, s, moments_sum)
+
+    return SimpleNamespace(merge=merge, total=total)
+
+
+@cache
+def backward(f: Formulas) -> SimpleNamespace:
+    """The adjoint of ``merge``."""
+    return SimpleNamespace(merge=wp.kernel(forward(f).merge.func, module=module_of(f, "backward")))
