@@ -22,16 +22,16 @@ import torch
 import torch_modal as tm
 
 BOUNDS = {
-    "lines of code": 16602,
-    "functions": 1506,
+    "lines of code": 16599,
+    "functions": 1503,
     "docstrings that begin with no noun": 0,
     "functions of in-between": 89,
     "files of in-between": 23,
     "functions of in-between, forward and backward": 114,
     "files of in-between, forward and backward": 24,
-    "functions of subdivide": 161,
+    "functions of subdivide": 162,
     "files of subdivide": 35,
-    "functions of making a layer": 108,
+    "functions of making a layer": 107,
     "files of making a layer": 33,
 }
 SLACK = 0.02

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from torch_modal.arrays import FloatArray, IntArray
-from torch_modal.elastic import bend, stretch, volume
+from torch_modal.elastic.bend import Bend
 from torch_modal.elastic.crossings import WarpPairs
 from torch_modal.elastic.distortion import Distortion, KernelDistortion
 from torch_modal.elastic.energy import Energy
@@ -23,7 +23,9 @@ from torch_modal.elastic.kernels.launch import kernels, launch, load_kernels, of
 from torch_modal.elastic.rotations import WarpRotations
 from torch_modal.elastic.rotations import mean_pose as mean_pose_by_kernel
 from torch_modal.elastic.steps import FineEnergy
+from torch_modal.elastic.stretch import Stretch
 from torch_modal.elastic.term import Mesh, Term
+from torch_modal.elastic.volume import Volume
 from torch_modal.errors import MissingPackageError
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.local_rotations import LocalRotations
@@ -62,9 +64,9 @@ class TorchBackend:
 
 def _make_kernels() -> None:
     """Kernels of Eq. 5 without gradients."""
-    for formulas in (stretch.KERNEL_FORMULAS, bend.KERNEL_FORMULAS, volume.KERNEL_FORMULAS):
-        of_elements("forward", formulas)
-    of_elements("convex", bend.KERNEL_FORMULAS, stretch.KERNEL_FORMULAS)
+    for term in (Stretch, Bend, Volume):
+        of_elements("forward", term.own_formulas)
+    of_elements("convex", Bend.own_formulas, Stretch.own_formulas)
 
 
 class WarpBackend(TorchBackend):

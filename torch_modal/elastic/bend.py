@@ -50,6 +50,17 @@ class Bend(PeriodicTerm, SquaredBend):
     :class:`~torch_modal.elastic.term.PeriodicTerm` has the function ``f``, which is the square of Eq. 5 below a radian.
     """
 
+    own_formulas = Formulas(
+        "bend",
+        3,
+        formulas.hinge_phase,
+        formulas.linearised_phase,
+        weight=formulas.hinge_weight,
+        fullness=formulas.hinge_fullness,
+        periodic=True,
+        gives_phase=True,
+    )
+
     def softening(self, start: Tensor, rest: Tensor, weights: Tensor | None) -> Tensor:
         """Less stiffness at needles: their gradient has no bound, and minimisers would turn their normals over.
 
@@ -59,22 +70,6 @@ class Bend(PeriodicTerm, SquaredBend):
             return fullness(start, NEEDLE)
         usual = (weights[..., None] * fullness(rest, NEEDLE_OF_STEPS)).sum(1)
         return formulas.softness(fullness(start, NEEDLE_OF_STEPS), usual)
-
-    def kernel_formulas(self, n: int) -> Formulas | None:
-        """Formulas of hinges; of a class that inherits from this one, its own."""
-        return KERNEL_FORMULAS if type(self) is Bend else super().kernel_formulas(n)
-
-
-KERNEL_FORMULAS = Formulas(
-    "bend",
-    3,
-    formulas.hinge_phase,
-    formulas.linearised_phase,
-    weight=formulas.hinge_weight,
-    fullness=formulas.hinge_fullness,
-    periodic=True,
-    gives_phase=True,
-)
 
 
 def fullness(edge_vectors: Tensor, needle: float) -> Tensor:

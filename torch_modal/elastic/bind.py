@@ -16,6 +16,7 @@ from torch import Tensor
 
 from torch_modal.geometry.vectors import cross as cross
 from torch_modal.geometry.vectors import inverse as inverse
+from torch_modal.geometry.vectors import root as root
 from torch_modal.geometry.vectors import tiny
 
 Scalar = Any
@@ -76,11 +77,6 @@ def underflows(x: Any) -> Any:
     return x <= torch.finfo(x.dtype).tiny
 
 
-def root(x: Any) -> Any:
-    """Square root, with derivative 0 where its argument vanishes: the root of a constant."""
-    return sqrt(where(vanishes(x), tiny(x), x))
-
-
 def above_rounding(number: float, x: Any) -> Any:
     """A relative number, or more where the arithmetic does not resolve it."""
     return max(number, 100 * torch.finfo(x.dtype).eps)
@@ -93,11 +89,11 @@ def _names_of_kernels() -> dict[str, Any]:
 
     from torch_modal.elastic.kernels import types as own
 
-    made = {name: wp.types.vector(length=n, dtype=own.real) for name, n in (("triple", 3), ("five", 5), ("six", 6))}
+    made = {"pair": own.vec2, "triple": own.vec3, "five": own.vec5, "six": own.vec6}
     names = {name: getattr(wp, name) for name in ("dot", "cross", "sqrt", "sin", "cos", "atan2", "where")}
     names |= {name: getattr(own, name) for name in ("real", "vanishes", "underflows", "root", "inverse")}
-    names |= {"maximum": wp.max, "minimum": wp.min, "absolute": wp.abs, "rows": wp.matrix_from_rows, "pair": wp.vec2d}
-    kinds = {"Scalar": own.real, "Flag": bool, "Vector": own.vec3, "Pair": wp.vec2d}
+    names |= {"maximum": wp.max, "minimum": wp.min, "absolute": wp.abs, "rows": wp.matrix_from_rows}
+    kinds = {"Scalar": own.real, "Flag": bool, "Vector": own.vec3}
     kinds |= {name.title(): kind for name, kind in made.items()}
     return {**names, **made, **kinds, "above_rounding": own.above_rounding}
 

@@ -64,11 +64,8 @@ class Distortion(nn.Module):
         # All shapes at once: for so few elements, the number of operations determines the time.
         rows = torch.stack([*shapes, *rests.shapes.unbind(1)]).movedim(-1, 0).contiguous()
         hinges = edge_vectors_of(rows, self.hinges.T)
-        n, lengths, angles = (
-            len(shapes),
-            formulas.length(edge_vectors_of(rows, self.edges.T)[0]),
-            formulas.hinge_angle(hinges),
-        )
+        lengths = formulas.edge_length(edge_vectors_of(rows, self.edges.T))
+        n, angles = len(shapes), formulas.hinge_angle(hinges)
         alpha, beta = self.on_elements(rests.stiffness)
         stretching = (alpha * formulas.bounded_stretch(lengths[:n, None], lengths[n:])).sum(-1)
         weights = formulas.bounded_hinge_weight(hinges[:, :, n:])

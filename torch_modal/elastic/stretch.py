@@ -10,6 +10,16 @@ class Stretch(Term):
     r"""Edge lengths: :math:`\alpha \sum_e (l_e - \bar l_e)^2 / \bar l_e`, the first term of Eq. 5."""
 
     formula, linearised = staticmethod(formulas.edge_length), staticmethod(formulas.linearised_length)
+    own_formulas = Formulas(
+        "stretch",
+        1,
+        formulas.edge_length,
+        formulas.linearised_length,
+        weight=formulas.length_weight,
+        tension=formulas.tension,
+        uses_mean=True,
+        even=True,
+    )
 
     def elements(self, mesh: Mesh) -> Tensor:
         """All edges."""
@@ -22,19 +32,3 @@ class Stretch(Term):
     def tension(self, edge_vectors: Tensor, slope: Tensor, curvature: Tensor) -> Tensor:
         """Transverse stiffness of a stretched string; smoothly near zero under compression."""
         return formulas.tension(self.measures(edge_vectors), slope, curvature)
-
-    def kernel_formulas(self, n: int) -> Formulas | None:
-        """Formulas of edges; of a class that inherits from this one, its own."""
-        return KERNEL_FORMULAS if type(self) is Stretch else super().kernel_formulas(n)
-
-
-KERNEL_FORMULAS = Formulas(
-    "stretch",
-    1,
-    formulas.edge_length,
-    formulas.linearised_length,
-    weight=formulas.length_weight,
-    tension=formulas.tension,
-    uses_mean=True,
-    even=True,
-)

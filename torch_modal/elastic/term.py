@@ -119,6 +119,8 @@ class Term(nn.Module):
     evaluates it on all elements at once, and kernels are made from it."""
     linearised: Any = None
     """Measure and its gradient in the edge vectors likewise: then kernels compute gradients of results, too."""
+    own_formulas: Formulas | None = None
+    """Formulas that kernels of exactly this class are made from, where they are not its own measure's."""
     stiffness: Any
 
     def __init__(self, stiffness: float | Tensor = 1.0) -> None:
@@ -204,6 +206,8 @@ class Term(nn.Module):
 
     def kernel_formulas(self, n: int) -> Formulas | None:
         """Formulas that kernels are made from, of ``n`` edge vectors; None for a term that torch computes."""
+        if (own := vars(type(self)).get("own_formulas")) is not None:
+            return own  # type: ignore[no-any-return]
         periodic = isinstance(self, PeriodicTerm)
         kind, fixed = (PeriodicTerm, ()) if periodic else (Term, ("difference", "tension"))
         overridden = (

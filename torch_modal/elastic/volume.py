@@ -18,6 +18,8 @@ class Volume(Term):
 
     total = True
     formula, linearised = staticmethod(formulas.tetrahedron), staticmethod(formulas.linearised_tetrahedron)
+    own_formulas = Formulas("volume", 1, formulas.volume_of_sizes, weight=formulas.weight_of_sizes)
+    """Of elements whose edge vector consists of volume and area."""
 
     def elements(self, mesh: Mesh) -> Tensor:
         """The centre and each face."""
@@ -27,14 +29,6 @@ class Volume(Term):
         """One over the square of the volume."""
         p, q, r = edge_vectors
         return formulas.volume_weight(measures, formulas.triangle_area(q - p, r - p).sum(-1, keepdim=True))
-
-    def kernel_formulas(self, n: int) -> Formulas | None:
-        """Formulas of rest shapes; of a class that inherits from this one, none."""
-        return KERNEL_FORMULAS if type(self) is Volume else None
-
-
-KERNEL_FORMULAS = Formulas("volume", 1, formulas.volume_of_sizes, weight=formulas.weight_of_sizes)
-"""Of elements whose edge vector consists of volume and area."""
 
 
 def encloses(x: Tensor, mesh: Connectivity) -> bool:

@@ -23,9 +23,12 @@ def pick(rows: Tensor, index: Tensor) -> Tensor:
 
 def norm(vectors: Tensor) -> Tensor:
     """Euclidean length, with derivative 0 at 0. *Shape:* ``(3, ...) -> (...)``."""
-    squared = (vectors * vectors).sum(0)
-    # The root of a constant has derivative 0 instead of NaN.
-    return torch.where(squared > tiny(vectors), squared, tiny(vectors)).sqrt()
+    return root((vectors * vectors).sum(0))
+
+
+def root(squared: Tensor) -> Tensor:
+    """Root of a squared length, with derivative 0 where that vanishes: the root of a constant, and not NaN."""
+    return torch.where(squared > tiny(squared), squared, tiny(squared)).sqrt()
 
 
 def tiny(like: Tensor) -> float:

@@ -5,9 +5,9 @@ import warp as wp
 from torch_modal.elastic import formulas
 from torch_modal.elastic.bind import for_kernels
 from torch_modal.elastic.kernels.measures import hinge_phase, potential
-from torch_modal.elastic.kernels.types import place, real, vec3
+from torch_modal.elastic.kernels.types import place, real, vec2, vec3
 
-vec2, periodic = wp.vec2d, potential(True)
+periodic = potential(True)
 length, bounded_stretch = for_kernels(formulas.length), for_kernels(formulas.bounded_stretch)
 bounded_weight = for_kernels(formulas.bounded_hinge_weight, 3)
 moments, merge_rests, energy, left_of = periodic.moments, periodic.merge_rests, periodic.energy, periodic.left

@@ -7,11 +7,10 @@ import warp as wp
 
 from torch_modal.elastic import formulas
 from torch_modal.elastic.bind import for_kernels
-from torch_modal.elastic.kernels.types import real, vec3
+from torch_modal.elastic.kernels.types import real, vec2, vec3, vec5, vec6
 from torch_modal.elastic.term import Formulas
 
-vec2, hinge_vectors = wp.vec2d, wp.mat33d
-vec5, vec6 = (wp.types.vector(length=n, dtype=real) for n in (5, 6))
+hinge_vectors = wp.mat33d
 phase_of, longest_side = for_kernels(formulas.phase), for_kernels(formulas.longest_side)
 triangle_fullness = for_kernels(formulas.triangle_fullness, 3)
 hinge_phase, linearised_phase = for_kernels(formulas.hinge_phase, 3), for_kernels(formulas.linearised_phase, 3)

@@ -3,8 +3,10 @@
 import warp as wp
 
 real = wp.float64
+vec2 = wp.vec2d
 vec3 = wp.vec3d
 vec4 = wp.vec4d
+vec5, vec6 = (wp.types.vector(length=n, dtype=real) for n in (5, 6))
 symmetric = wp.types.vector(length=6, dtype=real)
 """Entries ``xx, xy, xz, yy, yz, zz`` of a symmetric matrix."""
 
