@@ -1,5 +1,6 @@
 """Formulas: one text for torch and for kernels, and what they may not use."""
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -65,6 +66,42 @@ def test_kernels_compute_what_torch_computes(formula: Callable[..., Any], n: int
     wanted = formula(x)
     wanted = torch.stack(wanted, -1) if isinstance(wanted, tuple) else wanted
     torch.testing.assert_close(by_kernel(formula, x), wanted, rtol=1e-14, atol=1e-76)
+
+
+def test_values_that_are_known() -> None:
+    """Torch and kernels share the text, so that neither is a reference of the other."""
+    e, up = torch.tensor([[2.0, 0, 0], [1, 3**0.5, 0]], dtype=DOUBLE)
+    hinge = torch.stack([e, up, torch.tensor([1.0, 0, 3**0.5], dtype=DOUBLE)])
+    angle = formulas.hinge_angle(hinge)
+    assert float(angle.abs()) == pytest.approx(math.pi / 2)  # flat would be 0
+    assert float(formulas.hinge_weight(hinge, angle, angle)) == pytest.approx(2 / 3**0.5)
+    assert float(formulas.hinge_fullness(hinge, 0.75)) == pytest.approx(0.25)  # each a half at its own altitude
+    assert float(formulas.tetrahedron(torch.diag(torch.tensor([1.0, 2, 3], dtype=DOUBLE)))) == pytest.approx(1)
+    assert float(formulas.triangle_area(e, up)) == pytest.approx(3**0.5)
+    ratios = torch.tensor([0, 0.5, 1, 2], dtype=DOUBLE)
+    torch.testing.assert_close(formulas.softness(0.3 * ratios, 0.3 * torch.ones(4, dtype=DOUBLE)), ratios.clamp_max(1))
+    stretched, pressed = (formulas.tension(ratios[1], slope * ratios[2], 2 * ratios[2]) for slope in (1.0, -1.0))
+    assert float(stretched) == pytest.approx(2, rel=1e-5) and float(pressed) < 1e-5
+
+
+@pytest.mark.parametrize("name", ["square", "periodic"])
+def test_sums_over_rest_shapes(name: str) -> None:
+    """Energy and what is left are the sum over the rest shapes; slopes and curvatures are its derivatives."""
+    rest, weights = torch.tensor([0.1, -0.4, 1.9], dtype=DOUBLE), torch.tensor([0.5, 2, 0.3], dtype=DOUBLE)
+    moments, record, left, energy, slope = (
+        getattr(formulas, f"{name}_{part}") for part in ("moments", "record", "left", "energy", "slope")
+    )
+    of = formulas.phase if name == "periodic" else (lambda q: q)
+    one = formulas.periodic_square if name == "periodic" else torch.square
+    sums = [each.sum() for each in moments(of(rest), weights)]
+    to = record(sums, 3.0)
+    for value in torch.tensor([-2.5, 0.3, 1.0], dtype=DOUBLE):
+        whole = lambda q: (3 * weights * one(q - rest)).sum()  # noqa: E731
+        torch.testing.assert_close(energy(of(value), to) + left(sums, 3.0, to), whole(value))
+        torch.testing.assert_close(slope(of(value), to), torch.func.grad(whole)(value))
+        if name == "periodic":
+            curvature = torch.func.grad(torch.func.grad(whole))(value)
+            torch.testing.assert_close(formulas.periodic_curvature(of(value), to), curvature)
 
 
 def test_second_derivative_of_an_angle() -> None:
