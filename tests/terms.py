@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torch_modal.elastic.bind import Scalar, Vector, Vectors, dot, rows, sqrt
-from torch_modal.elastic.term import Mesh, Term
+from torch_modal.elastic.bind import Scalar, Vector, Vectors, atan2, dot, rows, sqrt
+from torch_modal.elastic.term import Mesh, PeriodicTerm, Term
 
 
 class Edges(Term):
@@ -86,8 +86,8 @@ def linearised_fibre(x: Vectors) -> tuple[Scalar, Vectors]:
     return size, rows(x[0] / size)
 
 
-def fibres() -> type[Term]:
-    """Lengths of edges along an axis, also for kernels."""
+def fibres(weighted: bool = True) -> type[Term]:
+    """Lengths of edges, with weights along an axis, also for kernels."""
 
     class Fibres(Term):
         formula, linearised = staticmethod(fibre_length), staticmethod(linearised_fibre)
@@ -95,7 +95,22 @@ def fibres() -> type[Term]:
         def elements(self, mesh: Mesh) -> Tensor:
             return mesh.edges
 
+    class Along(Fibres):
         def weights(self, edge_vectors: Tensor, measures: Tensor) -> Tensor:
             return edge_vectors[0, 1] ** 4 / measures**5
 
-    return Fibres
+    return Along if weighted else Fibres
+
+
+def edge_slope(x: Vectors) -> Scalar:
+    """Angle of an edge with a plane."""
+    return atan2(x[0][2], sqrt(x[0][0] * x[0][0] + x[0][1] * x[0][1]))
+
+
+class Slopes(PeriodicTerm):
+    """Angles of edges, which depend on the orientation."""
+
+    formula = staticmethod(edge_slope)
+
+    def elements(self, mesh: Mesh) -> Tensor:
+        return mesh.edges

@@ -13,7 +13,7 @@ import pytest
 import torch
 from bodies import sheet_surface
 from conftest import Shapes
-from terms import Area, Spring, fibres
+from terms import Area, Slopes, Spring, fibres
 from torch import Tensor
 from torch.func import functional_call, grad, vmap
 
@@ -30,7 +30,7 @@ from torch_modal.elastic.kernels import launch
 from torch_modal.elastic.rotations import WarpRotations, mean_pose
 from torch_modal.elastic.steps import FineEnergy, SumOfEnergies, TermsTowards, descend
 from torch_modal.elastic.stretch import Stretch
-from torch_modal.elastic.term import Mesh
+from torch_modal.elastic.term import Mesh, Term
 from torch_modal.elastic.volume import Volume
 from torch_modal.errors import MissingPackageError
 from torch_modal.geometry import procrustes
@@ -385,11 +385,11 @@ class TestLayers:
         torch.testing.assert_close(found[0][0], found[1][0], rtol=0, atol=1e-7)
         torch.testing.assert_close(found[0][1], found[1][1], rtol=1e-4, atol=1e-5)
 
-    @pytest.mark.parametrize("exact", [True, False], ids=["with its gradient", "measure alone"])
-    def test_a_term_of_ones_own_by_kernels(self, bars: Shapes, exact: bool) -> None:
+    @pytest.mark.parametrize("name", ["with its gradient", "measure alone", "without weights"])
+    def test_a_term_of_ones_own_by_kernels(self, bars: Shapes, name: str) -> None:
         """The same numbers as torch's, with a gradient and without; its kernels compute them."""
-        kind = fibres()
-        if not exact:
+        kind = fibres(weighted=name != "without weights")
+        if name == "measure alone":
             kind.linearised = None
         x, found = bars.keyframes[:2], []
         for backend_name in ("warp", "torch"):
@@ -402,7 +402,9 @@ class TestLayers:
             shape = layer(*ends, 0.3)
             found.append((still, shape.detach(), torch.autograd.grad(shape.square().sum(), ends)[0]))
             if backend_name == "warp":
-                assert layer.core.fine.further is None and len(layer.core.fine.kernels.terms) == 3
+                kernels = layer.core.fine.kernels
+                assert layer.core.fine.further is None and len(kernels.terms) == 3
+                assert (3 in kernels.weighed) == (name == "without weights")
         plain = tm.InBetween(bars.bases[:2], bars.faces)(*x, 0.3)
         assert float((found[0][0] - plain).abs().max()) > 1e-3 * float(plain.abs().max())
         for got, wanted, to in zip(*found, (1e-11, 1e-11, 1e-9), strict=True):
@@ -422,10 +424,11 @@ class TestLayers:
         assert float(found[1].abs()) > 0
         torch.testing.assert_close(*found, rtol=1e-8, atol=0)
 
+    @pytest.mark.parametrize("kind", [fibres(), fibres(weighted=False), Slopes], ids=["weights", "none", "angles"])
     @torch.no_grad()
-    def test_kernels_of_a_term_of_ones_own(self, case: Case) -> None:
+    def test_kernels_of_a_term_of_ones_own(self, case: Case, kind: type[Term]) -> None:
         """Energy, gradient and Hessian of one term are those of torch."""
-        energy = Energy(case.mesh, [fibres()(1e3)])
+        energy = Energy(case.mesh, [kind(1e3)])
         own = by_kernels_alone(energy, case.mesh)
         start, first, second, t, *_ = case.given
         rests = case.rests(first, second, t, torch.full((2, 1), 1e3, dtype=DOUBLE))

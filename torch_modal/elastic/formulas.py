@@ -57,6 +57,16 @@ LARGEST_WEIGHT = 8.0
 ZERO, ONE, TWO, HALF, THIRD, SIXTH = 0.0, 1.0, 2.0, 1 / 2, 1 / 3, 1 / 6
 
 
+def unit_weight(x: Vectors, measure: Scalar, mean: Scalar) -> Scalar:
+    """One, for terms without weights."""
+    return real(1.0)
+
+
+def unit_weight_of_angle(x: Vectors, measure: Pair, mean: Scalar) -> Scalar:
+    """:func:`unit_weight` of an angle, which kernels have as cosine and sine."""
+    return real(1.0)
+
+
 # ------------------------------------------------------------------------------------------------------------ edges
 def length(e: Vector) -> Scalar:
     """``|e|``."""

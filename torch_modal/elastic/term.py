@@ -217,7 +217,11 @@ class Term(nn.Module):
         if self.formula is None or self.total or any(overridden):
             return None
         name = f"{type(self).__module__}.{type(self).__qualname__}"
-        return Formulas(name, n, self.formula, self.linearised, periodic=periodic)
+        merged = ("weights", "at_rest", "merge_rests", "softening")
+        weight = None
+        if all(getattr(type(self), each) is getattr(kind, each) for each in merged):
+            weight = formulas.unit_weight_of_angle if periodic else formulas.unit_weight
+        return Formulas(name, n, self.formula, self.linearised, weight, periodic=periodic)
 
     def softening(self, start: Tensor, rest: Tensor, weights: Tensor | None) -> Tensor | None:
         """Factors of the stiffness where minimisations start; None for one.
