@@ -7,6 +7,7 @@ from .codec.sequence import encode as encode
 from .completion.complete import Completion as Completion
 from .completion.complete import complete as complete
 from .completion.observation import Observation as Observation
+from .completion.read import load_observations as load_observations
 from .contact.self_contacts import SelfContacts as SelfContacts
 from .contact.self_contacts import self_contacts as self_contacts
 from .data.augmentation import AugmentationSequential as AugmentationSequential

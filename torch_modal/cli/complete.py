@@ -26,7 +26,8 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
     add("--noise", type=float, metavar="X", help="standard deviation of the points (default: estimated)")
     add("--estimate-times", action="store_true", help="times between the first and the last are not exact")
     add("--contact", action="store_true", help="keep parts from passing through each other (extra contact)")
-    add("--view", nargs=3, type=float, metavar=("X", "Y", "Z"), help="direction to the camera of the clouds")
+    for name, text in (("--view", "direction to the camera, far away"), ("--camera", "place of the camera")):
+        add(name, nargs="+", type=float, metavar="X", help=f"{text}: three numbers, or three for each cloud")
     add_output(sub, "what was seen above the result, coloured by its confidence")
     add("--frames", type=int, metavar="N", help="evenly in time (default: 1 to 8 for each interval)")
     add("--fps", type=float, metavar="X", default=24.0, help="frames a second (default: %(default)g)")
@@ -50,6 +51,9 @@ def run(args: argparse.Namespace) -> None:
     whole, times = [args.mesh, *args.keyframes], args.keyframe_times
     if (times or args.keyframes) and len(times or ()) != len(whole):
         args.fail(f"--keyframe-times needs a time for each of {', '.join(map(str, whole))}; got {len(times or ())}")
+    for name, numbers in (("--view", args.view), ("--camera", args.camera)):
+        if len(numbers or ()) % 3:
+            args.fail(f"{name} takes three numbers, or three for each cloud; got {len(numbers)}")
     if args.frames is not None and not 2 <= args.frames <= MOST_FRAMES:
         args.fail(f"--frames must be 2 or more, and {MOST_FRAMES} at most; got {args.frames}")
     animation = check_files(args, [*whole, *args.observations])
@@ -57,7 +61,6 @@ def run(args: argparse.Namespace) -> None:
     import torch
 
     import torch_modal as tm
-    from torch_modal.completion.read import load_observations
     from torch_modal.data.tree import natural
 
     names = [f.as_posix() for f in args.observations if f.suffix.lower() != ".csv"]
@@ -65,8 +68,10 @@ def run(args: argparse.Namespace) -> None:
         message = f"{', '.join(names[:3])}, ... were seen at 0, 1, 2, ..., in this order; --times says other times"
         warnings.warn(message, stacklevel=2)
     keyframes, faces = tm.load_keyframes(whole)
-    view = args.view and torch.tensor(args.view, dtype=torch.float64)
-    seen = load_observations(args.observations, keyframes.shape[1], args.times, noise=args.noise, view=view)
+    given = {name: getattr(args, name) for name in ("view", "camera") if getattr(args, name)}
+    cameras = {name: torch.tensor(numbers, dtype=torch.float64).view(-1, 3) for name, numbers in given.items()}
+    cameras = {name: rows[0] if len(rows) == 1 else rows for name, rows in cameras.items()}
+    seen = tm.load_observations(args.observations, keyframes.shape[1], args.times, noise=args.noise, **cameras)
     args.report(f"{len(seen)} observations of {sum(len(one.points) for one in seen)} points")
     welded = tm.weld_seams(keyframes, faces)
     seen = [one if one.is_cloud else replace(one, vertices=welded.vertex_of[one.vertices]) for one in seen]

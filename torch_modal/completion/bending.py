@@ -52,15 +52,13 @@ class ModalBending:
         bending = torch.einsum("k,kcf->cf", pose.amplitudes, self.columns)
         return self.reconstruction(self._sides(base, bending), base[None])[0] @ pose.rotation.mT + pose.move
 
-    def linearise(self, base: Tensor, pose: ModalPose, rigid: bool = False) -> tuple[Tensor, Tensor]:
-        """The deformed shape, and its derivatives in amplitudes, a move and a turn about its centroid.
+    def linearise(self, base: Tensor, pose: ModalPose, n: int | None = None) -> tuple[Tensor, Tensor]:
+        """The deformed shape, and its derivatives in the first n amplitudes, a move and a turn about its centroid.
 
-        If rigid, in the last two alone. *Shape:* ``(V, 3), (V, 3, k + 6)``.
+        *Shape:* ``(V, 3), (V, 3, n + 6)``.
         """
         x = self.shape(base, pose)
         motions = infinitesimal_motions(x - x.mean(0)).movedim(0, -1)
-        if rigid:
-            return x, motions
         # Six copies of all faces, in each of which another coordinate of the sides is differentiated: one backward.
         copies = torch.einsum("k,kcf->cf", pose.amplitudes, self.columns).repeat(1, 6).requires_grad_()
         with torch.enable_grad():
@@ -74,7 +72,7 @@ class ModalBending:
             (one + other) * of_first - other * of_second,
             (other + last) * of_second - other * of_first,
         ]
-        moved = (torch.cat(corners, 1) @ self._by_face).view(3 * len(self.faces), -1)
+        moved = (torch.cat(corners, 1) @ self._by_face[..., :n]).view(3 * len(self.faces), -1)
         right = moved.new_zeros(len(base), moved.shape[1]).index_add(0, self.faces.flatten(), moved)
         fields = self.reconstruction.poisson(right, torch.zeros_like(right)).view(len(base), 3, -1)
         return x, torch.cat([pose.rotation @ fields, motions], -1)
@@ -83,5 +81,6 @@ class ModalBending:
     def step(pose: ModalPose, step: Tensor, centre: Tensor) -> ModalPose:
         """A pose after a step in the directions of :meth:`linearise`. *Shape:* ``(k + 6,), (3,)``."""
         turn, move = exp(step[-3:]), step[-6:-3]
-        amplitudes = pose.amplitudes + step[:-6] if len(step) > 6 else pose.amplitudes
+        amplitudes = pose.amplitudes.clone()
+        amplitudes[: len(step) - 6] += step[:-6]
         return ModalPose(amplitudes, turn @ pose.rotation, turn @ (pose.move - centre) + centre + move)

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from torch_modal.arrays import FloatArray
 from torch_modal.autograd import disable_compile, full_precision, outside_inference_mode
-from torch_modal.completion.confidence import DOUBTFUL, compare, confidence_of
+from torch_modal.completion.confidence import DOUBTFUL, compare, confidence_of, size_of
 from torch_modal.completion.frames import CompletionProblem
 from torch_modal.completion.gradient import LastSolve, ShapesOfPoints
 from torch_modal.completion.observation import Observation, check_observations, refuse_transforms
@@ -174,6 +174,13 @@ def _complete(
         warnings.warn(
             f"the shapes at {some} explain less than {100 * DOUBTFUL:.0f} % of the points seen then: those that are no "
             "key-frames are doubtful, and their confidence is low. Do the points show this body, in its units?",
+            MeshWarning,
+            stacklevel=6,
+        )
+    if (size := size_of(problem, x)) != 1:
+        warnings.warn(
+            f"the shapes are {size:.3g} times as large as the whole ones: are the points in another unit, or of "
+            "another body? Scale the points, or the whole shapes, before",
             MeshWarning,
             stacklevel=6,
         )

@@ -9,6 +9,8 @@ from torch import Tensor
 
 from torch_modal.completion.frames import CompletionProblem, Frame
 from torch_modal.completion.pairs import OUTLIERS, SampledSurface, robust_weights
+from torch_modal.elastic.volume import encloses
+from torch_modal.geometry.inspect import volume_of
 from torch_modal.geometry.rigid import best_fit
 
 SEEN_WITHIN = 2.5
@@ -19,6 +21,8 @@ HALF_AFTER = 0.02
 """Motion between neighbours in time, in parts of the diagonal, that halves the confidence of what is half seen."""
 DOUBTFUL = 0.5
 """Part of the points that a shape has to explain."""
+OF_EDGES, OF_VOLUMES = 0.035, 0.05
+"""Relative changes of edges, and of the root of volumes, beyond which the points may be of another size."""
 STRAY, STRAY_BEYOND = 0.02, 2.0
 """Part of a cloud that makes a group, and the distance from the surface, at a size of 100, beyond which that is named.
 """
@@ -61,6 +65,24 @@ def compare(
                 where = ", ".join(f"{coordinate:.4g}" for coordinate in place.tolist())
                 stray.append(f"{len(group)} of {n} points at {frame.time:g} around ({where})")
     return torch.from_numpy(misses), torch.from_numpy(trust), seen, doubtful, stray
+
+
+def size_of(problem: CompletionProblem, x: Tensor) -> float:
+    """Size of shapes over that of the whole ones, by the edges or the volume, whichever tells more; 1 within bounds.
+
+    *Shape:* ``(T, V, 3)``.
+    """
+    edges = torch.tensor(problem.mesh.edges)
+    lengths = [float((each[:, edges[:, 0]] - each[:, edges[:, 1]]).norm(dim=-1).mean()) for each in (x, problem.whole)]
+    ratios, bounds = [lengths[0] / lengths[1]], [OF_EDGES]
+    if encloses(problem.template, problem.mesh):
+        volumes = [
+            float(np.mean([abs(volume_of(one.numpy(), problem.mesh.faces)) for one in each]))
+            for each in (x, problem.whole)
+        ]
+        ratios, bounds = [*ratios, (volumes[0] / volumes[1]) ** (1 / 3)], [*bounds, OF_VOLUMES]
+    beyond = [abs(ratio - 1) / bound for ratio, bound in zip(ratios, bounds, strict=True)]
+    return ratios[int(np.argmax(beyond))] if max(beyond) > 1 else 1.0
 
 
 def confidence_of(problem: CompletionProblem, frames: Sequence[Frame], x: Tensor, seen: Tensor) -> Tensor:

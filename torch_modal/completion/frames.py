@@ -1,5 +1,6 @@
 """Observations by their times, at a size of 100 in the axes of the template."""
 
+import warnings
 from typing import NamedTuple
 
 import numpy as np
@@ -7,8 +8,11 @@ import torch
 from torch import Tensor
 
 from torch_modal.arrays import FloatArray, IntArray
+from torch_modal.completion.bending import ModalPose
+from torch_modal.completion.clouds import Camera, estimate_normals, find_view, outwardness
 from torch_modal.completion.observation import Observation
-from torch_modal.completion.pairs import NOISES, ObservedPoints
+from torch_modal.completion.pairs import NOISES, ObservedPoints, SampledSurface
+from torch_modal.errors import MeshWarning
 from torch_modal.geometry.canonical import CANONICAL_SIZE, GENERIC, to_canonical
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.keyframes.arrays import require_units
@@ -16,6 +20,8 @@ from torch_modal.registration.surface import places_between
 
 SWAY, SOFT = 2.0, 3e-5
 """Standard deviation of the amplitude of the first mode, at a size of 100; least stiffness of the modes."""
+INWARD = -0.05
+"""Mean cosine of the clouds' normals with the directions from their centroids, below which they point inward."""
 SIZE_DIGITS = 6
 """Digits of the logarithm of a size: equal ones, as of mirrored poses, differ by rounding."""
 NOISE = 0.5
@@ -37,6 +43,19 @@ class Frame(NamedTuple):
     """Mean of the points' weights: those of ``seen`` are relative to it, and add up to 1 in each, on average."""
     unused: list[ObservedPoints]
     """Points of weight 0: their distances are reported, and that is all."""
+
+    def seen_from(self, pose: ModalPose) -> "Frame":
+        """The observations in the coordinates of a body in a rigid pose."""
+        rotation, move = pose.rotation.numpy(), pose.move.numpy()
+        return self._replace(seen=[one.seen_from(rotation, move) for one in self.seen])
+
+    def without_cameras(self) -> "Frame":
+        """With the points of clouds alone, whatever a camera should see."""
+        return self._replace(seen=[one._replace(camera=None) for one in self.seen])
+
+    def score(self, surface: SampledSurface) -> float:
+        """Part of the observations that a surface leaves unexplained."""
+        return sum(one.score(surface, self.unit) for one in self.seen)
 
 
 def find_largest(shapes: FloatArray, faces: IntArray) -> int:
@@ -70,6 +89,8 @@ class CompletionProblem:
         _, self.axes, self.centre, self.scale = to_canonical(shapes[largest], faces.numpy())
         self.whole = torch.from_numpy((shapes - self.centre) @ self.axes.T * self.scale)
         self.template = self.whole[largest]
+        #: 1, or -1 where the normals of the clouds point inward, and are turned.
+        self.side = self._side(observations)
         ends = np.cumsum([len(one.points) for one in observations])
         seen = [(one.time, self._sample(one, int(end))) for one, end in zip(observations, ends, strict=True)]
         every = [self._frame(t, [one for time, one in seen if time == t]) for t in sorted({time for time, _ in seen})]
@@ -87,6 +108,20 @@ class CompletionProblem:
         return (x / self.scale) @ torch.from_numpy(self.axes) + torch.from_numpy(self.centre)
 
     @staticmethod
+    def _side(observations: list[Observation]) -> int:
+        given = []
+        for one in observations:
+            if one.normals is not None:
+                counts = slice(None) if one.weights is None else one.weights > 0
+                points, normals = (x[counts].detach().cpu().double().numpy() for x in (one.points, one.normals))
+                given.append(outwardness(points, normals))
+        if not given or np.mean(given) >= INWARD:
+            return 1
+        message = "the normals of the clouds point into the body: they are turned over; pass -normals to be sure"
+        warnings.warn(message, MeshWarning, stacklevel=7)
+        return -1
+
+    @staticmethod
     def _frame(time: float, every: list[ObservedPoints]) -> Frame:
         weight = float(np.mean([one.weights[one.weights > 0].mean() for one in every]))
         seen, unused = ([one.select(f(one.weights, 0)) for one in every] for f in (np.greater, np.equal))
@@ -99,8 +134,20 @@ class CompletionProblem:
         points, known = self.to_canonical(one.points), self.template[self.faces.unique()]
         weights = np.ones(len(points)) if one.weights is None else one.weights.cpu().double().numpy()
         counts = weights > 0
-        normals, view = (None if x is None else self.to_canonical(x, True) for x in (one.normals, one.view))
+        normals = None if one.normals is None else self.to_canonical(one.normals, True)
+        camera = None if one.view is None else Camera(self.to_canonical(one.view, True))
+        if one.camera is not None:
+            place = self.to_canonical(one.camera)
+            away = place - np.median(points[counts], 0)
+            camera = Camera(away / np.linalg.norm(away), place)
         noise, places = 0.0 if one.noise is None else max(one.noise * self.scale, NOISES[0]), None
+        if one.is_cloud and normals is None:
+            normals = np.zeros_like(points)
+            normals[counts] = estimate_normals(points[counts], camera and camera.towards(points[counts]))
+        elif normals is not None:
+            normals = self.side * normals
+            if camera is None and (view := find_view(normals[counts])) is not None:
+                camera = Camera(view)
         if not one.is_cloud:
             corners, barycentric = one.places()
             places = places_between(corners.cpu().numpy(), barycentric.cpu().double().numpy(), len(self.template))
@@ -113,4 +160,4 @@ class CompletionProblem:
                 "standard deviation of the points, in their unit"
             )
         numbers = np.arange(end - len(points), end)
-        return ObservedPoints(points, normals, weights, numbers, noise, places, view)
+        return ObservedPoints(points, normals, weights, numbers, noise, places, camera)

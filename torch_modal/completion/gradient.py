@@ -38,9 +38,11 @@ class LastSolve(NamedTuple):
         """
         with torch.enable_grad():
             x, others = (self.x.detach().requires_grad_() for _ in range(2))
+            # Markers are minimised until the start of the last minimisation, which softens needles, is its result.
+            starts = others if self.smooth else others.detach()
             terms = [
                 TermsTowards(self.energy, rests.reference(self.energy, other, relative=True), rests.anchors)
-                for rests, other in zip(self.rests(others), others[:, None], strict=True)
+                for rests, other in zip(self.rests(others), starts[:, None], strict=True)
             ]
             values = [term.value(one).sum() for term, one in zip(terms, x[:, None], strict=True)]
             slope = torch.autograd.grad(torch.stack(values).sum(), x, create_graph=True)[0]

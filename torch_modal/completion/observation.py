@@ -26,14 +26,16 @@ class Observation:
         time: When they were seen.
         points: *Shape:* ``(n, 3)``, n of 3 or more.
         normals: Outward normals of a cloud's points, of any length: better pairs, and none with the wrong side.
-            *Shape:* ``(n, 3)``.
+            Default: of the planes through each point's neighbours, towards the camera or outward. *Shape:* ``(n, 3)``.
         vertices: The vertex that each point shows: markers, or, with all vertices, a noisy mesh. *Shape:* ``(n,)``.
         corners: The vertices of the triangle that each point lies on: markers between vertices. *Shape:* ``(n, 3)``.
         barycentric: Their weights at each point, with sum one. *Shape:* ``(n, 3)``.
         weights: Of the points, none below zero, comparable among observations: 4 counts as half of the noise. Points of
             weight 0 have no effect. Default: 1 each. *Shape:* ``(n,)``.
         noise: Standard deviation of the points, in their unit. Default: estimated.
-        view: Direction from the surface to the camera of a cloud: what it does not see counts, too. *Shape:* ``(3,)``.
+        view: Direction from the surface to the camera of a cloud, far away: what it should see and has not counts, too.
+            Default: found from the normals given, if all face one side. *Shape:* ``(3,)``.
+        camera: The place of a camera that is near, instead. *Shape:* ``(3,)``.
 
     Raises:
         ValueError: Shapes that do not fit, numbers that are not finite, fewer than three points, or arguments that
@@ -50,6 +52,7 @@ class Observation:
     weights: Tensor | None = None
     noise: float | None = None
     view: Tensor | None = None
+    camera: Tensor | None = None
 
     def __post_init__(self) -> None:
         values: dict[str, Any] = {"time": float(self.time)}
@@ -67,7 +70,7 @@ class Observation:
             )
         values["points"], n = points, len(points)
         indices = {"vertices": (n,), "corners": (n, 3)}
-        numbers = {"normals": (n, 3), "barycentric": (n, 3), "weights": (n,), "view": (3,)}
+        numbers = {"normals": (n, 3), "barycentric": (n, 3), "weights": (n,), "view": (3,), "camera": (3,)}
         for name, shape in (indices | numbers).items():
             if getattr(self, name) is None:
                 continue
@@ -86,7 +89,8 @@ class Observation:
         for wrong, message in (
             ((self.corners is None) != (self.barycentric is None), "corners and barycentric go together"),
             (self.vertices is not None and self.corners is not None, "markers have vertices or corners; got both"),
-            (not self.is_cloud and (self.normals is not None or view is not None), "normals and view are for clouds"),
+            (not self.is_cloud and bool({"normals", "view", "camera"} & {*values}), "normals and views are for clouds"),
+            ({"view", "camera"} <= {*values}, "a camera has a view, from far, or a place; got both"),
             (weights is not None and not (weights >= 0).all(), "weights are 0 or more"),
             (weights is not None and int((weights > 0).sum()) < LEAST_POINTS, "3 points or more have a weight above 0"),
             (abs(worst - 1) > SUM_TOLERANCE, f"barycentric weights of a point have the sum one; got {worst:.6g}"),

@@ -1,5 +1,6 @@
 """Pairs of observed points and places on a surface, by position and normal, and their robust weights."""
 
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -7,6 +8,7 @@ from scipy import sparse
 from scipy.spatial import cKDTree
 
 from torch_modal.arrays import BoolArray, FloatArray, IntArray
+from torch_modal.completion.clouds import Camera
 from torch_modal.geometry.closest import closest_on_triangles, dot
 from torch_modal.geometry.connectivity import Connectivity, label_pieces
 from torch_modal.registration.surface import MeshSurface, places_between
@@ -49,8 +51,8 @@ class ObservedPoints(NamedTuple):
     """Standard deviation; 0 where it is not known yet."""
     places: Any = None
     """Interpolation matrix from vertices to the places of the points; None for a cloud. *Shape:* ``(n, V)``."""
-    view: FloatArray | None = None
-    """Direction to the camera of a cloud. *Shape:* ``(3,)``."""
+    camera: Camera | None = None
+    """Of a cloud."""
 
     def restrict(self, select: sparse.csr_matrix) -> "ObservedPoints":
         """With places on a coarse mesh, by the coarse vertex of each vertex. *Shape:* ``(V, V_coarse)``."""
@@ -61,6 +63,12 @@ class ObservedPoints(NamedTuple):
         normals, places = (None if rows is None else rows[chosen] for rows in (self.normals, self.places))
         points, weights, numbers = self.points[chosen], self.weights[chosen], self.numbers[chosen]
         return self._replace(points=points, normals=normals, weights=weights, numbers=numbers, places=places)
+
+    def seen_from(self, rotation: FloatArray, move: FloatArray) -> "ObservedPoints":
+        """In the coordinates of a body ``x`` that is at ``x rotation^T + move``. *Shape:* ``(3, 3), (3,)``."""
+        camera, normals = self.camera, None if self.normals is None else self.normals @ rotation
+        camera = None if camera is None else camera.seen_from(rotation, move)
+        return self._replace(points=(self.points - move) @ rotation, normals=normals, camera=camera)
 
     def main_part(self, gap: float) -> "ObservedPoints":
         """The points of a cloud without clusters that are a gap away from the one of the largest extent."""
@@ -112,9 +120,9 @@ class ObservedPoints(NamedTuple):
     def pairs(self, surface: "SampledSurface", released: BoolArray | None = None) -> "list[ObservedPoints]":
         """The points with their places, and, where the view is known, the visible places with points."""
         pairs = [self.pair(surface, released)]
-        if self.view is None or self.normals is None:
+        if self.camera is None or self.normals is None:
             return pairs
-        seen = surface.visible(self.view)
+        seen = surface.visible(self.camera)
         seen = seen[:: max(1, len(seen) // len(self.points))]
         faces = surface.sample_faces[seen]
         tree = cKDTree(join_features(self.points, self.normals))
@@ -134,8 +142,8 @@ class ObservedPoints(NamedTuple):
         """Fraction of the points that the surface leaves out, and of the visible surface that a cloud leaves out."""
         distances, agree = self.misses(surface)
         total = float(self.weights @ np.where(agree, 1 - 1 / (1 + (distances / unit) ** 2), 1))
-        if self.view is not None:
-            seen = surface.samples[surface.visible(self.view)]
+        if self.camera is not None:
+            seen = surface.samples[surface.visible(self.camera)]
             gap = (cKDTree(self.points).query(seen)[0] / (3 * unit)) ** 2
             total += float(self.weights.sum() * ((gap / (1 + gap)).mean() if len(seen) else 1.0))
         return total
@@ -190,19 +198,28 @@ class SampledSurface(MeshSurface):
         self, points: FloatArray, normals: FloatArray | None
     ) -> tuple[IntArray, FloatArray, FloatArray, BoolArray]:
         """Face and coordinates of the place that looks most like each point, the distance, and if normals agree."""
-        sampled = None if normals is None else self.face_normals[self.sample_faces]
-        face = self.sample_faces[cKDTree(join_features(self.samples, sampled)).query(join_features(points, normals))[1]]
+        tree = self._tree_of_places if normals is None else self._tree_with_normals
+        face = self.sample_faces[tree.query(join_features(points, normals))[1]]
         barycentric, distances = closest_on_triangles(points, self.vertices[self.faces[face]])
         agree = np.ones(len(points), bool) if normals is None else dot(self.face_normals[face], normals) > LEAST_COSINE
         return face, barycentric, distances, agree
 
-    def visible(self, view: FloatArray) -> IntArray:
-        """The samples that are seen from a direction. *Shape:* ``(m,)``."""
-        axes = np.linalg.svd(view[None])[2][1:]
-        depth, cells = self.samples @ view, np.floor(self.samples @ axes.T / CELL).astype(np.int64)
+    @cached_property
+    def _tree_of_places(self) -> cKDTree:
+        return cKDTree(self.samples)
+
+    @cached_property
+    def _tree_with_normals(self) -> cKDTree:
+        return cKDTree(join_features(self.samples, self.face_normals[self.sample_faces]))
+
+    def visible(self, camera: Camera) -> IntArray:
+        """The samples that a camera sees. *Shape:* ``(m,)``."""
+        picture, depth = camera.picture(self.samples)
+        cells = np.floor(picture / CELL).astype(np.int64)
         cells -= cells.min(0)
         _, cell = np.unique(cells @ [1, cells[:, 0].max() + 1], return_inverse=True)
         nearest = np.full(cell.max() + 1, -np.inf)
         np.maximum.at(nearest, cell.ravel(), depth)
-        front = self.face_normals[self.sample_faces] @ view > GRAZING
+        towards = camera.towards(self.samples)
+        front = (self.face_normals[self.sample_faces] * towards).sum(1) > GRAZING
         return np.flatnonzero(front & (nearest[cell.ravel()] - depth < DEPTH))

@@ -8,11 +8,12 @@ import numpy as np
 import torch
 from scipy import sparse
 from scipy.optimize import minimize_scalar
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from torch_modal.completion.bending import ModalBending, ModalPose
 from torch_modal.completion.frames import CompletionProblem
-from torch_modal.completion.search import PoseSearch
+from torch_modal.completion.search import AFTER_FIRST, FIRST, N_KEPT, N_SOFT, REST, PoseSearch
 from torch_modal.geometry.rigid import align, best_fit
 from torch_modal.geometry.triangle_frames import frames_of, mirror_sides
 from torch_modal.modes.coarsening import coarsen
@@ -27,6 +28,10 @@ COARSE_FACES = 2500
 """Faces of the mesh on which they are searched; of fewer, it is the caller's."""
 SHIFTS = (-0.17, 0.17)
 """Times at which a motion may be instead of where its neighbours say, in parts of the gap between these."""
+N_TURNED, DISTINCT, CERTAIN = 3, 0.8, 0.7
+"""Turned poses of the template that a search starts from; the largest cosine of the angle between two; score over that
+of the template as it is below which it is turned.
+"""
 TRUSTED, N_ALIKE = 0.34, 2
 """Part of the frames, those that explain most, from which the others are searched again; starts from their shapes."""
 TIME_ROUNDS, LATEST, UNCHANGED = 6, 0.5, 10.0
@@ -66,9 +71,7 @@ class FramePoses:
         """Shapes of all frames. *Shape of each:* ``(V, 3)``."""
         frames, fits, template = self.frames, dict[int, ModalFit](), self.problem.template
         if not self.whole:
-            rigid = [self.poses.rigid(self._coarsen(template), frame) for frame in frames]
-            first = int(np.argmin([score for _, score in rigid]))
-            fits[first] = self._search(first, [(template, rigid[first][0])])
+            fits = self._first(template)
             report.update()
         self._outward(fits, {}, report)
         if not self.whole:
@@ -87,6 +90,25 @@ class FramePoses:
             shapes.append(self.bending.shape(fits[i].base, pose))
             report.update()
         return shapes
+
+    def _first(self, template: Tensor) -> dict[int, ModalFit]:
+        """The frame that the template fits best after a rigid motion.
+
+        It may be turned: then a quarter turn about its principal axes is a better start, by far, as symmetric bodies
+        fit as well after some turns.
+        """
+        base, turns = self._coarsen(template), torch.from_numpy(Rotation.create_group("O").as_matrix())
+        placed = [self.poses.place(base, frame) for frame in self.frames]
+        first = int(np.argmin([score for _, score in placed]))
+        fit = self._search(first, [(template, placed[first][0])])
+        turned = sorted((self.poses.place(base, self.frames[first], turn) for turn in turns), key=lambda one: one[1])
+        distinct = [placed[first][0]]
+        for pose, _ in turned:
+            # The trace of a rotation by an angle is 1 + 2 cos.
+            if all(float((pose.rotation * other.rotation).sum()) < 1 + 2 * DISTINCT for other in distinct):
+                distinct.append(pose)
+        other = self._search(first, [(template, pose) for pose in distinct[1 : 1 + N_TURNED]])
+        return {first: other if other.score < CERTAIN * fit.score else fit}
 
     def _outward(self, fits: dict[int, ModalFit], before: dict[int, ModalFit], report: ProgressReport) -> None:
         """Add all other frames, those near in time to what is known first; none is worse than it was before."""
@@ -108,7 +130,7 @@ class FramePoses:
 
     def _alike(self, i: int, shapes: Sequence[Tensor]) -> list[tuple[Tensor, ModalPose]]:
         """The shapes that explain most of a frame after a rigid motion: motions repeat."""
-        placed = [(x, *self.poses.rigid(self._coarsen(x), self.frames[i])) for x in shapes]
+        placed = [(x, *self.poses.place(self._coarsen(x), self.frames[i])) for x in shapes]
         return [(x, pose) for x, pose, _ in sorted(placed, key=lambda one: one[2])[:N_ALIKE]]
 
     def _starts(self, t: float, known: list[tuple[float, Tensor]]) -> list[tuple[Tensor, ModalPose]]:
@@ -135,14 +157,26 @@ class FramePoses:
         return motion._replace(source=motion.target, target=2 * motion.target - motion.source).apply(x)
 
     def _search(self, i: int, starts: Sequence[tuple[Tensor, ModalPose]]) -> ModalFit:
-        """The best pose of a frame from several starts, or one of these."""
-        frame, fits = self.frames[i], []
+        """The best pose of a frame from several starts, or one of these.
+
+        Surface that a camera should see and that has no points may hold a limb back as well as guide it: each start
+        descends with and without it, and the score with it decides.
+        """
+        frame, poses = self.frames[i], self.poses
+        ways = [frame, frame.without_cameras()][: 1 + any(one.camera is not None for one in frame.seen)]
+        fits, begun = [], []
         for base, start in starts:
             coarse = self._coarsen(base)
-            for pose in (self.poses.descend(coarse, start, frame), start):
-                fits.append((base, pose, self.poses.score(coarse, pose, frame)))
+            fits.append((base, start, poses.score(coarse, start, frame)))
+            for way in ways:
+                pose = poses.descend(coarse, start, way, part=FIRST, n_modes=N_SOFT)
+                begun.append((base, pose, way, poses.score(coarse, pose, frame._replace(unit=AFTER_FIRST))))
+        for base, pose, way, _ in sorted(begun, key=lambda one: one[-1])[:N_KEPT]:
+            coarse = self._coarsen(base)
+            pose = poses.descend(coarse, pose, way, part=REST)
+            fits.append((base, pose, poses.score(coarse, pose, frame)))
         base, pose, score = min(fits, key=lambda one: one[2])
-        pose, score = self.poses.move_limbs(self._coarsen(base), pose, frame, score)
+        pose, score = poses.move_limbs(self._coarsen(base), pose, frame, score)
         return ModalFit(self.bending.shape(base, pose), base, pose, score)
 
     def _coarsen(self, x: Tensor) -> Tensor:

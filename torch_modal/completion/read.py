@@ -34,12 +34,19 @@ def load_observations(
     if len(when) != len(clouds):
         what = f"{len(when)} times for {len(clouds)} clouds ({', '.join(map(str, clouds[:3]))}, ...)"
         raise ValueError(f"{what}: give one for each cloud or mesh, in their order; CSV files hold their own times")
+    places = {name: options.pop(name) for name in ("view", "camera") if options.get(name) is not None}
+    for name, rows in places.items():
+        if rows.dim() == 1:
+            places[name] = rows.expand(len(clouds), -1)
+        elif len(rows) != len(clouds):
+            raise ValueError(f"{name} has {len(rows)} rows for {len(clouds)} clouds: give one, or one for each")
     for file in files:
         if file in clouds:
-            observations.append(Observation(when.pop(0), *_cloud(file), **options))
+            each = {name: rows[clouds.index(file)] for name, rows in places.items()}
+            points, normals = _cloud(file)
+            observations.append(Observation(when.pop(0), points, normals, **options, **each))
         else:
-            options_here = {**options, "view": None}
-            observations += [Observation(t, x, vertices=i, **options_here) for t, i, x in _markers(file, n_vertices)]
+            observations += [Observation(t, x, vertices=i, **options) for t, i, x in _markers(file, n_vertices)]
     return observations
 
 

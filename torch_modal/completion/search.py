@@ -13,9 +13,14 @@ from torch_modal.completion.bending import ModalBending, ModalPose
 from torch_modal.completion.frames import Frame
 from torch_modal.completion.pairs import SLIDE, ObservedPoints, SampledSurface
 from torch_modal.geometry.connectivity import Connectivity, edge_graph, farthest_apart
+from torch_modal.geometry.rigid import infinitesimal_motions
 
 # Steps, and the distance from which on pairs lose weight at the first and the last; stiffness of the modes likewise.
 STEPS, FAR, NEAR = 12, 20.0, 2.0
+# Steps of all starts, after which the score at this distance chooses those that take the others.
+ALL, FIRST, REST, N_KEPT, AFTER_FIRST = slice(None), slice(4), slice(4, None), 2, 8.0
+# Modes in the first steps.
+N_SOFT = 24
 # Points of a cloud, and visible places of a surface, that take part in a step, and in one of the pose alone.
 N_POINTS, N_RIGID = 800, 200
 STIFF, STIFFER = 1e-2, (1e-4, 1e-3, 1e-2)
@@ -35,6 +40,9 @@ ISOLATED = 15.0
 N_TRIED, N_TIPS, MOST_AWAY, WEIGHT, ROUNDS, GAIN = 3, 12, 40.0, 3.0, 3, 1e-3
 # Smallest and largest length of a limb that is tried.
 LIMBS = 8.0, 30.0
+
+
+UNTURNED = torch.eye(3, dtype=torch.float64)
 
 
 class PoseSearch:
@@ -60,20 +68,35 @@ class PoseSearch:
 
     def score(self, base: Tensor, pose: ModalPose, frame: Frame) -> float:
         """Part that is left unexplained, and a little of the energy of the modes; 0 or more."""
-        surface = self.surface(base, pose)
         total = PRIOR * float(self.stiffness[:-6] @ pose.amplitudes**2)
-        return total + sum(seen.score(surface, frame.unit) for seen in frame.seen)
+        return total + frame.score(self.surface(base, pose))
 
-    def rigid(self, base: Tensor, frame: Frame) -> tuple[ModalPose, float]:
-        """The pose alone, from the centroid of what was seen on, with and without stray clusters; and its score."""
-        main, poses = frame._replace(seen=[one.main_part(ISOLATED) for one in frame.seen], soft=1.0), []
+    def place(self, base: Tensor, frame: Frame, turn: Tensor = UNTURNED) -> tuple[ModalPose, float]:
+        """The best of rigid poses from a turn about the centroid of what was seen on, with and without stray clusters.
+
+        And its score. *Shape of a turn:* ``(3, 3)``.
+        """
+        main, starts = frame._replace(seen=[one.main_part(ISOLATED) for one in frame.seen]), []
         parted = sum(len(one.points) for one in main.seen) < sum(len(one.points) for one in frame.seen)
-        for every in (main, frame._replace(soft=1.0))[: 1 + parted]:
+        surface = SampledSurface(base.numpy(), self.mesh)
+        for every in (main, frame)[: 1 + parted]:
             centre = np.median(np.concatenate([seen.points for seen in every.seen]), 0)
-            start = self.bending.still()._replace(move=torch.from_numpy(centre) - base.median(0).values)
-            poses.append(self.descend(base, start, every, (2 * FAR, FAR), 1.0, rigid=True))
-        pose = min(poses, key=lambda pose: self.score(base, pose, main))
-        return pose, self.score(base, pose, frame)
+            move = torch.from_numpy(centre) - turn @ base.median(0).values
+            starts.append(self._move(surface, self.bending.still()._replace(rotation=turn, move=move), every))
+        pose = min(starts, key=lambda pose: main.seen_from(pose).score(surface))
+        return pose, frame.seen_from(pose).score(surface)
+
+    def _move(self, surface: SampledSurface, pose: ModalPose, frame: Frame) -> ModalPose:
+        """The pose after rigid steps from far to near: the body stays, and what was seen moves towards it."""
+        base = torch.from_numpy(surface.vertices)
+        centre = base.mean(0)
+        fields = infinitesimal_motions(base - centre).movedim(0, -1)
+        frame = frame._replace(seen=[one.thin(N_RIGID) for one in frame.seen], soft=1.0)
+        for far in np.geomspace(2 * FAR, FAR, STEPS):
+            rows = self._rows(surface, fields, frame.seen_from(pose).seen, float(far), None)
+            step = pose.rotation @ self._step(rows, fields, pose, 1.0).view(2, 3, 1)
+            pose = self.bending.step(pose, step.flatten(), pose.rotation @ centre + pose.move)
+        return pose
 
     def descend(
         self,
@@ -83,29 +106,33 @@ class PoseSearch:
         distances: tuple[float, float] = (FAR, NEAR),
         stiff: float = STIFF,
         n_steps: int = STEPS,
+        part: slice = ALL,
+        n_modes: int | None = None,
         released: BoolArray | None = None,
         springs: Callable[[FloatArray, int], ObservedPoints] | None = None,
-        rigid: bool = False,
     ) -> ModalPose:
         """Gauss-Newton steps, each with new pairs, from far to near and from stiff to soft; no vertex moves far."""
-        seen = [one.thin(N_RIGID if rigid else N_POINTS) for one in frame.seen]
+        seen = [one.thin(N_POINTS) for one in frame.seen]
         schedule = zip(np.geomspace(*distances, n_steps), np.geomspace(stiff, frame.soft, n_steps), strict=True)
-        for k, (far, stiffness) in enumerate(schedule):
-            if rigid or k % 2 == 0:
-                x, fields = self.bending.linearise(base, pose, rigid)
+        for k, (far, stiffness) in enumerate(list(schedule)[part]):
+            if k % 2 == 0:
+                x, fields = self.bending.linearise(base, pose, n_modes)
             else:  # the derivatives of the step before do nearly as well
                 x = self.bending.shape(base, pose)
             pulled = [*seen, springs(x.numpy(), k)] if springs else seen
-            rows = self._rows(x, fields, pulled, float(far), released)
-            products, n = (rows.mT @ rows).double(), fields.shape[-1]
-            amplitudes = torch.cat([pose.amplitudes, pose.amplitudes.new_zeros(6)])[-n:]
-            prior = float(stiffness) * self.stiffness[-n:]
-            matrix, slope = products[:n, :n].clone(), products[:n, n] + prior * amplitudes
-            matrix.diagonal().add_(prior + 1e-9 * matrix.diagonal().mean())
-            step = -torch.linalg.solve(matrix, slope)
-            largest = float((fields @ step).norm(dim=-1).max()) / LARGEST_STEP
-            pose = self.bending.step(pose, step / max(1.0, largest), x.mean(0))
+            rows = self._rows(SampledSurface(x.numpy(), self.mesh), fields, pulled, float(far), released)
+            pose = self.bending.step(pose, self._step(rows, fields, pose, float(stiffness)), x.mean(0))
         return pose
+
+    def _step(self, rows: Tensor, fields: Tensor, pose: ModalPose, stiffness: float) -> Tensor:
+        """The Gauss-Newton step of weighted rows, and of the modes' energy. *Shape:* ``(m, n + 1) -> (n,)``."""
+        products, n = (rows.mT @ rows).double(), fields.shape[-1]
+        amplitudes = torch.cat([pose.amplitudes[: n - 6], pose.amplitudes.new_zeros(6)])
+        prior = stiffness * torch.cat([self.stiffness[: n - 6], self.stiffness[-6:]])
+        matrix, slope = products[:n, :n].clone(), products[:n, n] + prior * amplitudes
+        matrix.diagonal().add_(prior + 1e-9 * matrix.diagonal().mean())
+        step = -torch.linalg.solve(matrix, slope)
+        return step / max(1.0, float((fields @ step).norm(dim=-1).max()) / LARGEST_STEP)
 
     def stiffen(self, base: Tensor, pose: ModalPose, frame: Frame) -> ModalPose:
         """The pose of the stiffest modes that explain as much: where little moves, soft ones would follow the noise."""
@@ -161,10 +188,15 @@ class PoseSearch:
         return self.descend(base, pose, frame, (FAR / 3, NEAR), 10 * frame.soft, STEPS // 2)
 
     def _rows(
-        self, x: Tensor, fields: Tensor, seen: list[ObservedPoints], far: float, released: BoolArray | None
+        self,
+        surface: SampledSurface,
+        fields: Tensor,
+        seen: list[ObservedPoints],
+        far: float,
+        released: BoolArray | None,
     ) -> Tensor:
         """Derivatives of the weighted offsets of all pairs, and last the offsets. *Shape:* ``(m, n + 1)``."""
-        n, surface, rows = fields.shape[-1], SampledSurface(x.numpy(), self.mesh), []
+        n, rows = fields.shape[-1], []
         columns = fields.flatten(1).float().numpy()  # products of float32: half the time
         for pairs in [pairs for one in seen for pairs in one.pairs(surface, released)]:
             off = pairs.places @ surface.vertices - pairs.points
