@@ -114,6 +114,23 @@ def test_what_stands_stays() -> None:
     assert edge_change(moved, own) < 1.1 * edge_change(x, faces)
 
 
+def test_paths_do_not_drift() -> None:
+    """Eight strides of the inchworm: each is as long as the first, in its direction."""
+    x, faces, _ = inchworm()
+    _, own, along = inchworm(9.0, 1.2, 30)
+    truth = inchworm(9.0, 1.2, 30)[0]
+    forth = [x]
+    for _ in range(7):  # the pose after a stride is the first one, moved
+        motion = best_fit(x[0], forth[-1][-1])
+        forth.append(motion.apply(x[1:]))
+    places = truth[0] * torch.tensor([LONG / 9, 1 / 1.2, 1 / 1.2], dtype=torch.float64)
+    moved = tm.transfer(torch.cat(forth), faces, truth[0], own, registration=places)
+    feet = moved[:: len(x) - 1, along < 0.1].mean(1)
+    steps = feet.diff(dim=0).norm(dim=-1)
+    assert len(steps) == 8 and largest(steps / steps.mean() - 1) < 0.03
+    assert largest(moved[..., 2].mean(1)) < 1e-6
+
+
 def test_parts_without_a_counterpart_are_rigid(gallop: tuple[Tensor, Tensor], coarse: tuple[Tensor, Tensor]) -> None:
     """The tail, whose map is wrong: it follows the trunk."""
     (x, faces), (truth, own) = gallop, coarse

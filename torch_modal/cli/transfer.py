@@ -68,6 +68,5 @@ def run(args: argparse.Namespace) -> None:
     options = pick_options(args, "cyclic", "bones", "targets")
     write_sequence(args, animation, moved, asset.faces, asset, keyframe_indices=[], **options)
     if args.picture:
-        args.report(
-            f"picture:   {tm.render_sequence({'moved': moved}, asset.faces, args.picture, overwrite=args.overwrite)}"
-        )
+        tm.render_sequence({"moved": moved}, asset.faces, args.picture, keyframe_indices=[], overwrite=args.overwrite)
+        args.report(f"picture:   {args.picture}")

@@ -82,7 +82,7 @@ def transfer(
             follows from the target's legs. False for shapes without an order: the body's centroid then moves as the
             source's, scaled.
         keep_doubtful: Use a registration of low confidence, with a warning.
-        progress: Of the registration; see :data:`torch_modal.progress.Progress`.
+        progress: Of the registration and the frames; see :data:`torch_modal.progress.Progress`.
 
     Returns:
         The target's shapes, in its coordinates and the dtype and device of the frames; the target itself for ``rest``.
