@@ -72,6 +72,7 @@ from .motion.subdivide import frame_times as frame_times
 from .motion.subdivide import keyframe_places as keyframe_places
 from .motion.subdivide import linear_sequence as linear_sequence
 from .motion.subdivide import subdivide as subdivide
+from .motion.transfer import transfer as transfer
 from .passengers.passengers import Passengers as Passengers
 from .registration.load import load_keyframes as load_keyframes
 from .registration.register import register as register

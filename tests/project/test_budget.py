@@ -22,8 +22,8 @@ import torch
 import torch_modal as tm
 
 BOUNDS = {
-    "lines of code": 16599,
-    "functions": 1503,
+    "lines of code": 16920,
+    "functions": 1520,
     "docstrings that begin with no noun": 0,
     "functions of in-between": 89,
     "files of in-between": 23,

@@ -44,6 +44,13 @@ def test_train_timing_learns_times_without_labels() -> None:
 
 
 @pytest.mark.slow
+def test_transfer_comes_near_to_the_true_gallop(tmp_path: Path) -> None:
+    found = load_example("transfer").main(tmp_path, cell=0.05)
+    assert found.confidence > 0.5 and found.error < 0.015 and found.error < 0.8 * found.copied
+    assert (tmp_path / "stout.glb").exists() and (tmp_path / "transfer.png").exists()
+
+
+@pytest.mark.slow
 def test_augment_segmentation_learns_more_from_in_betweens() -> None:
     """The short form: one seed, in fewer steps."""
     iou = {arm: float(found) for arm, found in load_example("augment_segmentation").main(seeds=1, steps=300).items()}

@@ -12,7 +12,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
-from torch_modal.cli import bake, commands, complete, subdivide, view
+from torch_modal.cli import bake, commands, complete, subdivide, transfer, view
 from torch_modal.version import __version__
 
 PROGRAM = "torch-modal"
@@ -36,6 +36,7 @@ COMMANDS: dict[str, tuple[Callable[[Any], None], Callable[[Any], int | None]]] =
     "subdivide": (subdivide.add_arguments, subdivide.run),
     "bake": (bake.add_arguments, bake.run),
     "complete": (complete.add_arguments, complete.run),
+    "transfer": (transfer.add_arguments, transfer.run),
     "register": (commands.add_register, commands.register),
     "check": (commands.add_check, commands.check),
     "carry": (commands.add_carry, commands.carry),

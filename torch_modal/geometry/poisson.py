@@ -16,7 +16,7 @@ from torch_modal.geometry.sparse import SparseSolver, graph_laplacian, solve_by
 from torch_modal.geometry.triangle_frames import Sides, edge_means, frames_of, mirror_sides
 
 # Bounds of cotangent weights, for slivers. Positive weights make the matrix positive definite.
-_WEIGHT_RANGE = (0.02, 20.0)
+WEIGHT_RANGE = (0.02, 20.0)
 
 # Number of vertices of the largest piece that a loose piece follows.
 _N_ANCHORS = 16
@@ -148,7 +148,7 @@ class Reconstruction(nn.Module):
         self.register_buffer("faces", faces.cpu().clone(), persistent=False)
         self.register_buffer("sides", torch.tensor(mesh.sides), persistent=False)
         self.register_buffer("signs", torch.tensor(mesh.signs), persistent=False)
-        bounded = np.clip(half_cotangents(shape, mesh), *_WEIGHT_RANGE)
+        bounded = np.clip(half_cotangents(shape, mesh), *WEIGHT_RANGE)
         #: Weights of the sides. *Shape:* ``(3F,)``.
         self.register_buffer("weights", torch.from_numpy(bounded), persistent=False)
         #: Areas of the vertices. *Shape:* ``(V,)``.
@@ -186,7 +186,11 @@ class Reconstruction(nn.Module):
 
         The initial shape, ``rest``, determines the positions of loose pieces. *Shape:* ``(B, V, 3) -> (B, V, 3)``.
         """
-        out = placed = self.fit(wanted, rest)
+        return self.place_loose(self.fit(wanted, rest), rest)
+
+    def place_loose(self, placed: Tensor, rest: Tensor) -> Tensor:
+        """A shape of :meth:`fit` in which loose pieces follow the largest one. *Shape:* ``(B, V, 3), (B, V, 3)``."""
+        out = placed
         for (piece, _), motion in zip(self.loose, self.follow(rest, placed), strict=True):
             centre = self.poisson.shares.to(rest)[None, piece] @ rest[:, piece]
             out = out.index_copy(1, piece.to(out.device), placed[:, piece] + motion.apply(centre) - centre)

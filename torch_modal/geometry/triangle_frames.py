@@ -72,6 +72,19 @@ def sides(x: Tensor, faces: Tensor) -> Sides:
     return first - origin, second - origin
 
 
+def side_frames(x: Tensor, faces: Tensor) -> Tensor:
+    """Two sides and the unit normal of each triangle, as columns; the normal is zero where there is no area.
+
+    The product with the inverse of the columns at rest is the deformation gradient, of constant thickness.
+
+    *Shape:* ``(3, B, V), (F, 3) -> (3, 3, B, F)``.
+    """
+    first, second = sides(x, faces)
+    normal = cross(first, second)
+    length = norm(normal)
+    return torch.stack([first, second, normal * inverse(length, (normal * normal).sum(0) <= 0)], 1)
+
+
 def frames(triangle_sides: Sides) -> Frames:
     """The frame of each triangle; the normal of one without area is arbitrary and a constant, all is finite."""
     first, second = triangle_sides

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from torch_modal.autograd import full_precision, is_traced, linear_map, outside_inference_mode
 from torch_modal.geometry.rigid import best_rotation
-from torch_modal.geometry.triangle_frames import sides
+from torch_modal.geometry.triangle_frames import side_frames, sides
 from torch_modal.geometry.vectors import cross, inverse, norm
 from torch_modal.keyframes.arrays import check_tensor
 from torch_modal.keyframes.check import check_arrays
@@ -90,7 +90,7 @@ class Passengers(nn.Module):
         if weights is None:
             known = None if anchors is None else anchors.detach().cpu().numpy()
             weights = bind_points(bound.numpy(), rest.numpy(), corners.numpy(), known)
-        frame = _frames(rest.mT, corners).movedim(-1, 0)  # (F, 3, 3)
+        frame = side_frames(rest.mT, corners).movedim(-1, 0)  # (F, 3, 3)
         area = 0.5 * norm(doubled)
         flat = area <= 1e-12 * area.mean()
         area = torch.where(flat, 0, area)
@@ -165,7 +165,7 @@ class Passengers(nn.Module):
 
     def _deformation(self, x: Tensor) -> Tensor:
         """Mean deformation gradient around each vertex. *Shape:* ``(B, V, 3) -> (B, V, 3, 3)``."""
-        frame = _frames(x.movedim(-1, 0).contiguous(), self.faces).movedim((0, 1), (-2, -1))  # (B, F, 3, 3)
+        frame = side_frames(x.movedim(-1, 0).contiguous(), self.faces).movedim((0, 1), (-2, -1))  # (B, F, 3, 3)
         each = ((frame @ self.inverses) * self.areas[:, None, None]).flatten(2)
         summed = x.new_zeros(*x.shape[:2], 9)
         for corner in self.faces.T:
@@ -191,11 +191,3 @@ def _product(starts: Tensor, columns: Tensor, values: Tensor, x: Tensor) -> Tens
         warnings.filterwarnings("ignore", "Sparse CSR")  # "beta", since 2021
         matrix = torch.sparse_csr_tensor(starts, columns, values, (n, len(rows)), check_invariants=False)
     return (matrix @ rows.flatten(1)).view(n, *rows.shape[1:]).movedim(0, -2)
-
-
-def _frames(rows: Tensor, faces: Tensor) -> Tensor:
-    """Two sides and the unit normal of each triangle, as columns. *Shape:* ``(3, ..., V) -> (3, 3, ..., F)``."""
-    first, second = sides(rows, faces)
-    normal = cross(first, second)
-    length = norm(normal)
-    return torch.stack([first, second, normal * inverse(length, (normal * normal).sum(0) <= 0)], 1)
