@@ -121,7 +121,7 @@ def test_an_animation_of_others_by_hand(tmp_path: Path) -> None:
 
 def test_own_skins_and_shapes_as_animations_of_others(tmp_path: Path) -> None:
     for form in ({"bones": 6}, {"targets": 4}, {}):
-        path = tm.save_animation(FRAMES, FACES, tmp_path / "a.glb", fps=10, overwrite=True, **form)
+        path = tm.save_animation(FRAMES, FACES, tmp_path / "a.glb", fps=10, **form)
         own = tm.load_sequence(path)
         path.write_bytes(path.read_bytes().replace(b'"generator":"torch_modal"', b'"generator":"other_thing"'))
         other = tm.load_sequence(path)

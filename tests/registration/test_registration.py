@@ -19,7 +19,7 @@ from torch_modal.registration import register as register_module
 from torch_modal.registration.landmarks import landmark_table, read_landmarks
 from torch_modal.registration.maps import SpectralShape
 from torch_modal.registration.register import register
-from torch_modal.registration.report import measure
+from torch_modal.registration.report import Registration, measure
 from torch_modal.registration.surface import DUST, MeshSurface, drop_unreferenced, largest_pieces, sew
 
 for library in ("robust_laplacian", "potpourri3d", "igl"):
@@ -67,17 +67,17 @@ def pair() -> tuple[Mesh, Mesh, np.ndarray]:
     return (rest, faces), (there, there_faces), posed(rest)
 
 
-def errors(found: tm.Registration, truth: np.ndarray) -> np.ndarray:
+def errors(found: Registration, truth: np.ndarray) -> np.ndarray:
     """In percent of the diagonal."""
     return 100 * np.linalg.norm(found.positions.numpy() - truth, axis=1) / np.linalg.norm(np.ptp(truth, axis=0))
 
 
 @pytest.fixture(scope="module")
-def found(pair: tuple[Mesh, Mesh, np.ndarray]) -> tm.Registration:
+def found(pair: tuple[Mesh, Mesh, np.ndarray]) -> Registration:
     return register(*pair[0], *pair[1], progress=False)
 
 
-def test_truth_is_met_without_landmarks(pair: tuple[Mesh, Mesh, np.ndarray], found: tm.Registration) -> None:
+def test_truth_is_met_without_landmarks(pair: tuple[Mesh, Mesh, np.ndarray], found: Registration) -> None:
     off = errors(found, pair[2])
     assert off.mean() < 1.0 and np.percentile(off, 95) < 3.0
     assert not found.doubtful and not found.warnings
@@ -85,7 +85,7 @@ def test_truth_is_met_without_landmarks(pair: tuple[Mesh, Mesh, np.ndarray], fou
     assert found.flipped_area < 0.01
 
 
-def test_missing_parts_have_low_confidence(found: tm.Registration) -> None:
+def test_missing_parts_have_low_confidence(found: Registration) -> None:
     assert float((found.vertex_confidence > 0.5).double().mean()) > 0.99
     sample = load_sample("hand")
     x, y = sample.keyframes[:2].numpy()
@@ -101,7 +101,7 @@ def test_missing_parts_have_low_confidence(found: tm.Registration) -> None:
 
 @pytest.mark.parametrize("direction", [(1, 0.2, 0.1), (0.6, -0.5, -0.6)], ids=["tip", "side"])
 def test_a_hole_is_not_covered_and_what_is_left_is_as_good(
-    pair: tuple[Mesh, Mesh, np.ndarray], found: tm.Registration, direction: tuple[float, float, float]
+    pair: tuple[Mesh, Mesh, np.ndarray], found: Registration, direction: tuple[float, float, float]
 ) -> None:
     """A tenth of the surface is cut out: a limb, or a piece between limbs."""
     (rest, faces), _, truth = pair
@@ -120,7 +120,7 @@ def test_a_hole_is_not_covered_and_what_is_left_is_as_good(
     assert result.unsupported_area == pytest.approx(0.1, abs=0.03)
 
 
-def test_report_measures_what_it_says(pair: tuple[Mesh, Mesh, np.ndarray], found: tm.Registration) -> None:
+def test_report_measures_what_it_says(pair: tuple[Mesh, Mesh, np.ndarray], found: Registration) -> None:
     """The places on the target are exact, and the report has their largest distance, and the mean by area."""
     there = trimesh.Trimesh(*pair[1], process=False)
     below = (found.barycentric.numpy()[..., None] * pair[1][0][found.target_corners.numpy()]).sum(1)
@@ -148,19 +148,19 @@ def test_dtype_and_units_follow_the_inputs(pair: tuple[Mesh, Mesh, np.ndarray]) 
 
 
 def test_the_second_time_is_from_the_cache(
-    pair: tuple[Mesh, Mesh, np.ndarray], found: tm.Registration, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    pair: tuple[Mesh, Mesh, np.ndarray], found: Registration, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """By the content of both meshes and of the landmarks, which are vertices or points."""
     (rest, faces), (there, there_faces), _ = pair
     calls: list[int] = []
 
-    def solved(problem: object) -> tm.Registration:
+    def solved(problem: object) -> Registration:
         calls.append(len(calls))
         return found._replace(confidence=0.25, warnings=("one, with a comma", "two"))
 
     monkeypatch.setattr(register_module._RegistrationProblem, "solve", solved)
 
-    def again(target: np.ndarray, marks: object = None, cache: bool = True) -> tm.Registration:
+    def again(target: np.ndarray, marks: object = None, cache: bool = True) -> Registration:
         options = {"landmarks": marks, "cache_dir": tmp_path, "cache": cache, "progress": False}
         return register(rest, faces, target, there_faces, **options)
 
@@ -178,12 +178,12 @@ def test_the_second_time_is_from_the_cache(
     assert calls == [0, 1, 2, 3]
 
 
-def test_results_are_repeatable(pair: tuple[Mesh, Mesh, np.ndarray], found: tm.Registration) -> None:
+def test_results_are_repeatable(pair: tuple[Mesh, Mesh, np.ndarray], found: Registration) -> None:
     again = register(*pair[0], *pair[1], cache=False, progress=False)
     assert torch.equal(again.positions, found.positions) and again.confidence == found.confidence
 
 
-def test_vertices_of_no_face_come_along(pair: tuple[Mesh, Mesh, np.ndarray], found: tm.Registration) -> None:
+def test_vertices_of_no_face_come_along(pair: tuple[Mesh, Mesh, np.ndarray], found: Registration) -> None:
     (rest, faces), (there, there_faces), truth = pair
     more = register(np.vstack([rest, 1.02 * rest[:1]]), faces, there, there_faces, progress=False)
     assert more.positions.shape == (len(rest) + 1, 3)
@@ -191,7 +191,7 @@ def test_vertices_of_no_face_come_along(pair: tuple[Mesh, Mesh, np.ndarray], fou
     assert np.linalg.norm(more.positions[-1].numpy() - truth[0]) < 0.05 * np.linalg.norm(np.ptp(truth, axis=0))
 
 
-def test_seams_are_no_cuts(pair: tuple[Mesh, Mesh, np.ndarray], found: tm.Registration) -> None:
+def test_seams_are_no_cuts(pair: tuple[Mesh, Mesh, np.ndarray], found: Registration) -> None:
     """Each face of a half with vertices of its own, as exporters split them: the result is the whole one's."""
     (rest, faces), target, _ = pair
     half = rest[faces].mean(1)[:, 2] > 0
@@ -237,7 +237,7 @@ def test_mirrored_landmarks_are_doubtful(pair: tuple[Mesh, Mesh, np.ndarray]) ->
 
 
 def test_a_stray_sphere_beside_the_target_changes_nothing(
-    pair: tuple[Mesh, Mesh, np.ndarray], found: tm.Registration
+    pair: tuple[Mesh, Mesh, np.ndarray], found: Registration
 ) -> None:
     (rest, faces), (there, there_faces), truth = pair
     ball = trimesh.creation.icosphere(subdivisions=2, radius=0.1 * np.linalg.norm(np.ptp(there, axis=0)))
@@ -259,7 +259,7 @@ def test_across_shapes(pair: tuple[Mesh, Mesh, np.ndarray], marked: bool) -> Non
     assert result.to_target.mean < 0.12 and result.flipped_area < 0.02 and not result.doubtful
 
 
-def test_attributes_are_sampled(pair: tuple[Mesh, Mesh, np.ndarray], found: tm.Registration) -> None:
+def test_attributes_are_sampled(pair: tuple[Mesh, Mesh, np.ndarray], found: Registration) -> None:
     there = torch.from_numpy(pair[1][0])
     below = found.sample(there)  # positions are an attribute too
     assert float((below - found.positions).norm(dim=1).mean()) < 0.002 * float(
@@ -384,7 +384,7 @@ def files(pair: tuple[Mesh, Mesh, np.ndarray], tmp_path_factory: pytest.TempPath
     return [save_mesh(*mesh, folder / f"{name}.obj") for name, mesh in zip("abc", meshes, strict=True)]
 
 
-def test_key_frames_of_any_connectivity(files: list[Path], found: tm.Registration) -> None:
+def test_key_frames_of_any_connectivity(files: list[Path], found: Registration) -> None:
     lines: list[str] = []
     keyframes, _ = tm.load_keyframes(files, register=True, progress=False, report=lines.append)
     assert keyframes.shape == (3, len(found.positions), 3) and len(lines) == 1
@@ -399,7 +399,7 @@ def test_key_frames_of_any_connectivity(files: list[Path], found: tm.Registratio
 def test_each_mesh_is_registered_from_the_one_before(
     pair: tuple[Mesh, Mesh, np.ndarray],
     files: list[Path],
-    found: tm.Registration,
+    found: Registration,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -432,7 +432,7 @@ def test_doubtful_key_frames_are_refused(files: list[Path], tmp_path: Path) -> N
 
 
 def test_register_command_writes_the_registered_mesh(
-    files: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str], found: tm.Registration
+    files: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str], found: Registration
 ) -> None:
     out = tmp_path / "wrapped.obj"
     assert cli.main(["register", *map(str, files[:2]), "--out", str(out)]) == 0

@@ -56,7 +56,7 @@ def register(args: argparse.Namespace) -> None:
         if not args.keep_doubtful:
             raise ValueError(f"{why}. To help it, {ADVICE}; --keep-doubtful writes it all the same")
         warnings.warn(why, stacklevel=2)
-    tm.save_mesh(result.positions, template.faces, args.out, args.overwrite, template)
+    tm.save_mesh(result.positions, template.faces, args.out, overwrite=args.overwrite, asset=template)
     args.report(f"written: {args.out}")
 
 
@@ -100,6 +100,7 @@ def check(args: argparse.Namespace) -> int:
         check_output(args, [args.picture], [*args.meshes, *args.keyframes])
 
     import torch_modal as tm
+    from torch_modal.times import fill_linear
 
     shapes, faces = tm.load_keyframes([*args.keyframes, *args.meshes])
     welded = tm.weld_seams(shapes, faces)
@@ -107,9 +108,9 @@ def check(args: argparse.Namespace) -> int:
     names = [str(mesh) for mesh in args.meshes]
     if args.between:
         keyframes, started = welded.keyframes, time.perf_counter()
-        frames = tm.subdivide(shapes, welded.faces, 3, **pick_options(args, "contact", "progress"))
+        frames = tm.interpolate(shapes, welded.faces, 3, **pick_options(args, "contact", "progress"))
         seconds, shell = time.perf_counter() - started, tm.losses.ShellLoss(welded.faces)
-        motions = frames, tm.linear_sequence(shapes, tm.keyframe_places(len(names), 3))
+        motions = frames, fill_linear(shapes, range(0, 8 * len(names), 8))
         ours, linear = (float((len(x) - 1) * shell(x[1:], x[:-1]).sum()) for x in motions)
         args.report(f"shell energy of the motion: {ours:.4g}, of linear interpolation: {linear:.4g}; {seconds:.1f} s")
         names, shapes = [f"t = {i / 8:g}" for i in range(len(frames))], frames
@@ -137,7 +138,6 @@ def check(args: argparse.Namespace) -> int:
             keyframe_indices=[0],
             colors={"crossings": marks},
             color_label="1: crosses, 2: new",
-            overwrite=args.overwrite,
         )
         args.report(f"picture: {args.picture}")
     return CROSSES if bool(contacts.n_far.any()) else 0
@@ -285,7 +285,7 @@ def demo(args: argparse.Namespace) -> None:
     Run the main job on the samples that come with the package: a galloping creature
     (a cycle of six key-frames) and a closing hand (two key-frames).
 
-    For each it runs `subdivide`, which writes an animation (GLB) and a picture of the sequence
+    For each it runs `interpolate`, which writes an animation (GLB) and a picture of the sequence
     next to linear interpolation.
 
     Examples:
@@ -298,7 +298,7 @@ def demo(args: argparse.Namespace) -> None:
 
     for name in names:
         plays = ["--cyclic" if SAMPLES[name]["cyclic"] else "--ping-pong", "--duration", str(SAMPLES[name]["seconds"])]
-        command = ["subdivide", *map(str, sample_files(name)), "--levels", str(args.levels), *plays, "--overwrite"]
+        command = ["interpolate", *map(str, sample_files(name)), "--levels", str(args.levels), *plays, "--overwrite"]
         command += ["--out", str(args.out / f"{name}.glb"), "--picture", str(args.out / f"{name}.png")]
         args.report(" ".join(["torch-modal", *command]))
         subdivide.run(args.parse(command, argparse.Namespace(progress=args.progress, report=args.report)))

@@ -26,10 +26,10 @@ FPS = 24.0
 class OutputFormat:
     """A function that writes a format, with what must be known before it is imported.
 
-    In :data:`MESH_FORMATS`, for :func:`torch_modal.save_frames`, it takes vertices ``(V, 3)``, faces ``(F, 3)`` and the
-    :class:`torch_modal.Asset` that they come from, or None, and returns the bytes of a file. In
-    :data:`ANIMATION_FORMATS`, for :func:`torch_modal.save_animation`, it takes a :class:`torch_modal.Animation` and the
-    path of a new file, which is renamed when the function returns.
+    In :data:`MESH_FORMATS`, for :func:`torch_modal.save_mesh`, it takes vertices ``(V, 3)``, faces ``(F, 3)`` and the
+    :class:`torch_modal.io.asset.Asset` that they come from, or None, and returns the bytes of a file. In
+    :data:`ANIMATION_FORMATS`, for :func:`torch_modal.save_animation`, it takes an :class:`Animation` and the path of a
+    new file, which is renamed when the function returns.
 
     Attributes:
         function: The function; of built-in formats its place, ``module:name``.

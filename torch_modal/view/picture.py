@@ -105,7 +105,6 @@ def render_sequence(
     colors: Mapping[str, Array] | None = None,
     color_label: str = "",
     points: Mapping[str, Sequence[Array]] | None = None,
-    overwrite: bool = False,
 ) -> Path:
     """Draw rows of shapes side by side, all seen by the same camera at the same scale.
 
@@ -113,7 +112,7 @@ def render_sequence(
         frames_by_row: For each row its label and its shapes, for example ``{"torch_modal": x, "linear": y}``.
             *Shape of each:* ``(N, V, 3)``, the same for all.
         faces: Vertex indices. *Shape:* ``(F, 3)``.
-        out: File to write, ``*.png`` or ``*.pdf``.
+        out: File to write, ``*.png`` or ``*.pdf``; replaced if it exists.
         columns: How many frames to show, evenly chosen with the first and the last, or their numbers. By
             default all up to seven, and of more a number from four to seven that gives equal steps.
         titles: Text above the columns. Default: their times, from 0 to 1.
@@ -126,19 +125,18 @@ def render_sequence(
             percentile of what is shown, with an arrow if there is more. *Shape of each:* ``(N, V)``.
         color_label: Name of the numbers in ``colors``, with their unit.
         points: Rows of clouds, drawn above the shapes as dots: a cloud for each frame. *Shape of each:* ``(n, 3)``.
-        overwrite: Replace the file if it exists.
 
     Returns:
         The file.
 
     Raises:
         ValueError: An argument cannot be used; the message says why.
-        FileExistsError: The file exists and ``overwrite`` is off.
+        IsADirectoryError: ``out`` is a folder.
     """
     path = Path(out)
     fmt = check_suffix(path, PICTURES)[1:]
     check_view(view, up)
-    refuse_existing(path, overwrite)
+    refuse_existing(path)
 
     checked, triangles = check_sequences(frames_by_row, faces, "frames_by_row")
     rows, shapes = list(checked), list(checked.values())

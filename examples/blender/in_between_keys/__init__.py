@@ -63,7 +63,7 @@ def in_betweens(
         for file, points in zip(files, shapes, strict=True):
             write_mesh(file, points, triangles)
         options = ["--levels", str(levels), *["--cyclic"] * cyclic, *["--contact"] * contact]
-        run_program(program, "subdivide", *map(str, files), *options, "--out", str(folder / "out"))
+        run_program(program, "interpolate", *map(str, files), *options, "--out", str(folder / "out"))
         return [read_points(file) for file in sorted((folder / "out").glob("frame-*.obj"))]
 
 
