@@ -63,7 +63,7 @@ def test_obj_keeps_everything_but_positions(tmp_path):
     others = [[x for x in text if not x.startswith(("v ", "vn ", "f "))] for text in (before, after)]
     assert others[0] == others[1]
     v_lines = [line for line in after if line.startswith("v ")]
-    np.testing.assert_array_equal([[float(word) for word in line.split()[1:4]] for line in v_lines], moved)
+    np.testing.assert_allclose([[float(word) for word in line.split()[1:4]] for line in v_lines], moved, rtol=1e-8)
     assert all(line.endswith(" 0.5 0.25 1.0") for line in v_lines)
     for old, new in zip(corners(source), corners(out), strict=True):
         assert [(v, t) for v, t, _ in old] == [(v, t) for v, t, _ in new]
