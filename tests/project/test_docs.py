@@ -287,7 +287,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     shutil.copytree(ROOT / "tests" / "benchmarks", root / "tests" / "benchmarks")
     for name in ("README.md", "setup.py"):
         shutil.copy(ROOT / name, root)
-    (root / "docs" / "added.md").write_text("# A page that nobody listed\n\nSee [the layer](layer.md#gradients).\n")
+    (root / "docs" / "added.md").write_text("# A page that nobody listed\n\nSee [the layer](solving.md#gradients).\n")
     (root / "tests" / "environment.sh").write_text(f"python='{sys.executable}'\n")  # is there already
     command = ["sh", str(root / "docs" / "build.sh"), "--version", "--quiet"]
     done = subprocess.run(command, cwd=root, capture_output=True, text=True, timeout=600)

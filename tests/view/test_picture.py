@@ -218,6 +218,14 @@ def test_what_rests_stays_and_what_travels_is_followed():
     assert np.abs(moved).max() <= 1.0 + 1e-12
 
 
+def test_half_of_the_panels_are_in_betweens() -> None:
+    for n_keys, levels in ((2, 4), (3, 2), (4, 2), (7, 2), (7, 3), (6, 1), (13, 2)):
+        keys = [2**levels * i for i in range(n_keys)]
+        chosen = picture.choose_columns(None, keys[-1] + 1, keys)
+        assert 2 * len(set(chosen) - set(keys)) >= len(chosen) and chosen[0] == 0 and chosen[-1] == keys[-1]
+    assert picture.choose_columns(7, 25, list(range(0, 25, 4))) == list(range(0, 25, 4))  # as asked
+
+
 def test_existing_pictures_are_replaced(tmp_path):
     rows, faces, out = {"a": growing(2)}, np.asarray(BALL.faces), tmp_path / "a.png"
     out.write_text("mine")

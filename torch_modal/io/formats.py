@@ -56,6 +56,7 @@ class OutputFormat:
 
 GLB_HOLDS = ("texcoords", "normals", "colors", "materials")
 """From a file of another format; of materials, colour, roughness and the texture of the colour."""
+USD_HOLDS = ("polygons", "texcoords", "normals", "colors", "materials")
 MESH_FORMATS: dict[str, OutputFormat] = {
     ".ply": OutputFormat("torch_modal.io.ply:ply_bytes"),
     ".obj": OutputFormat("torch_modal.io.obj:obj_bytes"),
@@ -68,7 +69,7 @@ ANIMATION_FORMATS: dict[str, OutputFormat] = {
     ".gif": OutputFormat("torch_modal.view.animation:write_gif", FEATURES),
     **dict.fromkeys(
         (".usd", ".usda", ".usdc"),
-        OutputFormat("torch_modal.io.animations:write_usd", ("polygons", "texcoords", "colors"), ("pxr",), "usd"),
+        OutputFormat("torch_modal.io.usd:write_usd", USD_HOLDS, ("pxr",), "usd"),
     ),
     **dict.fromkeys((".mdd", ".pc2"), OutputFormat("torch_modal.io.animations:write_point_cache", FEATURES)),
     ".npz": OutputFormat("torch_modal.io.animations:write_npz", FEATURES),
