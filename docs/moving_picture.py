@@ -43,7 +43,7 @@ def main(out: Path) -> None:
             shapes.append(size * seen(x, *sample.view) + torch.tensor([place, row, 0.0]))
             faces.append(sample.faces + n)
             n += x.shape[1]
-    tm.save_animation(torch.cat(shapes, 1), torch.cat(faces), out, 16, cyclic=True, duration=2.0, overwrite=True)
+    tm.save_animation(torch.cat(shapes, 1), torch.cat(faces), out, 16, cyclic=True, duration=2.0)
 
 
 if __name__ == "__main__":

@@ -56,17 +56,17 @@ def main(out: Path, levels: int = 3, cell: float | None = None) -> Morph:
     np.savetxt(out / "landmarks.txt", landmarks, fmt="%d", header="slender  stout")
     (_, faces, _), (_, stout_faces, _) = bodies.values()
     slender, stout = (galloping(name, TIMES[name], cells[name]) for name in bodies)
-    tm.save_mesh(slender, faces, out / "slender.obj", overwrite=True)
-    tm.save_mesh(stout, stout_faces, out / "stout.obj", overwrite=True)
+    tm.save_mesh(slender, faces, out / "slender.obj")
+    tm.save_mesh(stout, stout_faces, out / "stout.obj")
     registration = tm.register(slender, faces, stout, stout_faces, landmarks=landmarks, same_subject=False)
     print(registration.summary())
 
     keyframes = torch.stack([torch.from_numpy(slender), registration.positions])
     frames = tm.interpolate(keyframes, faces, levels)
     places = keyframe_places(2, levels)
-    tm.save_animation(frames, faces, out / "morph.glb", keyframe_indices=places, ping_pong=True, overwrite=True)
+    tm.save_animation(frames, faces, out / "morph.glb", keyframe_indices=places, ping_pong=True)
     rows = {"torch_modal": frames, "linear": fill_linear(keyframes, places)}
-    tm.render_sequence(rows, faces, out / "morph.png", columns=5, keyframe_indices=places, overwrite=True)
+    tm.render_sequence(rows, faces, out / "morph.png", columns=5, keyframe_indices=places)
     print(f"{len(frames)} frames of {len(slender)} vertices in {out}: morph.glb, morph.png")
     return Morph(registration, frames, torch.from_numpy(faces), out)
 

@@ -67,4 +67,4 @@ def main(table: Table, out: Path | None, only: Sequence[str], meshes: Path | Non
             for name, x in rows.items()
         }
         file, label = out / "paper-figure1.png", "edge error, %"
-        tm.render_sequence(rows, faces, file, range(5), None, [0, 2, 4], colors=off, color_label=label, overwrite=True)
+        tm.render_sequence(rows, faces, file, range(5), None, [0, 2, 4], colors=off, color_label=label)

@@ -48,4 +48,4 @@ def main(table: Table, out: Path | None, only: Sequence[str], meshes: Path | Non
         table.add(name, *percents(error))
     if out:
         rows |= {} if truth is None else {"truth": truth}
-        tm.render_sequence(rows, faces, out / "paper-figure2.png", keyframe_indices=[0, 4], view=VIEW, overwrite=True)
+        tm.render_sequence(rows, faces, out / "paper-figure2.png", keyframe_indices=[0, 4], view=VIEW)

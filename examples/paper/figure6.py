@@ -37,4 +37,4 @@ def main(table: Table, out: Path | None, only: Sequence[str]) -> None:
         table.add(name, *percents(edge_error(x[1:4], truth[1:4], faces)))
     if out:
         drawn = {name.replace(" (", "\n("): x for name, x in (rows | {"truth": truth}).items()}
-        tm.render_sequence(drawn, faces, out / "paper-figure6.png", keyframe_indices=[0, 4], overwrite=True)
+        tm.render_sequence(drawn, faces, out / "paper-figure6.png", keyframe_indices=[0, 4])

@@ -72,4 +72,4 @@ def main(table: Table, out: Path | None, only: Sequence[str]) -> None:
         table.add(name, *errors, f"{turned(body, between, known):.0f}°", f"{thinnest(body, between, known):.2f}")
     if out:
         drawn = {name.replace(" and ", " and\n"): x for name, x in (rows | {"truth": truth}).items()}
-        tm.render_sequence(drawn, faces, out / "paper-figure7.png", keyframe_indices=[0, 4], overwrite=True)
+        tm.render_sequence(drawn, faces, out / "paper-figure7.png", keyframe_indices=[0, 4])

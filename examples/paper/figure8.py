@@ -63,4 +63,4 @@ def main(table: Table, out: Path | None, only: Sequence[str]) -> None:
                 table.add(between, name, *(f"{float(ratio):.3f}" for ratio in ratios))
             if out:
                 file = out / f"paper-figure8-{between}.png"
-                tm.render_sequence(rows, faces, file, keyframe_indices=[0, 4], overwrite=True)
+                tm.render_sequence(rows, faces, file, keyframe_indices=[0, 4])

@@ -209,7 +209,8 @@ torch_modal.layers.in_betwixt, tm.losses.Shell, `tests/project/test_docs.py::tes
 
 def test_the_first_block_of_readme_runs_in_an_empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    run_python(blocks(ROOT / "README.md")[0], names := {})
+    for _ in range(2):  # a second run replaces what the first has written
+        run_python(blocks(ROOT / "README.md")[0], names := {})
     assert names["frames"].shape == (17, 3782, 3) and [file.name for file in tmp_path.iterdir()] == ["grasp.glb"]
 
 

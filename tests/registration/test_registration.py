@@ -1,5 +1,6 @@
 """One mesh laid onto another: against known truths, on damaged meshes, and what is said when it cannot be right."""
 
+import shutil
 import sys
 from pathlib import Path
 from typing import Any
@@ -381,7 +382,7 @@ def files(pair: tuple[Mesh, Mesh, np.ndarray], tmp_path_factory: pytest.TempPath
     folder = tmp_path_factory.mktemp("register")
     (rest, faces), target, _ = pair
     meshes = [(rest, faces), target, (bent(rest, -0.3), faces)]
-    return [save_mesh(*mesh, folder / f"{name}.obj") for name, mesh in zip("abc", meshes, strict=True)]
+    return [save_mesh(*mesh, folder / f"{name}.obj")[0] for name, mesh in zip("abc", meshes, strict=True)]
 
 
 def test_key_frames_of_any_connectivity(files: list[Path], found: Registration) -> None:
@@ -392,7 +393,7 @@ def test_key_frames_of_any_connectivity(files: list[Path], found: Registration) 
     assert torch.equal(keyframes[2], tm.load_keyframes(files[2:]).keyframes[0]), "it has the first one's faces already"
     with pytest.raises(tm.MeshError, match="vertices"):
         tm.load_keyframes(files)
-    with pytest.raises(tm.MeshError, match="register=True"):
+    with pytest.raises(tm.MeshError, match="--register"):
         tm.load_keyframes(files, landmarks=np.zeros((1, 3), dtype=int))
 
 
@@ -405,7 +406,7 @@ def test_each_mesh_is_registered_from_the_one_before(
 ) -> None:
     """With the landmarks of these two meshes."""
     points, faces, _ = shuffled(pair[1][0] + 1, pair[1][1], seed=1)
-    paths, asked = [*files[:2], save_mesh(points, faces, tmp_path / "d.obj")], []
+    paths, asked = [*files[:2], *save_mesh(points, faces, tmp_path / "d.obj")], []
 
     def recorded(template: np.ndarray, faces: np.ndarray, target: np.ndarray, *_: np.ndarray, **options: Any) -> Any:
         asked.append((template, target, options["landmarks"]))
@@ -426,7 +427,7 @@ def test_each_mesh_is_registered_from_the_one_before(
 def test_doubtful_key_frames_are_refused(files: list[Path], tmp_path: Path) -> None:
     ball = trimesh.creation.icosphere(subdivisions=2)
     points, faces, _ = shuffled(np.array(ball.vertices), np.array(ball.faces))
-    other = save_mesh(points, faces, tmp_path / "ball.obj")
+    (other,) = save_mesh(points, faces, tmp_path / "ball.obj")
     with pytest.raises(tm.MeshError, match=r"doubtful.*landmarks"):
         tm.load_keyframes([files[0], other], register=True, progress=False)
 
@@ -437,9 +438,29 @@ def test_register_command_writes_the_registered_mesh(
     out = tmp_path / "wrapped.obj"
     assert cli.main(["register", *map(str, files[:2]), "--out", str(out)]) == 0
     assert "confidence" in capsys.readouterr().out
-    np.testing.assert_allclose(tm.load_keyframes([out]).keyframes[0], found.positions, atol=1e-12)
+    # Files have nine digits, and the fit is sensitive to them at a few vertices.
+    assert float((tm.load_keyframes([out]).keyframes[0] - found.positions).abs().mean()) < 1e-3
     with pytest.raises(SystemExit):
         cli.main(["register", *map(str, files[:2])])
+
+
+def test_register_command_of_a_folder_writes_a_table(
+    files: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str], found: Registration
+) -> None:
+    """The one of the pair is trusted; a ball is no pose of it, and is left out."""
+    scans, out = tmp_path / "scans", tmp_path / "out"
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    save_mesh(np.array(ball.vertices), np.array(ball.faces), scans / "ball.ply")
+    shutil.copy(files[1], scans / files[1].name)
+    assert cli.main(["register", str(files[0]), str(scans), "--out", str(out), "--quiet"]) == 3
+    result = out / files[1].with_suffix(files[0].suffix).name
+    assert float((tm.load_keyframes([result]).keyframes[0] - found.positions).abs().mean()) < 1e-3
+    head, *rows = (out / "report.csv").read_text().splitlines()
+    assert head.startswith("target,confidence") and [row.split(",")[0] for row in rows] == [files[1].name, "ball.ply"]
+    assert float(rows[1].split(",")[1]) < 0.5 < float(rows[0].split(",")[1])
+    assert sorted(path.name for path in out.iterdir()) == sorted([result.name, "report.csv"])
+    assert cli.main(["register", str(files[0]), str(scans), "--out", str(out)]) == 1
+    assert "--overwrite" in capsys.readouterr().err
 
 
 @pytest.mark.slow
