@@ -78,7 +78,6 @@ setup(
         "numpy>=1.24",
         "scipy>=1.11",
         "trimesh>=4.6.13",  # earlier ones lose the mesh of some files
-        "networkx>=3.0",
         "pytetwild>=0.4.2",
         "fast-simplification>=0.1.11",
         # Without wheels for Linux and Windows on ARM, where SciPy solves.

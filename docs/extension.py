@@ -20,6 +20,8 @@ from sphinx.util.nodes import nested_parse_with_titles
 from sphinx.writers.html5 import HTML5Translator
 
 import torch_modal as tm
+from torch_modal.motion.subdivide import keyframe_places
+from torch_modal.times import fill_linear
 
 DOCS = Path(__file__).parent
 PACKAGE = Path(tm.__file__).parent
@@ -130,7 +132,9 @@ def command_helps() -> dict[str, str]:
 
     parser = build_parser()
     (commands,) = (action for action in parser._actions if isinstance(action, argparse._SubParsersAction))
-    return {name: each.format_help() for name, each in commands.choices.items()}
+    return {
+        each.prog.split()[-1]: each.format_help() for each in commands.choices.values()
+    }  # an alias is no second one
 
 
 class CommandHelp(SphinxDirective):
@@ -255,13 +259,13 @@ def write_shape_pages(app: Sphinx) -> None:
             continue
         sample = load_sample(name)
         levels = 2 if sample.cyclic else 4
-        places = tm.keyframe_places(len(sample.keyframes), levels=levels, cyclic=sample.cyclic)
+        places = keyframe_places(len(sample.keyframes), levels=levels, cyclic=sample.cyclic)
         bases = tm.extract_bases(sample.keyframes, sample.faces, progress=False)
         rows = {
-            "torch_modal": tm.subdivide(
+            "torch_modal": tm.interpolate(
                 sample.keyframes, sample.faces, levels=levels, bases=bases, cyclic=sample.cyclic, progress=False
             ),
-            "linear": tm.linear_sequence(sample.keyframes, places),
+            "linear": fill_linear(sample.keyframes, places),
         }
         page.unlink(missing_ok=True)
         keys = places[:-1] if sample.cyclic else places

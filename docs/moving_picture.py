@@ -11,6 +11,8 @@ from torch import Tensor
 import torch_modal as tm
 from torch_modal.data.samples import load_sample
 from torch_modal.geometry.rotations import exp
+from torch_modal.motion.subdivide import keyframe_places
+from torch_modal.times import fill_linear
 
 FRAMES = 36
 
@@ -32,14 +34,16 @@ def main(out: Path) -> None:
         keyframes = sample.keyframes[list(order)]
         bases = tm.extract_bases(keyframes, sample.faces)
         # Two key-frames there and back again are a cycle too.
-        own = tm.subdivide(keyframes, sample.faces, 4, bases=bases, cyclic=True, smooth=name != "hand", n_frames=FRAMES)
-        places = tm.keyframe_places(len(keyframes), 4, cyclic=True, n_frames=FRAMES)
-        linear = tm.linear_sequence(keyframes, places)[:FRAMES]
+        own = tm.interpolate(
+            keyframes, sample.faces, 4, bases=bases, cyclic=True, smooth=name != "hand", n_frames=FRAMES
+        )
+        places = keyframe_places(len(keyframes), 4, cyclic=True, n_frames=FRAMES)
+        linear = fill_linear(keyframes, places)[:FRAMES]
         for x, place in ((own, -0.55), (linear, 0.55)):
             shapes.append(size * seen(x, *sample.view) + torch.tensor([place, row, 0.0]))
             faces.append(sample.faces + n)
             n += x.shape[1]
-    tm.save_animation(torch.cat(shapes, 1), torch.cat(faces), out, 16, cyclic=True, duration=2.0, overwrite=True)
+    tm.save_animation(torch.cat(shapes, 1), torch.cat(faces), out, 16, cyclic=True, duration=2.0)
 
 
 if __name__ == "__main__":

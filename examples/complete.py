@@ -71,9 +71,7 @@ def main(folder: Path, n_points: int = 1500) -> dict[str, float]:
     folder.mkdir(parents=True, exist_ok=True)
     frames = torch.linspace(FIRST, LAST, 25, dtype=torch.float64)
     ends = [0, len(frames) - 1]
-    tm.save_animation(
-        completion(frames), sample.faces, folder / "complete.glb", fps=24, keyframe_indices=ends, overwrite=True
-    )
+    tm.save_animation(completion(frames), sample.faces, folder / "complete.glb", fps=24, keyframe_indices=ends)
     tm.render_sequence(
         {"completed": completion.shapes, "true": truth},
         sample.faces,
@@ -84,7 +82,6 @@ def main(folder: Path, n_points: int = 1500) -> dict[str, float]:
         colors={"completed": 1 - completion.confidence},
         color_label="1 - confidence",
         points={"seen": [one.points for one in observations]},
-        overwrite=True,
     )
     return {
         name: float((x - truth).norm(dim=-1).mean()) / diagonal

@@ -82,7 +82,6 @@ def main(out: Path, n: int = 500, rounds: int = 1) -> dict[str, float]:
         columns=range(6),
         colors={name: 100 * (y - truth[six]).norm(dim=-1) for name, y in shown.items()},
         color_label="distance from the test [% of the diagonal]",
-        overwrite=True,
     )
     print(f"picture: {out / 'few-shot.png'}")
     return {name: mean / means["mixtures"] for name, mean in means.items()}

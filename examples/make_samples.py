@@ -345,7 +345,7 @@ def main() -> None:
         describe(name, rest, faces, frames)
         for kind, shapes in frames.items():
             for n, shape in enumerate(shapes, start=0 if kind == "key" or name == "creature" else 1):
-                tm.save_mesh(shape, faces, out / name / f"{kind}-{n}.ply", overwrite=True)
+                tm.save_mesh(shape, faces, out / name / f"{kind}-{n}.ply")
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ the command line reads, both animals as OBJ, the morph as GLB, and a picture bes
 the shell, with the files that this writes:
 
     torch-modal register slender.obj stout.obj --across --landmarks landmarks.txt --out stout-as-slender.obj
-    torch-modal subdivide slender.obj stout-as-slender.obj --levels 3 --out morph.glb
+    torch-modal interpolate slender.obj stout-as-slender.obj --levels 3 --out morph.glb
 """
 
 import argparse
@@ -21,6 +21,9 @@ from _animals import animal, galloping, tips
 from scipy.spatial import cKDTree
 
 import torch_modal as tm
+from torch_modal.motion.subdivide import keyframe_places
+from torch_modal.registration.report import Registration
+from torch_modal.times import fill_linear
 
 TIMES = {"slender": 0.0, "stout": 4.5}
 """Of their strides, in frames: stretched, and about to push off with the hind legs."""
@@ -29,7 +32,7 @@ TIMES = {"slender": 0.0, "stout": 4.5}
 class Morph(NamedTuple):
     """What came out."""
 
-    registration: tm.Registration
+    registration: Registration
     frames: torch.Tensor
     """From the slender animal to the stout one. *Shape:* ``(N, V, 3)``."""
     faces: torch.Tensor
@@ -42,7 +45,7 @@ def main(out: Path, levels: int = 3, cell: float | None = None) -> Morph:
 
     Args:
         out: Folder for the files; it is made if missing.
-        levels: Of `subdivide`: ``2**levels`` frames from one to the other.
+        levels: Of `interpolate`: ``2**levels`` frames from one to the other.
         cell: Length of the edges of the slender animal; 1.15 times that of the stout one.
     """
     out.mkdir(parents=True, exist_ok=True)
@@ -53,17 +56,17 @@ def main(out: Path, levels: int = 3, cell: float | None = None) -> Morph:
     np.savetxt(out / "landmarks.txt", landmarks, fmt="%d", header="slender  stout")
     (_, faces, _), (_, stout_faces, _) = bodies.values()
     slender, stout = (galloping(name, TIMES[name], cells[name]) for name in bodies)
-    tm.save_mesh(slender, faces, out / "slender.obj", overwrite=True)
-    tm.save_mesh(stout, stout_faces, out / "stout.obj", overwrite=True)
+    tm.save_mesh(slender, faces, out / "slender.obj")
+    tm.save_mesh(stout, stout_faces, out / "stout.obj")
     registration = tm.register(slender, faces, stout, stout_faces, landmarks=landmarks, same_subject=False)
     print(registration.summary())
 
     keyframes = torch.stack([torch.from_numpy(slender), registration.positions])
-    frames = tm.subdivide(keyframes, faces, levels)
-    places = tm.keyframe_places(2, levels)
-    tm.save_animation(frames, faces, out / "morph.glb", keyframe_indices=places, ping_pong=True, overwrite=True)
-    rows = {"torch_modal": frames, "linear": tm.linear_sequence(keyframes, places)}
-    tm.render_sequence(rows, faces, out / "morph.png", columns=5, keyframe_indices=places, overwrite=True)
+    frames = tm.interpolate(keyframes, faces, levels)
+    places = keyframe_places(2, levels)
+    tm.save_animation(frames, faces, out / "morph.glb", keyframe_indices=places, ping_pong=True)
+    rows = {"torch_modal": frames, "linear": fill_linear(keyframes, places)}
+    tm.render_sequence(rows, faces, out / "morph.png", columns=5, keyframe_indices=places)
     print(f"{len(frames)} frames of {len(slender)} vertices in {out}: morph.glb, morph.png")
     return Morph(registration, frames, torch.from_numpy(faces), out)
 

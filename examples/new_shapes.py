@@ -69,7 +69,6 @@ def main(out: Path) -> dict[str, list[float]]:
         keyframe_indices=[],
         columns=range(len(poses)),
         view=sample.view,
-        overwrite=True,
     )
 
     diagonal = float((poses[0].amax(0) - poses[0].amin(0)).norm())
@@ -101,7 +100,6 @@ def main(out: Path) -> dict[str, list[float]]:
         view=sample.view,
         colors={name: torch.stack(values) for name, values in colors.items()},
         color_label="distance from the truth [% of the diagonal]",
-        overwrite=True,
     )
     print(f"pictures: {out}")
     return errors

@@ -272,7 +272,6 @@ def draw(data: Strides, results: dict[str, Learned], out: Path) -> None:
         up="y",
         colors=errors,
         color_label=label,
-        overwrite=True,
     )
 
 

@@ -56,13 +56,11 @@ def main(out: Path, cell: float | None = None) -> Transferred:
     error, copy = (float((tm.align(x, truth) - truth)[1:].norm(dim=-1).mean()) / scale for x in (moved, copied))
     print(f"{100 * error:.2f} % of the diagonal off the true gallop; copied displacements {100 * copy:.2f} %")
 
-    path = tm.subdivide(moved, stout[1], 2, cyclic=True, progress=False)
-    tm.save_animation(path, stout[1], out / "stout.glb", cyclic=True, overwrite=True)
+    path = tm.interpolate(moved, stout[1], 2, cyclic=True, progress=False)
+    tm.save_animation(path, stout[1], out / "stout.glb", cyclic=True)
     both = torch.cat([frames, moved - torch.tensor([0, 2.0, 0], dtype=moved.dtype)], 1)
     joined = torch.cat([faces, stout[1] + frames.shape[1]])
-    tm.render_sequence(
-        {"above: sample\nbelow: stout": both}, joined, out / "transfer.png", keyframe_indices=[], overwrite=True
-    )
+    tm.render_sequence({"above: sample\nbelow: stout": both}, joined, out / "transfer.png", keyframe_indices=[])
     print(f"stout.glb, transfer.png in {out}")
     return Transferred(error, copy, found.confidence)
 

@@ -11,6 +11,8 @@ from terms import Edges
 from torch import Tensor
 
 import torch_modal as tm
+from torch_modal.data.augmentation import ShapeAugmentation
+from torch_modal.inbetween.settings import PRESETS
 
 DOUBLE = torch.float64
 
@@ -61,7 +63,7 @@ class Step(torch.nn.Module):
 class Random(torch.nn.Module):
     """A transform with the space that it draws from."""
 
-    def __init__(self, kind: type[tm.ShapeAugmentation], shapes: Shapes) -> None:
+    def __init__(self, kind: type[ShapeAugmentation], shapes: Shapes) -> None:
         super().__init__()
         # Draws laid on the key-frames depend on no shape that is passed.
         options = {"on_keyframes": False} if kind is tm.RandomBlend else {}
@@ -75,7 +77,7 @@ class Random(torch.nn.Module):
 
 def space(shapes: Shapes) -> tm.ShapeSpace:
     """Of all key-frames, without tables."""
-    return tm.ShapeSpace(shapes.bases, shapes.faces, times=None)
+    return tm.ShapeSpace(shapes.bases, shapes.faces)
 
 
 def in_between(shapes: Shapes, **options: Any) -> tm.InBetween:
@@ -150,7 +152,7 @@ def blended(layer: Any, x: Tensor) -> Tensor:
     return layer(x, torch.tensor([[0.2, 0.3, 0.5], [0.334, 0.333, 0.333]]).to(x))
 
 
-COARSE = replace(tm.PRESETS["modal"].objective, coarse_faces=30)
+COARSE = replace(PRESETS["modal"].objective, coarse_faces=30)
 
 LAYERS: dict[str, Case] = {
     "InBetween": Case(in_between, pair_in_time),
@@ -182,7 +184,6 @@ TRANSFORMS: dict[str, Case] = {
     kind.__name__: Case(partial(Random, kind), lambda layer, x: layer(x), batched=False)
     for kind in (
         tm.RandomBlend,
-        tm.RandomExtrapolation,
         tm.RandomInBetween,
         tm.RandomModalDeformation,
         tm.RandomRigidMotion,
@@ -195,7 +196,6 @@ FUNCTIONS: dict[str, Case] = {
     "subdivide": Case(
         lambda s: s, lambda s, x: tm.subdivide(x, s.faces, 1, bases=s.bases, preset="fast", progress=False)
     ),
-    "linear_sequence": Case(lambda s: s, lambda _, x: tm.linear_sequence(x, tm.keyframe_places(3, 1))),
     "fit": Case(space, lambda space, x: space.fit(x[1, ::5], torch.arange(0, x.shape[1], 5)).shape),
     "components": Case(space, lambda space, x: space.components().coordinates(x)),
     "self_contacts": Case(lambda s: s, lambda s, x: tm.self_contacts(x, s.faces).number),

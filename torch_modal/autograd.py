@@ -80,7 +80,7 @@ def require_numbers(layer: str, x: Tensor) -> None:
     kind = "a meta tensor has" if x.is_meta else "torch.export has"
     raise RuntimeError(
         f"{layer} takes steps that depend on the numbers of its input, and {kind} none: move it to a device with data, "
-        "and leave it out of what is exported; docs/layer.md names the settings and layers that can be exported"
+        "and leave it out of what is exported; docs/solving.md names the settings and layers that can be exported"
     )
 
 

@@ -1,4 +1,4 @@
-"""Exceptions and warnings about input."""
+"""Exceptions and warnings."""
 
 
 class MeshWarning(UserWarning):
@@ -11,3 +11,11 @@ class MissingPackageError(ImportError):
 
 class MeshError(ValueError):
     """Input that cannot work: a file, an array or a mesh."""
+
+
+class ModalAnalysisError(RuntimeError):
+    """The mesher failed, or the eigenproblem has no trustworthy solution; the message says why, and gives a remedy."""
+
+
+class ConvergenceError(RuntimeError):
+    """A gradient was requested through a minimisation that did not converge."""

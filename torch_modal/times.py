@@ -45,13 +45,15 @@ def check_times(times: Times, n: int, cyclic: bool | None = False, of: str = "ke
     )
 
 
-def fill_times(times: Tensor, places: Sequence[int]) -> Tensor:
-    """Times of all frames up to the last place, even within each interval, of which the places have the given times.
+def fill_linear(values: Tensor, places: Sequence[int]) -> Tensor:
+    """Values of all frames up to the last place, linear between the places, which have the given values.
 
-    *Shape:* ``(N,), (N,) -> (T,)``.
+    One place more than values closes a cycle, whose last frame is left out. *Shape:* ``(N, ...) -> (T, ...)``.
     """
-    at = np.interp(np.arange(places[-1] + 1), places, times.cpu().numpy())
-    return torch.from_numpy(at).to(times.device)
+    cyclic, n = len(places) > len(values), len(values)
+    at = np.interp(np.arange(places[-1] + (not cyclic)), places, np.arange(len(places)))
+    left, u = torch.from_numpy(at).long(), torch.from_numpy(at).frac().to(values)
+    return torch.lerp(values[left % n], values[(left + 1) % n], u.reshape(-1, *[1] * (values.dim() - 1)))
 
 
 def wrap_times(t: Tensor, times: Tensor) -> Tensor:

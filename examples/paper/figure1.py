@@ -20,6 +20,7 @@ from torch import Tensor
 
 import torch_modal as tm
 from torch_modal.data.samples import load_sample
+from torch_modal.times import fill_linear
 
 COLUMNS = ["", "edge error", "in the regions", "vertex error", "time, s"]
 CHECK = "linear Hildebrandt"
@@ -36,13 +37,13 @@ def main(table: Table, out: Path | None, only: Sequence[str], meshes: Path | Non
     bases = tm.extract_bases(keys, faces, progress=False)
     times, half = torch.arange(12.0) / 2, 2 ** (LEVELS - 1)
     methods: dict[str, Callable[[], Tensor]] = {
-        "linear": lambda: tm.linear_sequence(keys, range(0, 25, 4))[::half],
+        "linear": lambda: fill_linear(keys, range(0, 25, 4))[::half],
         "Hildebrandt et al. 2012": lambda: spacetime(keys, faces, times, cyclic=True),
         "Hildebrandt et al. 2012, faster": lambda: spacetime(keys, faces, times, cyclic=True, pitch=0.1),
-        "the paper": lambda: tm.subdivide(
+        "the paper": lambda: tm.interpolate(
             keys, faces, LEVELS, cyclic=True, bases=bases, preset="paper", progress=False
         )[::half],
-        "torch_modal": lambda: tm.subdivide(keys, faces, LEVELS, cyclic=True, progress=False)[::half],
+        "torch_modal": lambda: tm.interpolate(keys, faces, LEVELS, cyclic=True, progress=False)[::half],
         "torch_modal, encoded": lambda: tm.encode(
             frames, faces, list(range(0, 12, 2)), 60, cyclic=True, progress=False
         ).decode(),
@@ -66,4 +67,4 @@ def main(table: Table, out: Path | None, only: Sequence[str], meshes: Path | Non
             for name, x in rows.items()
         }
         file, label = out / "paper-figure1.png", "edge error, %"
-        tm.render_sequence(rows, faces, file, range(5), None, [0, 2, 4], colors=off, color_label=label, overwrite=True)
+        tm.render_sequence(rows, faces, file, range(5), None, [0, 2, 4], colors=off, color_label=label)

@@ -15,6 +15,7 @@ from errors import edge_error, lengths, percents
 from results import Table, wanted
 
 import torch_modal as tm
+from torch_modal.times import fill_linear
 
 COLUMNS = ["", "edge error"]
 CHECK = "linear torch_modal"
@@ -33,9 +34,9 @@ def main(table: Table, out: Path | None, only: Sequence[str], meshes: Path | Non
         truth = torch.stack([torch.from_numpy(body.pose(n / 4)) for n in range(5)])
         keyframes = truth[[0, 4]]
     methods = {
-        "linear": lambda: tm.linear_sequence(keyframes, [0, 4]),
-        "the paper": lambda: tm.subdivide(keyframes, faces, levels=2, preset="paper", progress=False),
-        "torch_modal": lambda: tm.subdivide(keyframes, faces, levels=2, progress=False),
+        "linear": lambda: fill_linear(keyframes, [0, 4]),
+        "the paper": lambda: tm.interpolate(keyframes, faces, levels=2, preset="paper", progress=False),
+        "torch_modal": lambda: tm.interpolate(keyframes, faces, levels=2, progress=False),
     }
     rows = {name: method() for name, method in methods.items() if wanted(name, only)}
     for name, x in rows.items():
@@ -47,4 +48,4 @@ def main(table: Table, out: Path | None, only: Sequence[str], meshes: Path | Non
         table.add(name, *percents(error))
     if out:
         rows |= {} if truth is None else {"truth": truth}
-        tm.render_sequence(rows, faces, out / "paper-figure2.png", keyframe_indices=[0, 4], view=VIEW, overwrite=True)
+        tm.render_sequence(rows, faces, out / "paper-figure2.png", keyframe_indices=[0, 4], view=VIEW)

@@ -70,4 +70,4 @@ def main(table: Table, out: Path | None, only: Sequence[str]) -> None:
     if out:
         file, every = out / "paper-figure3.png", range(N_MODES)
         titles = [f"mode {i + 1}" for i in every]
-        tm.render_sequence(rows, faces, file, every, titles, every, overwrite=True)
+        tm.render_sequence(rows, faces, file, every, titles, every)

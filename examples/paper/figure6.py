@@ -15,6 +15,7 @@ from results import Table, wanted
 
 import torch_modal as tm
 from torch_modal.data.samples import load_sample
+from torch_modal.times import fill_linear
 
 COLUMNS = ["", "edge error"]
 CHECK = "linear torch_modal"
@@ -26,9 +27,9 @@ def main(table: Table, out: Path | None, only: Sequence[str]) -> None:
     faces, ends = hand.faces, hand.keyframes
     truth = torch.stack([ends[0], *hand.truth, ends[1]])
     methods = {
-        "linear": lambda: tm.linear_sequence(ends, [0, 4]),
-        "the paper": lambda: tm.subdivide(ends, faces, levels=2, preset="paper", progress=False),
-        "torch_modal": lambda: tm.subdivide(ends, faces, levels=2, progress=False),
+        "linear": lambda: fill_linear(ends, [0, 4]),
+        "the paper": lambda: tm.interpolate(ends, faces, levels=2, preset="paper", progress=False),
+        "torch_modal": lambda: tm.interpolate(ends, faces, levels=2, progress=False),
         "geodesic (Kilian et al. 2007)": lambda: geodesic(*ends, faces).frames[::2],
     }
     rows = {name: method() for name, method in methods.items() if wanted(name, only)}
@@ -36,4 +37,4 @@ def main(table: Table, out: Path | None, only: Sequence[str]) -> None:
         table.add(name, *percents(edge_error(x[1:4], truth[1:4], faces)))
     if out:
         drawn = {name.replace(" (", "\n("): x for name, x in (rows | {"truth": truth}).items()}
-        tm.render_sequence(drawn, faces, out / "paper-figure6.png", keyframe_indices=[0, 4], overwrite=True)
+        tm.render_sequence(drawn, faces, out / "paper-figure6.png", keyframe_indices=[0, 4])

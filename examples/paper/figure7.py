@@ -62,8 +62,8 @@ def main(table: Table, out: Path | None, only: Sequence[str]) -> None:
         "Fröhlich and Botsch 2011": lambda: torch.stack(
             [x_a, *(froehlich_botsch(reduced, n / 4) for n in (1, 2, 3)), x_b]
         ),
-        "the paper": lambda: tm.subdivide(ends, faces, levels=2, preset="paper", progress=False),
-        "torch_modal": lambda: tm.subdivide(ends, faces, levels=2, progress=False),
+        "the paper": lambda: tm.interpolate(ends, faces, levels=2, preset="paper", progress=False),
+        "torch_modal": lambda: tm.interpolate(ends, faces, levels=2, progress=False),
     }
     rows = {name: method() for name, method in methods.items() if wanted(name, only)}
     for name, x in rows.items():
@@ -72,4 +72,4 @@ def main(table: Table, out: Path | None, only: Sequence[str]) -> None:
         table.add(name, *errors, f"{turned(body, between, known):.0f}°", f"{thinnest(body, between, known):.2f}")
     if out:
         drawn = {name.replace(" and ", " and\n"): x for name, x in (rows | {"truth": truth}).items()}
-        tm.render_sequence(drawn, faces, out / "paper-figure7.png", keyframe_indices=[0, 4], overwrite=True)
+        tm.render_sequence(drawn, faces, out / "paper-figure7.png", keyframe_indices=[0, 4])

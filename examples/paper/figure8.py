@@ -20,6 +20,7 @@ from results import Table, wanted
 from torch import Tensor
 
 import torch_modal as tm
+from torch_modal.times import fill_linear
 
 COLUMNS = ["length of the tail between", "", "a quarter", "half-way", "three quarters"]
 LABELS = 2
@@ -47,7 +48,7 @@ def main(table: Table, out: Path | None, only: Sequence[str]) -> None:
     """Draw both."""
     faces = torch.from_numpy(animal("slender")[1])
     pairs = {
-        "poses": lambda: tm.subdivide(
+        "poses": lambda: tm.interpolate(
             torch.stack([torch.from_numpy(galloping("slender", time)) for time in TIMES]), faces, 2, progress=False
         ),
         "shapes": morph,
@@ -55,11 +56,11 @@ def main(table: Table, out: Path | None, only: Sequence[str]) -> None:
     for between, subdivided in pairs.items():
         if wanted(between, only):
             own = subdivided()
-            rows = {"linear": tm.linear_sequence(own[[0, 4]], [0, 4]), "torch_modal": own}
+            rows = {"linear": fill_linear(own[[0, 4]], [0, 4]), "torch_modal": own}
             for name, x in rows.items():
                 lengths = tail_lengths(x)
                 ratios = lengths[1:4] / lengths[[0, 4]].mean()
                 table.add(between, name, *(f"{float(ratio):.3f}" for ratio in ratios))
             if out:
                 file = out / f"paper-figure8-{between}.png"
-                tm.render_sequence(rows, faces, file, keyframe_indices=[0, 4], overwrite=True)
+                tm.render_sequence(rows, faces, file, keyframe_indices=[0, 4])

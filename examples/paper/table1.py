@@ -22,15 +22,17 @@ from results import Table, wanted
 import torch_modal as tm
 from torch_modal.data.samples import load_sample
 from torch_modal.geometry.surface import Surface
+from torch_modal.modes.lattice import Lattice
 from torch_modal.modes.tetrahedra import Mesher, Tetrahedra
+from torch_modal.modes.tetwild import TetWild
 
 COLUMNS = ["model", "#V", "#N", "#K", "#D", "IT, s", "UT, s", "UT by default, s"]
 CHECK = "hand"
 N_MODES = 50
-DENSE = tm.TetWild(edge_length_fac=0.007, epsilon=1e-3, max_surface_faces=10**8, timeout=3600)
+DENSE = TetWild(edge_length_fac=0.007, epsilon=1e-3, max_surface_faces=10**8, timeout=3600)
 """As many tetrahedra as the paper's."""
 ROWS: dict[str, tuple[Mesher, tuple[tuple[str, ...], ...]]] = {
-    "creature": (tm.Lattice(), ()),
+    "creature": (Lattice(), ()),
     "creature, fTetWild": (
         DENSE,
         (
@@ -39,9 +41,9 @@ ROWS: dict[str, tuple[Mesher, tuple[tuple[str, ...], ...]]] = {
             ("paper: cat", "7,207", "41.4K", "2", "60", "58.36", "0.09"),
         ),
     ),
-    "hand": (tm.Lattice(), (("paper: hand", "13,071", "50.2K", "2", "100", "31.86", "0.28"),)),
-    "wader": (tm.Lattice(), (("paper: flamingo", "26,284", "103K", "2", "100", "153.01", "0.73"),)),
-    "person": (tm.Lattice(), (("paper: women", "25,381", "93.7K", "2", "100", "96.06", "0.12"),)),
+    "hand": (Lattice(), (("paper: hand", "13,071", "50.2K", "2", "100", "31.86", "0.28"),)),
+    "wader": (Lattice(), (("paper: flamingo", "26,284", "103K", "2", "100", "153.01", "0.73"),)),
+    "person": (Lattice(), (("paper: women", "25,381", "93.7K", "2", "100", "96.06", "0.12"),)),
 }
 """Bodies and their meshers, and the paper's rows for those most like them."""
 
@@ -90,7 +92,7 @@ class Counted:
 def main(table: Table, out: Path | None, only: Sequence[str], meshes: Path | None = None) -> None:
     """A row for each body, and the paper's."""
     published = {row[0].removeprefix("paper: "): row for _, theirs in ROWS.values() for row in theirs}
-    rows = {name: (tm.Lattice(), (published[name],)) for name in MESHES} if meshes else ROWS
+    rows = {name: (Lattice(), (published[name],)) for name in MESHES} if meshes else ROWS
     for name, (mesher, theirs) in rows.items():
         if not wanted(name, only):
             continue

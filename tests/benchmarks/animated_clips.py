@@ -203,7 +203,6 @@ def draw(folder: Path, ranked: list[tuple[float, Clip, dict[str, Tensor]]]) -> N
             folder / f"public-{label}.png",
             titles=[f"frame {int(others[i])}" for i in middle],
             keyframe_indices=[],
-            overwrite=True,
         )
         print(f"{label}: {clip.body} {clip.name}")
 

@@ -31,6 +31,8 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader, Dataset, default_collate
 
 import torch_modal as tm
+from torch_modal.data.augmentation import ShapeAugmentation
+from torch_modal.data.shape_batch import ShapeBatch
 
 MESHES = {"creature": ("creature",), "hand": ("mh-hand-path", "00", "04", "08"), "woman": ("mh-woman",)}
 """A sample, and folders beside the project with the files of them."""
@@ -42,7 +44,7 @@ N_POSES, N_MARKERS, MARKER_NOISE = 6, 20, 0.005
 class RandomLinear(tm.RandomInBetween):
     """What all is compared with: linear interpolation, everything else being the same."""
 
-    def shapes(self, batch: tm.ShapeBatch, partners: tm.ShapeBatch, t: Tensor, space: tm.ShapeSpace) -> Tensor:
+    def shapes(self, batch: ShapeBatch, partners: ShapeBatch, t: Tensor, space: tm.ShapeSpace) -> Tensor:
         """Linear mixtures."""
         return torch.lerp(batch.shapes, partners.shapes, t[:, None, None])
 
@@ -63,18 +65,16 @@ class Files(Dataset[dict[str, Tensor]]):
 def ways(folder: Path, n: int) -> dict[str, Callable[[], Dataset[Any]]]:
     """The data sets by their names; an epoch of slow ones has fewer shapes."""
 
-    def of(transform: tm.ShapeAugmentation, share: int = 1, **options: Any) -> Callable[[], Dataset[Any]]:
+    def of(transform: ShapeAugmentation, share: int = 1, **options: Any) -> Callable[[], Dataset[Any]]:
         return lambda: tm.ShapeDataset(folder, transform, samples_per_set=max(2 * BATCH, n // share), **options)
 
     return {
         "meshes read from disk": lambda: Files(folder, max(2 * BATCH, n // 8)),
         "linear mixtures": of(RandomLinear(p=1.0)),
-        "`RandomInBetween`, from tables": of(tm.RandomInBetween(p=1.0)),
-        "`RandomInBetween`, each solved (`times=None`)": of(tm.RandomInBetween(p=1.0), 8, times=None),
+        "`RandomInBetween`": of(tm.RandomInBetween(p=1.0), 8),
         "`RandomBlend(members=64)`, from a table": of(tm.RandomBlend(p=1.0, members=64)),
         "`RandomBlend`, each solved": of(tm.RandomBlend(p=1.0), 16),
         "`RandomModalDeformation`, always new": of(tm.RandomModalDeformation(p=1.0), 4),
-        "`RandomExtrapolation`, from tables": of(tm.RandomExtrapolation(p=1.0), 4),
     }
 
 

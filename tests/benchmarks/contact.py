@@ -159,7 +159,6 @@ def pictures(folder: Path, case: Case, found: Run) -> None:
         view=view,
         colors=marks,
         color_label="1: passes through",
-        overwrite=True,
     )
     print(f"picture: {path}")
 

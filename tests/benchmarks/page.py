@@ -25,6 +25,8 @@ from browsers import open_browser, open_page
 
 import torch_modal as tm
 from torch_modal.data.samples import SAMPLES, load_sample
+from torch_modal.motion.subdivide import keyframe_places
+from torch_modal.times import fill_linear
 
 if TYPE_CHECKING:
     from selenium.webdriver import Chrome
@@ -35,8 +37,8 @@ LEVELS = 5  # 32 intervals between two key-frames
 def measure(name: str, folder: Path) -> list[str]:
     """A line of the table."""
     sample = load_sample(name)
-    shapes = tm.subdivide(sample.keyframes[:2], sample.faces, LEVELS)
-    path = tm.show(shapes, sample.faces).save(folder / "page.html", overwrite=True)
+    shapes = tm.interpolate(sample.keyframes[:2], sample.faces, LEVELS)
+    path = tm.show(shapes, sample.faces).save(folder / "page.html")
     return [f"{name}, {len(shapes)} shapes of {shapes.shape[1]:,} vertices", f"{path.stat().st_size / 1e6:.2f} MB"]
 
 
@@ -52,17 +54,17 @@ def draw(out: Path, folder: Path) -> None:
     from selenium.webdriver.common.actions.action_builder import ActionBuilder
 
     hand, creature = load_sample("hand"), load_sample("creature")
-    places = tm.keyframe_places(2, 2)
+    places = keyframe_places(2, 2)
     rows = {
-        "torch_modal": tm.subdivide(hand.keyframes, hand.faces, 2),
-        "linear": tm.linear_sequence(hand.keyframes, places),
+        "torch_modal": tm.interpolate(hand.keyframes, hand.faces, 2),
+        "linear": fill_linear(hand.keyframes, places),
         "truth": torch.cat([hand.keyframes[:1], hand.truth, hand.keyframes[1:]]),
     }
     closing = tm.show(rows, hand.faces, keyframe_indices=places, view=hand.view, title="Closing hand")
-    keyframes, places = creature.keyframes[:3], tm.keyframe_places(3, 3)
+    keyframes, places = creature.keyframes[:3], keyframe_places(3, 3)
     rows = {
-        "torch_modal": tm.subdivide(keyframes, creature.faces, 3),
-        "linear": tm.linear_sequence(keyframes, places),
+        "torch_modal": tm.interpolate(keyframes, creature.faces, 3),
+        "linear": fill_linear(keyframes, places),
     }
     gallop = tm.show(rows, creature.faces, keyframe_indices=places, view=creature.view, title="Gallop")
     with open_browser(1240, 760) as chrome:

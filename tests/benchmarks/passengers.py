@@ -64,7 +64,7 @@ def fine_meshes(levels: int, n_proxy: int, picture: Path | None) -> list[str]:
     distance = float((found[1] - full).norm(dim=-1).mean()) / diagonal
     if picture is not None:
         rows = {"by proxy": found, "whole mesh": torch.stack([keyframes[0], full, keyframes[1]])}
-        tm.render_sequence(rows, faces, picture, view=load_sample("creature").view, overwrite=True)
+        tm.render_sequence(rows, faces, picture, view=load_sample("creature").view)
     times = f"{own_time:.2f}; {whole_time:.2f} s", f"{set_up[0]:.0f}; {set_up[1]:.0f} s"
     return [f"{keyframes.shape[1]:,}", *times, percent(distance), number(errors[0] / errors[1], ".2f")]
 

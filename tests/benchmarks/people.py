@@ -32,7 +32,7 @@ from timing import limit_threads
 import torch_modal as tm
 from torch_modal.arrays import FloatArray
 from torch_modal.geometry.decimation import decimate
-from torch_modal.registration.report import TRUSTED
+from torch_modal.registration.report import TRUSTED, Registration
 from torch_modal.registration.surface import MeshSurface, largest_pieces
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "registration"))
@@ -160,7 +160,7 @@ def landmark_vertices() -> list[int]:
 
 
 # ------------------------------------------------------------------------------------------------------------ measures
-def error(found: tm.Registration, pair: Pair) -> float:
+def error(found: Registration, pair: Pair) -> float:
     """Mean distance along the target from the true places, in per cent of the root of its area."""
     target, sample = pair.target, np.random.default_rng(0).permutation(len(pair.truth))[:N_MEASURED]
     solver = potpourri3d.MeshHeatMethodDistanceSolver(target.vertices, target.faces)

@@ -40,6 +40,7 @@ from torch_modal.data.samples import sample_files
 from torch_modal.geometry.connectivity import edge_graph
 from torch_modal.geometry.decimation import decimate
 from torch_modal.io.read import open_asset
+from torch_modal.registration.report import Registration
 from torch_modal.registration.surface import MeshSurface, drop_unreferenced
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "examples"))
@@ -164,7 +165,7 @@ class Hole(NamedTuple):
     """Of the template's vertices, in percent of the whole target's diagonal. *Shape:* ``(V,)``."""
     there: BoolArray
     """The vertices that the target has. *Shape:* ``(V,)``."""
-    found: tm.Registration
+    found: Registration
 
 
 @cache
@@ -219,7 +220,7 @@ class Result(NamedTuple):
     seconds: float
 
 
-def registered(*meshes: Any, **options: Any) -> tuple[tm.Registration | None, float]:
+def registered(*meshes: Any, **options: Any) -> tuple[Registration | None, float]:
     """A registration, unless it is refused, and its seconds."""
     started, found = time.process_time(), None
     with contextlib.suppress(tm.MeshError):
@@ -353,7 +354,7 @@ def middle(name: str, i: int, j: int) -> Result:
     found, seconds = registered(rest, triangles, shapes[j], faces)
     assert found is not None
     halves = [
-        tm.subdivide(np.stack(pair), f, 1, progress=False)[1].numpy()
+        tm.interpolate(np.stack(pair), f, 1, progress=False)[1].numpy()
         for pair, f in (((rest, found.positions.numpy()), triangles), ((shapes[i], shapes[j]), faces))
     ]
     mine, true = MeshSurface(halves[0], triangles), MeshSurface(halves[1], faces)
@@ -396,7 +397,6 @@ def picture(out: Path) -> None:
         keyframe_indices=[0],
         colors={"registered": np.stack(errors)},
         color_label="error, % of the diagonal",
-        overwrite=True,
     )
 
 

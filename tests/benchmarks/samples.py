@@ -15,6 +15,8 @@ import torch_modal as tm
 from torch_modal.data.samples import SAMPLES, Sample, load_sample
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.inspect import volume_of
+from torch_modal.motion.subdivide import keyframe_places
+from torch_modal.times import fill_linear
 
 LEVELS = 2
 
@@ -39,9 +41,9 @@ def add(name: str, table: Table) -> None:
     """A row for a sample."""
     sample = load_sample(name)
     keyframes, faces, cyclic = sample.keyframes, sample.faces, sample.cyclic
-    places = tm.keyframe_places(len(keyframes), LEVELS, cyclic=cyclic)
-    straight = tm.linear_sequence(keyframes, places)
-    own = tm.subdivide(keyframes, faces, LEVELS, cyclic=cyclic, progress=False)
+    places = keyframe_places(len(keyframes), LEVELS, cyclic=cyclic)
+    straight = fill_linear(keyframes, places)
+    own = tm.interpolate(keyframes, faces, LEVELS, cyclic=cyclic, progress=False)
     edges, volumes = zip(*(errors(sample, x, LEVELS).mean(0).tolist() for x in (straight, own)), strict=True)
     label = f"{name}, {len(keyframes)} key-frames, {keyframes.shape[1]:,} vertices"
     table.add(label, *map(percent, edges), *(f"{volume:.3f}" for volume in volumes))

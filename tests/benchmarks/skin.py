@@ -31,6 +31,7 @@ from torch_modal.cli.main import main as command
 from torch_modal.data.samples import load_sample
 from torch_modal.data.sequence import read_shapes
 from torch_modal.geometry.inspect import diagonals
+from torch_modal.geometry.skin import Skin
 
 BONES, TARGETS = 40, 8
 COLUMNS = ["", "a morph target for each frame", f"`bones={BONES}`", f"`targets={TARGETS}`"]
@@ -60,18 +61,18 @@ def measure(name: str, folder: Path) -> list[str]:
     return cells
 
 
-def by_dem_bones(frames: np.ndarray, faces: np.ndarray, bones: int) -> tm.Skin:
+def by_dem_bones(frames: np.ndarray, faces: np.ndarray, bones: int) -> Skin:
     """The skin of Dem Bones, with its own settings."""
     from py_dem_bones import solve_skinning
 
     made = solve_skinning(frames[0], frames, bone_count=bones, faces=faces)
     rest, weights, transforms = map(torch.tensor, (frames[0], made.weights.T, made.transforms))
-    return tm.Skin(rest, weights, transforms, 0.0, 0.0)
+    return Skin(rest, weights, transforms, 0.0, 0.0)
 
 
-def played_errors(skin: tm.Skin, shapes: np.ndarray, faces: np.ndarray, folder: Path) -> list[float]:
+def played_errors(skin: Skin, shapes: np.ndarray, faces: np.ndarray, folder: Path) -> list[float]:
     """Errors of the written skin at the frames, and half-way between them; shapes are at both in turns."""
-    path = tm.save_animation(shapes[::2], faces, folder / "skin.glb", fps=1, bones=skin, overwrite=True)
+    path = tm.save_animation(shapes[::2], faces, folder / "skin.glb", fps=1, bones=skin)
     off = np.square(tm.load_sequence(path, fps=2).frames.numpy() - shapes).sum(-1)
     return [
         float(np.sqrt(off[part].mean()) / diagonals(shapes[:1])[0]) for part in (slice(0, None, 2), slice(1, None, 2))
@@ -83,7 +84,7 @@ def compare(name: str, bones: int, folder: Path) -> list[float]:
     at = MOTIONS[name]
     shapes, faces = frames_of(name, np.linspace(at[0], at[-1], 2 * len(at) - 1))
     columns = []
-    methods: list[Callable[..., tm.Skin]] = [by_dem_bones, tm.bake]
+    methods: list[Callable[..., Skin]] = [by_dem_bones, tm.bake]
     for method in methods:
         started = time.process_time()
         skin = method(shapes[::2], faces, bones)
@@ -99,7 +100,7 @@ def measure_long(folder: Path) -> None:
     first, middle = faces[:more], frames.shape[1] + np.arange(more)  # faces that get a vertex in their middle
     frames = np.concatenate([frames, frames[:, first].mean(2)], 1)
     thirds = [np.stack([first[:, k], first[:, (k + 1) % 3], middle], 1) for k in range(3)]
-    tm.save_frames(frames, np.concatenate([faces[more:], *thirds]), folder / "frames", "obj")
+    tm.save_mesh(frames, np.concatenate([faces[more:], *thirds]), folder / "frames", "obj")
     started = time.process_time()
     assert command(["bake", str(folder / "frames"), "--bones", "40", "--out", str(folder / "a.glb")]) == 0
     print(f"{time.process_time() - started:.1f} s of processor time")
@@ -116,7 +117,7 @@ def draw(out: Path, folder: Path) -> None:
     }
     shown = {name: torch.tensor(row[4::8][:5]) for name, row in rows.items()}
     view = load_sample("creature").view
-    tm.render_sequence(shown, faces, out, columns=5, keyframe_indices=[], view=view, overwrite=True)
+    tm.render_sequence(shown, faces, out, columns=5, keyframe_indices=[], view=view)
     Image.open(out).quantize(128).save(out, optimize=True)
 
 

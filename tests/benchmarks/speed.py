@@ -37,6 +37,7 @@ from timing import limit_threads, timed
 
 import torch_modal as tm
 from torch_modal.data.samples import load_sample
+from torch_modal.inbetween.settings import PRESETS
 
 WORK = (
     *("whole", "fast", "modal", "torch alone"),
@@ -63,7 +64,7 @@ def layers(case: Case) -> dict[str, Callable[[], tm.InBetween]]:
     options: dict[str, dict[str, Any]] = {
         "whole": {},
         "fast": {"preset": "fast"},
-        "modal": {"preset": "modal"} if "modal" in tm.PRESETS else {},  # the former default
+        "modal": {"preset": "modal"} if "modal" in PRESETS else {},  # the former default
         "torch alone": {"solver": tm.Solver(backend="torch")},
     }
     return {name: partial(tm.InBetween, bases, case.faces, **own) for name, own in options.items()}
@@ -201,7 +202,7 @@ def threads(arguments: argparse.Namespace) -> None:
         layer(*(x.clone().requires_grad_() for x in ends), times).square().sum().backward()
 
     def divided() -> None:
-        tm.subdivide(torch.stack([case.x_a, case.x_b]), case.faces, 4, bases=case.bases(), progress=False)
+        tm.interpolate(torch.stack([case.x_a, case.x_b]), case.faces, 4, bases=case.bases(), progress=False)
 
     def extracted() -> None:
         with tempfile.TemporaryDirectory() as scratch:
@@ -227,7 +228,7 @@ start = time.perf_counter()
 import torch, torch_modal as tm
 loaded, used = time.perf_counter(), sum(os.times()[:4])
 keyframes, faces = torch.load(sys.argv[1])
-tm.subdivide(keyframes, faces, levels=3)
+tm.interpolate(keyframes, faces, levels=3)
 print(json.dumps([loaded - start, time.perf_counter() - loaded, sum(os.times()[:4]) - used]))
 """
 

@@ -15,16 +15,16 @@ from results import Table, add_keep, wanted
 from solids import eigenmodes
 from timing import limit_threads
 
-import torch_modal as tm
 from torch_modal.geometry.surface import Surface
 from torch_modal.modes.extract import MESHERS
 from torch_modal.modes.solid import without_small_pieces
 from torch_modal.modes.stiffness import HessianForm, arap_hessian, mass_matrix
 from torch_modal.modes.surface import CanonicalSurface
 from torch_modal.modes.tetrahedra import Mesher, Tetrahedra
+from torch_modal.modes.tetwild import TetWild
 
 N = 3
-FINE = tm.TetWild(0.03, 2e-3, stop_energy=10.0, max_surface_faces=10**8, timeout=3600.0)
+FINE = TetWild(0.03, 2e-3, stop_energy=10.0, max_surface_faces=10**8, timeout=3600.0)
 WAYS: tuple[tuple[str, HessianForm], ...] = (
     ("auto", "edge"),
     ("lattice", "edge"),

@@ -22,7 +22,7 @@ DIAGONAL = np.linalg.norm(np.ptp(FRAMES[0], axis=0))
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    tm.save_frames(FRAMES, FACES, tmp_path / "frames", "obj")
+    tm.save_mesh(FRAMES, FACES, tmp_path / "frames", "obj")
     return tmp_path / "frames"
 
 
@@ -60,11 +60,13 @@ def test_key_frames_alone_and_the_path_between_them(
     assert main(["bake", str(folder / "*.obj"), "--every", "3", "--out", str(out)]) == 0
     (between,) = errors(capsys.readouterr().out)
     frames = tm.load_sequence(out).frames
-    assert torch.equal(frames[[0, 3, 6, 8]], torch.tensor(FRAMES[[0, 3, 6, 8]]))
+    kept = torch.tensor(FRAMES[[0, 3, 6, 8]])
+    torch.testing.assert_close(frames[[0, 3, 6, 8]], kept, rtol=1e-8, atol=1e-12)  # nine digits
     others = [1, 2, 4, 5, 7]
     assert between == pytest.approx(rms(frames[others], FRAMES[others]), abs=1e-5) and between < 2e-3
     assert main(["bake", str(folder), "--every", "4", "--cyclic", "--out", str(out), "--overwrite", "--quiet"]) == 0
-    assert torch.equal(tm.load_sequence(out).frames[[0, 4]], torch.tensor(FRAMES[[0, 4]]))
+    again = tm.load_sequence(out).frames
+    torch.testing.assert_close(again[[0, 4]], torch.tensor(FRAMES[[0, 4]]), rtol=1e-8, atol=1e-12)
 
 
 def test_trembling_is_taken_out(folder: Path, tmp_path: Path) -> None:
@@ -84,7 +86,7 @@ def test_trembling_is_taken_out(folder: Path, tmp_path: Path) -> None:
 def test_materials_come_from_the_first_mesh(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     asset = tm.open_asset(textured_obj(tmp_path, "bar.obj"))
     moved = np.stack([bend(asset.positions, turn) for turn in (0.01, 0.4, 0.8)])
-    files = tm.save_frames(moved, asset.faces, tmp_path / "in", asset=asset)
+    files = tm.save_mesh(moved, asset.faces, tmp_path / "in", asset=asset)
     with pytest.warns(tm.MeshWarning, match="quads"):
         tm.save_animation(moved, asset.faces, tmp_path / "a.glb", asset=asset)
     assert main(["bake", *map(str, files), "--bones", "4", "--out", str(tmp_path / "b.glb")]) == 0
@@ -114,7 +116,7 @@ def test_nothing_is_overwritten_and_one_shape_is_no_motion(
     out = tmp_path / "a.glb"
     out.write_text("mine")
     bake = ["bake", str(folder), "--out"]
-    assert "exists; pass overwrite=True (--overwrite)" in fails(capsys, *bake, str(out))
+    assert "exists, and may not be replaced (--overwrite)" in fails(capsys, *bake, str(out))
     assert out.read_text() == "mine"
     np.savez(tmp_path / "a.npz", frames=FRAMES, faces=FACES)
     assert main(["bake", str(tmp_path / "a.npz"), "--targets", "2", "--out", str(out), "--overwrite", "--quiet"]) == 0
@@ -126,4 +128,4 @@ def test_nothing_is_overwritten_and_one_shape_is_no_motion(
     assert "must end in" in fails(capsys, *bake, str(tmp_path / "b.obj"))
     assert "two forms of a .glb file" in fails(capsys, *bake, "b.usda", "--bones", "3")
     assert "smooth must be a positive number" in fails(capsys, *bake, "b.glb", "--smooth", "0", "--quiet")
-    assert "pass register=True (--register)" in fails(capsys, *bake, "b.glb", "--across")
+    assert "ask for it too (--register)" in fails(capsys, *bake, "b.glb", "--across")

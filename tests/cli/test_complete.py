@@ -12,6 +12,7 @@ from test_cli import fails, misused
 
 import torch_modal as tm
 from torch_modal.cli import main as cli
+from torch_modal.completion.complete import Completion
 
 
 @pytest.fixture
@@ -44,7 +45,7 @@ def arrived(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
         confidence[-1, : len(first) // 2] = 0.1
         misses = [one.points.new_full((len(one.points),), 0.05) for one in observations]
         path = tm.Path(moved, faces, times=knots) if len(knots) > 1 else None
-        return tm.Completion(at, shapes, confidence, misses, [m.new_ones(len(m)) for m in misses], moved, path)
+        return Completion(at, shapes, confidence, misses, [m.new_ones(len(m)) for m in misses], moved, path)
 
     monkeypatch.setattr(tm, "complete", complete)
     return seen
@@ -140,7 +141,7 @@ def test_markers_keep_their_places_where_seams_are_welded(
     assert cli.main(["complete", "loose.obj", "m.csv", "--out", "still.npz", "--quiet"]) == 0
     (one,) = arrived["observations"]
     assert arrived["rests"].shape == x.shape
-    assert torch.equal(arrived["rests"][one.vertices], loose[chosen])
+    torch.testing.assert_close(arrived["rests"][one.vertices], loose[chosen], rtol=1e-8, atol=0)
     assert np.load("still.npz")["frames"].shape == (1, *loose.shape)  # one time alone stands still
 
 
@@ -200,7 +201,7 @@ def test_what_cannot_work_is_refused_before_the_work(
     own = ["--keyframes", "a.glb", "--keyframe-times", "0", "1", "--overwrite"]
     assert "is one of the meshes that are read" in fails(capsys, *base, *out, *own)
     Path("a.glb").write_text("mine")
-    assert "a.glb exists; pass overwrite=True" in fails(capsys, *base, *out)
+    assert "a.glb exists, and may not be replaced" in fails(capsys, *base, *out)
     assert Path("a.glb").read_text() == "mine"
     Path("bad.csv").write_text("time,vertex,x,y,z\n0,4000,0,0,0\n")
     assert "bad.csv, line 2: vertex 4000 " in fails(capsys, "complete", "template.obj", "bad.csv", "--out", "b.glb")

@@ -67,8 +67,8 @@ def test_sigterm_leaves_no_temporary_files(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    files = tm.save_frames(np.stack([capsule[0], 1.1 * capsule[0]]), capsule[1], tmp_path / "in", "obj")
-    monkeypatch.setattr(tm, "subdivide", lambda keyframes, *_, **__: keyframes)
+    files = tm.save_mesh(np.stack([capsule[0], 1.1 * capsule[0]]), capsule[1], tmp_path / "in", "obj")
+    monkeypatch.setattr(tm, "interpolate", lambda keyframes, *_, **__: keyframes)
     there = []
 
     def write(animation: Animation, path: Path) -> None:
@@ -88,7 +88,7 @@ def test_loops_of_links_and_long_names_are_one_line(
     where: str, tmp_path: Path, capsule: tuple[np.ndarray, np.ndarray], capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "loop.obj").symlink_to("loop.obj")
-    (mesh,) = tm.save_frames(capsule[0][None], capsule[1], tmp_path / "in", "obj")
+    (mesh,) = tm.save_mesh(capsule[0][None], capsule[1], tmp_path / "in", "obj")
     for path in (tmp_path / "loop.obj", tmp_path / f"{'n' * 5000}.obj"):
         inputs, out = (
             ([mesh, path], tmp_path / "a.glb") if where == "in" else ([mesh, mesh], path.with_suffix(".obj") / "a")

@@ -17,7 +17,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three frames of the sample, and a body of other faces, half as large, in the pose of the first."""
     folder = tmp_path_factory.mktemp("transfer")
     x, faces, *_ = tm.load_sample("creature")
-    tm.save_frames(x[:3], faces, folder / "gait", "ply")
+    tm.save_mesh(x[:3], faces, folder / "gait", "ply")
     points, own, _ = decimate(x[0].numpy(), faces.numpy(), 3000)
     tm.save_mesh(0.5 * points, own, folder / "camel.obj")
     return folder

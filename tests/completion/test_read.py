@@ -57,7 +57,7 @@ def test_missing_points_are_left_out_and_normals_that_are_zero_are_none(tmp_path
 def test_meshes_are_clouds_of_their_vertices_with_outward_normals(tmp_path: Path, suffix: str) -> None:
     stray = np.array([[9.0, 9.0, 9.0]])  # a vertex without a face is no point of the surface
     x = torch.from_numpy(np.concatenate([BALL.vertices, stray]) if suffix != ".glb" else np.asarray(BALL.vertices))
-    path = tm.save_mesh(x, torch.tensor(np.asarray(BALL.faces)), tmp_path / f"ball{suffix}")
+    (path,) = tm.save_mesh(x, torch.tensor(np.asarray(BALL.faces)), tmp_path / f"ball{suffix}")
     (found,) = load_observations([path], 3)
     assert found.normals is not None and len(found.points) == len(BALL.vertices)
     torch.testing.assert_close(found.points.norm(dim=1), torch.ones(len(BALL.vertices)).double(), rtol=0, atol=1e-6)

@@ -441,7 +441,7 @@ def test_path_takes_any_time(hand: Shapes) -> None:
 def test_nothing_changes_where_nothing_touches(bars: Shapes) -> None:
     pair = bars.pick(0, 1)
     found = tm.subdivide(pair.keyframes, pair.faces, 2, bases=pair.bases, contact=True, progress=False)
-    plain = tm.Path(pair.bases, pair.faces)(pair.keyframes, tm.frame_times(2, 2))
+    plain = tm.Path(pair.bases, pair.faces)(pair.keyframes, torch.linspace(0, 1, 5))
     torch.testing.assert_close(found, plain, rtol=0, atol=1e-12)
 
 
@@ -488,9 +488,10 @@ def test_in_betweens_that_still_cross_are_counted(hand: Shapes, monkeypatch: pyt
     assert any(message in str(one.message) for one in told)
 
 
-def test_space_draws_from_tables_without_crossings(hand: Shapes) -> None:
-    space = tm.ShapeSpace(hand.bases, hand.faces, contact=True, times=9)
-    assert int(far(space.in_betweens.table(0, 1).double(), hand).sum()) == 0
+def test_in_betweens_of_a_space_have_no_crossings(hand: Shapes) -> None:
+    space = tm.ShapeSpace(hand.bases, hand.faces, contact=True)
+    draw = tm.RandomInBetween(p=1.0, space=space, generator=torch.Generator().manual_seed(0))
+    assert int(far(draw(hand.keyframes[[0, 1] * 3]), hand).sum()) == 0
 
 
 def test_shapes_beside_keyframes_that_intersect_themselves_all_take_steps() -> None:

@@ -227,7 +227,7 @@ def test_check_says_what_crosses(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert cli.main(["check", *keys]) == 0
     assert "pairs" in capsys.readouterr().out
     middle = torch.lerp(*sample.keyframes, 0.5)
-    (file,) = tm.save_frames(middle[None], sample.faces, tmp_path, "obj")
+    (file,) = tm.save_mesh(middle[None], sample.faces, tmp_path, "obj")
     picture = tmp_path / "marked.png"
     assert cli.main(["check", str(file), "--keyframes", *keys, "--picture", str(picture)]) == 3
     line = next(line for line in capsys.readouterr().out.splitlines() if file.name in line)

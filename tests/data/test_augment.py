@@ -10,17 +10,18 @@ import torch
 from conftest import Shapes, random_rotation, seeded
 
 import torch_modal as tm
+from torch_modal.data.augmentation import ShapeAugmentation
 from torch_modal.data.deformation import deform
-from torch_modal.data.in_betweens import interpolate
+from torch_modal.data.shape_batch import ShapeBatch
 from torch_modal.data.strain import edge_strains
 from torch_modal.geometry.canonical import size
 from torch_modal.geometry.rigid import best_fit
+from torch_modal.geometry.vectors import vertex_normals
 
 F64 = torch.float64
 
-KINDS: dict[str, Callable[..., tm.ShapeAugmentation]] = {
+KINDS: dict[str, Callable[..., ShapeAugmentation]] = {
     "between": tm.RandomInBetween,
-    "extrapolation": tm.RandomExtrapolation,
     "deformation": tm.RandomModalDeformation,
     "rigid": tm.RandomRigidMotion,
     "blend": tm.RandomBlend,
@@ -47,7 +48,7 @@ def test_shapes_and_dtypes_follow_the_input(bars: Shapes, space: tm.ShapeSpace, 
     assert (out.shape, out.dtype, out.requires_grad) == (x.shape, dtype, False)
     assert bool(out.isfinite().all())
     assert not torch.equal(out, x)
-    pool = tm.ShapeBatch.of_keyframes(space, x)
+    pool = ShapeBatch.of_keyframes(space, x)
     assert augment(x[0], pool=pool).shape == (1, *x.shape[1:])
     single = KINDS[kind](p=1.0, keepdim=True, generator=seeded(), space=space)
     assert single(x[0], pool=pool).shape == x.shape[1:]
@@ -98,9 +99,9 @@ def test_single_precision_in_any_units(bars: Shapes, kind: str, scale: float) ->
     found = []
     for factor in (1.0, scale):
         bases = [tm.ModalBasis(factor * b.reference, b.eigenvalues, b.modes, b.rigid_eigenvalues) for b in bars.bases]
-        space = tm.ShapeSpace(bases, bars.faces, times=5)
+        space = tm.ShapeSpace(bases, bars.faces)
         augment = KINDS[kind](p=1.0, space=space, generator=seeded())
-        for pool in (None, tm.ShapeBatch.of_keyframes(space)):
+        for pool in (None, ShapeBatch.of_keyframes(space)):
             found.append(augment((factor * bars.keyframes).float(), pool=pool).double() / factor)
     for one, other in zip(found[:2], found[2:], strict=True):
         torch.testing.assert_close(one, other, rtol=0, atol=1e-4)
@@ -111,7 +112,7 @@ def test_single_precision_in_any_units(bars: Shapes, kind: str, scale: float) ->
     [
         (lambda: tm.RandomRigidMotion(p=1.5), "probability"),
         (lambda: tm.RandomInBetween(t=(0.2, 1.2)), r"t must be a range .* within \[0, 1\]"),
-        (lambda: tm.RandomExtrapolation(beyond=(0.3, 0.1)), "beyond must be a range"),
+        (lambda: tm.RandomBlend(beyond=(0.3, 0.1)), "beyond is a range"),
         (lambda: tm.RandomInBetween("half"), "t must be a range"),
         (lambda: tm.RandomInBetween(0.5), "t must be a range .* got 0.5"),
         (lambda: tm.RandomModalDeformation(max_strain=1.0), "max_strain"),
@@ -143,7 +144,7 @@ def test_wrong_calls(bars: Shapes, space: tm.ShapeSpace) -> None:
     with pytest.raises(ValueError, match="2 shapes need parameters with 2 rows"):
         deformation(x[:2], params=deformation.params, space=space)
     with pytest.raises(ValueError, match="a pool holds the 3 key-frames"):
-        tm.RandomInBetween(p=1.0)(x, space=space, pool=tm.ShapeBatch(x[:2]))
+        tm.RandomInBetween(p=1.0)(x, space=space, pool=ShapeBatch(x[:2]))
     with pytest.raises(ValueError, match="no in-between"):
         mirrored = x * torch.tensor([1.0, 1, -1], dtype=F64)
         tm.RandomInBetween(p=1.0, t=(0.5, 0.5))(torch.stack([x[0], mirrored[0]]), space=space)
@@ -170,49 +171,18 @@ def test_in_between_is_the_layers(bars: Shapes, space: tm.ShapeSpace) -> None:
     assert len(partners_of(augment.params).unique()) > 1
 
 
-def test_key_frames_of_a_pool_are_interpolated_from_a_table(bars: Shapes, space: tm.ShapeSpace) -> None:
-    exact = tm.ShapeSpace(bars.bases, bars.faces, dtype=F64, times=None)
-    t = torch.tensor([0.0, 0.03, 0.3, 0.51, 0.77, 0.99, 1.0], dtype=F64)
-    for i, j in ((0, 1), (2, 0)):
-        solved = exact.in_betweens.of_keyframes(i, j, t)
-        read = space.in_betweens.of_keyframes(i, j, t)
-        linear = torch.lerp(bars.keyframes[i], bars.keyframes[j], t[:, None, None])
-        assert float((read - solved).norm(dim=-1).max()) < 0.02 * float((linear - solved).norm(dim=-1).max())
-        assert float((read - solved).norm(dim=-1).max()) < 2e-4 * 4  # of a bar of length 4
-        assert torch.equal(read[0], bars.keyframes[i])
-        assert torch.equal(read[-1], bars.keyframes[j])
-    augment = tm.RandomInBetween(p=1.0, generator=seeded(), space=space)
-    pool = tm.ShapeBatch.of_keyframes(space, bars.keyframes)
-    batch = augment.transform(pool.rows(torch.tensor([2, 2])), params := augment.forward_parameters(2), None, pool)
-    for row in range(2):
-        partner = (2 + 1 + int(2 * params["partner"][row])) % 3
-        expected = space.in_betweens.of_keyframes(2, partner, params["t"][row : row + 1])[0]
-        assert torch.equal(batch.shapes[row], expected)
-
-
 def test_a_pool_may_be_plain_shapes(bars: Shapes, space: tm.ShapeSpace) -> None:
     """Nobody needs to say which key-frame each is near to: that is found."""
     transform = tm.RandomInBetween(p=1.0)
     x = bars.keyframes[:1]
-    found = transform(x, space=space, pool=tm.ShapeBatch(bars.keyframes))
-    known = transform(x, params=transform.params, space=space, pool=tm.ShapeBatch.of_keyframes(space, x))
-    torch.testing.assert_close(found, known, rtol=0, atol=1e-3)  # solved, and from the table
-
-
-def test_interpolation_is_cubic() -> None:
-    t = torch.linspace(0, 1, 9, dtype=F64)
-    curve = torch.stack([t**3 - t, 2 * t**2, 1 + t], 1)[:, None]
-    fine = torch.linspace(0, 1, 50, dtype=F64)
-    expected = torch.stack([fine**3 - fine, 2 * fine**2, 1 + fine], 1)[:, None]
-    torch.testing.assert_close(interpolate(curve, fine), expected)
-    assert torch.equal(interpolate(curve, t), curve)
-    times = torch.rand(4, dtype=F64, generator=seeded()).requires_grad_()
-    assert torch.autograd.gradcheck(lambda t: interpolate(curve, t), [times])
+    found = transform(x, space=space, pool=ShapeBatch(bars.keyframes))
+    known = transform(x, params=transform.params, space=space, pool=ShapeBatch.of_keyframes(space, x))
+    torch.testing.assert_close(found, known, rtol=0, atol=1e-12)
 
 
 def test_a_shape_alone_has_key_frames_as_partners(bars: Shapes, space: tm.ShapeSpace) -> None:
     """As with a pool; without other key-frames, or with labels, there are none."""
-    x, pool = bars.keyframes[0], tm.ShapeBatch.of_keyframes(space)
+    x, pool = bars.keyframes[0], ShapeBatch.of_keyframes(space)
     given: dict[str, Any] = {"t": (0.4, 0.6), "p": 1.0, "keepdim": True}
     found = tm.RandomInBetween(**given, space=space, generator=seeded())(x)
     assert float((found - x).abs().max()) > 0.1
@@ -235,54 +205,6 @@ def test_times_and_partners_are_uniform(space: tm.ShapeSpace) -> None:
     assert (float(t.min()), float(t.max())) == (pytest.approx(0.2, abs=1e-3), pytest.approx(0.6, abs=1e-3))
     assert float(t.mean()) == pytest.approx(0.4, abs=0.01)
     assert float(params["batch_prob"].double().mean()) == pytest.approx(0.3, abs=0.03)
-    t = tm.RandomExtrapolation(beyond=(0.1, 0.2), space=space).forward_parameters(4000, generator=seeded())["t"]
-    assert bool((((t >= -0.2) & (t <= -0.1)) | ((t >= 1.1) & (t <= 1.2))).all())
-    assert float((t > 0).double().mean()) == pytest.approx(0.5, abs=0.03)
-
-
-# --------------------------------------------------------------------------------------------------- extrapolation
-def extrapolated(space: tm.ShapeSpace, x: torch.Tensor, t: float) -> torch.Tensor:
-    """The first of two shapes, at a time on the way to the second."""
-    augment = tm.RandomExtrapolation(p=1.0, space=space)
-    params = {
-        "batch_prob": torch.tensor([True, False]),
-        "partner": torch.zeros(2, dtype=F64),
-        "t": torch.full((2,), t, dtype=F64),
-    }
-    return augment(x, params=params)[0]
-
-
-@pytest.mark.parametrize(("i", "j"), [(0, 1), (1, 0), (2, 1)])
-def test_extrapolation_goes_on_smoothly(bars: Shapes, space: tm.ShapeSpace, i: int, j: int) -> None:
-    x = bars.keyframes[[i, j]]
-    layer = tm.InBetween([bars.bases[i], bars.bases[j]], bars.faces, "fast")
-    for end, sign in ((x[0], -1), (x[1], 1)):
-        gaps = []
-        for step in (1e-2, 1e-3):
-            t_end = 0.0 if sign < 0 else 1.0
-            beyond = extrapolated(space, x, t_end + sign * step) - end
-            before = end - layer(x[0], x[1], t_end - sign * step)
-            gaps.append(float((beyond - before).norm() / before.norm()))
-        assert gaps[0] < 0.05
-        assert gaps[1] == pytest.approx(gaps[0] / 10, rel=0.5)
-
-
-@pytest.mark.parametrize(("i", "j"), [(0, 1), (1, 0), (0, 2)])
-def test_the_end_is_the_in_between_of_start_and_extrapolation(
-    bars: Shapes, space: tm.ShapeSpace, i: int, j: int
-) -> None:
-    """What defines an extrapolation, by the layer, which has no part in making it beyond the end."""
-    x = bars.keyframes[[i, j]]
-    s = 0.2
-    found = extrapolated(space, x, 1 + s)
-    linear = x[1] + s * (x[1] - x[0])
-    layer = tm.InBetween([bars.bases[i], bars.bases[j]], bars.faces, "fast")
-    back, linear_back = (layer(x[0], y, 1 / (1 + s)) for y in (found, linear))
-    moved = float((found - x[1]).norm())
-    assert float((back - x[1]).norm()) < 0.2 * moved
-    assert float((back - x[1]).norm()) < 0.5 * float((linear_back - x[1]).norm())
-    expected = volume(x[1], bars.faces)
-    assert float(volume(found, bars.faces) / expected) == pytest.approx(1, abs=0.02)
 
 
 # ----------------------------------------------------------------------------------------------------- deformation
@@ -453,7 +375,7 @@ def test_labels_go_along(bars: Shapes, space: tm.ShapeSpace) -> None:
     )
     new_pose, y, new_part, normals = augment(pose, x, part, None)
     assert torch.equal(new_part, part)
-    torch.testing.assert_close(normals, tm.vertex_normals(y, bars.faces))
+    torch.testing.assert_close(normals, vertex_normals(y, bars.faces))
     between = augment.params[0]
     expected = torch.where(between["t"] > 0.5, pose[partners_of(between)], pose)
     assert torch.equal(new_pose, expected)
@@ -473,15 +395,6 @@ def test_labels_are_blended_if_asked(bars: Shapes, space: tm.ShapeSpace) -> None
     torch.testing.assert_close(soft, (1 - t)[:, None] * one_hot + t[:, None] * one_hot[partner])
     with pytest.raises(ValueError, match="one-hot"):
         augment(bars.keyframes, torch.arange(3))
-    beyond = tm.AugmentationSequential(
-        tm.RandomExtrapolation(p=1.0, blend_labels=True),
-        data_keys=["shapes", "shape_labels"],
-        generator=seeded(),
-        space=space,
-    )
-    _, hard = beyond(bars.keyframes, one_hot)
-    assert [len(part) for part in beyond(bars.keyframes[:0], one_hot[:0])] == [0, 0]
-    assert torch.equal(hard.sort(1).values, torch.tensor([[0.0, 0, 1]], dtype=F64).expand(3, 3))
 
 
 def test_one_shape_with_its_labels(bars: Shapes, space: tm.ShapeSpace) -> None:
@@ -507,8 +420,6 @@ def test_composition_says_what_does_not_fit(bars: Shapes, space: tm.ShapeSpace) 
         augment(bars.keyframes, torch.zeros(3, 7))
     with pytest.raises(ValueError, match="normals need faces"):
         tm.AugmentationSequential(tm.RandomRigidMotion(), data_keys=["shapes", "normals"])(bars.keyframes, None)
-    with pytest.raises(ValueError, match="times is 3"):
-        tm.ShapeSpace(bars.bases, bars.faces, times=3)
     with pytest.raises(ValueError, match="one connectivity"):
         smaller = replace(bars.bases[1], reference=bars.bases[1].reference[1:], modes=bars.bases[1].modes[:, 1:])
         tm.ShapeSpace([bars.bases[0], smaller], bars.faces)
@@ -521,7 +432,7 @@ def test_composition_says_what_does_not_fit(bars: Shapes, space: tm.ShapeSpace) 
 def check_draws(shapes: Shapes, n: int) -> None:
     """All finite, strains within the bound, and volumes near those of what the shapes came from."""
     space = tm.ShapeSpace(shapes.bases, shapes.faces)
-    pool = tm.ShapeBatch.of_keyframes(space)
+    pool = ShapeBatch.of_keyframes(space)
     k = len(space)
     volumes = volume(pool.shapes.double(), shapes.faces)
     for kind, make in KINDS.items():
@@ -534,7 +445,7 @@ def check_draws(shapes: Shapes, n: int) -> None:
             y = augment.transform(batch, params, None, pool).shapes
             assert bool(y.isfinite().all()), kind
             source = volumes[rows]
-            if kind in ("between", "extrapolation"):
+            if kind == "between":
                 partner = (rows + 1 + (params["partner"] * (k - 1)).long()) % k
                 source = torch.lerp(source, volumes[partner], params["t"].clamp(0, 1))
             found = volume(y.double(), shapes.faces)

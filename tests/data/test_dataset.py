@@ -14,8 +14,10 @@ from safetensors.torch import load_file, save_file
 from torch.utils.data import DataLoader, Subset, default_collate
 
 import torch_modal as tm
+from torch_modal.data.dataset import SetBatchSampler
 from torch_modal.data.in_betweens import FORMAT, VERSION
-from torch_modal.elastic.bend import Bend
+from torch_modal.data.stored import StoredSet
+from torch_modal.geometry.vectors import vertex_normals
 from torch_modal.io.tensors import TensorFile, write_tensors
 
 N_SETS, PER_SET = 3, 8
@@ -35,7 +37,6 @@ def root(bars: Shapes, small_bars: Shapes, tmp_path_factory: pytest.TempPathFact
 def everything(p: float = 0.7) -> tm.AugmentationSequential:
     return tm.AugmentationSequential(
         tm.RandomInBetween(p=p),
-        tm.RandomExtrapolation(p=0.3),
         tm.RandomModalDeformation(p=p),
         tm.RandomRigidMotion(p=p),
     )
@@ -46,7 +47,7 @@ def dataset(root: Path, **options: Any) -> tm.ShapeDataset:
 
 
 def batches(data: tm.ShapeDataset, epochs: int = 1, **options: Any) -> list[dict[str, Any]]:
-    loader = DataLoader(data, batch_sampler=tm.SetBatchSampler(data, 4), **options)
+    loader = DataLoader(data, batch_sampler=SetBatchSampler(data, 4), **options)
     found = []
     for epoch in range(epochs):
         data.set_epoch(epoch)
@@ -71,7 +72,7 @@ def test_a_dataset_gives_samples_of_all_its_sets(root: Path, bars: Shapes) -> No
     assert (sample["vertices"].shape, sample["vertices"].dtype) == ((164, 3), torch.float32)
     assert torch.equal(sample["faces"], bars.faces)
     assert torch.equal(data.space(0).faces, bars.faces)
-    torch.testing.assert_close(sample["normals"], tm.vertex_normals(sample["vertices"][None], bars.faces)[0])
+    torch.testing.assert_close(sample["normals"], vertex_normals(sample["vertices"][None], bars.faces)[0])
     assert data[-1]["set"] == 2
     assert data[-1]["vertices"].shape == (30, 3)
     assert dataset(root, dtype=torch.float64)[0]["vertices"].dtype == torch.float64
@@ -141,7 +142,7 @@ def test_ordinary_loaders_mix_sets_of_one_connectivity(root: Path) -> None:
 
 
 LOADERS: dict[str, Callable[..., DataLoader]] = {
-    "sampler": lambda data, **options: DataLoader(data, batch_sampler=tm.SetBatchSampler(data, 3), **options),
+    "sampler": lambda data, **options: DataLoader(data, batch_sampler=SetBatchSampler(data, 3), **options),
     "plain": lambda data, **options: DataLoader(data, 3, collate_fn=list, **options),
     "subset": lambda data, **options: DataLoader(Subset(data, range(len(data))), 3, collate_fn=list, **options),
 }
@@ -260,7 +261,7 @@ def test_a_trainer_of_lightning_has_new_samples_in_each_epoch(root: Path, kind: 
 
 def test_batches_of_one_set(root: Path) -> None:
     data = dataset(root)
-    sampler = tm.SetBatchSampler(data, 3)
+    sampler = SetBatchSampler(data, 3)
     drawn = list(sampler)
     assert len(drawn) == len(sampler) == N_SETS * 3
     assert sorted(index for batch in drawn for index in batch) == list(range(len(data)))
@@ -268,12 +269,12 @@ def test_batches_of_one_set(root: Path) -> None:
     assert list(sampler) != drawn
     data.set_epoch(0)
     assert list(sampler) == drawn
-    assert list(tm.SetBatchSampler(data, 3, shuffle=False))[:4] == [[0, 1, 2], [3, 4, 5], [6, 7], [8, 9, 10]]
+    assert list(SetBatchSampler(data, 3, shuffle=False))[:4] == [[0, 1, 2], [3, 4, 5], [6, 7], [8, 9, 10]]
     with pytest.raises(ValueError, match="batch_size"):
-        tm.SetBatchSampler(data, 0)
+        SetBatchSampler(data, 0)
 
 
-def label_poses(stored: tm.StoredSet) -> dict[str, torch.Tensor]:
+def label_poses(stored: StoredSet) -> dict[str, torch.Tensor]:
     classes = {"straight": 0, "bent": 1, "twisted": 2}
     part = torch.arange(stored.n_vertices) % 4
     return {"vertex_labels": part, "shape_labels": torch.eye(3)[[classes[name] for name in stored.names]]}
@@ -294,7 +295,7 @@ def test_labels_from_a_function(root: Path) -> None:
     assert_same(batches(soft, num_workers=1, multiprocessing_context="spawn"), batches(soft))
 
 
-def soft_poses(stored: tm.StoredSet) -> dict[str, torch.Tensor]:
+def soft_poses(stored: StoredSet) -> dict[str, torch.Tensor]:
     return {"shape_labels": label_poses(stored)["shape_labels"]}
 
 
@@ -314,26 +315,6 @@ def test_labels_of_each_key_frame(bars: Shapes, tmp_path: Path) -> None:
         tm.ShapeDataset(tmp_path, labels=lambda _: {"vertex_labels": torch.zeros(163)})[0]
 
 
-def test_tables_are_kept_in_the_folders(bars: Shapes, tmp_path: Path) -> None:
-    tm.write_set(tmp_path / "set", *bars, ["0", "1", "2"])
-    first = batches(tm.ShapeDataset(tmp_path))
-    tables = sorted((tmp_path / "set").glob("between-*.safetensors"))
-    assert [path.name for path in tables] == [f"between-{pair}.safetensors" for pair in ("0-1", "0-2", "1-2")]
-    times = [path.stat().st_mtime_ns for path in tables]
-    assert_same(batches(tm.ShapeDataset(tmp_path)), first)
-    assert [path.stat().st_mtime_ns for path in tables] == times
-    # Damaged ones are made again.
-    tables[0].write_bytes(tables[0].read_bytes()[:-100])
-    assert_same(batches(tm.ShapeDataset(tmp_path)), first)
-    assert [path.stat().st_mtime_ns for path in tables] != times
-    # Where nothing can be written, nothing is.
-    for path in tables:
-        path.unlink()
-    without = tm.ShapeDataset(tmp_path, folder=None)
-    assert_same(batches(without), first)
-    assert not list((tmp_path / "set").glob("between-*"))
-
-
 def test_tables_of_members_are_kept_in_the_folders(bars: Shapes, tmp_path: Path) -> None:
     tm.write_set(tmp_path / "set", *bars, ["0", "1", "2"])
     blend = tm.RandomBlend(p=1.0, members=2)
@@ -346,17 +327,22 @@ def test_tables_of_members_are_kept_in_the_folders(bars: Shapes, tmp_path: Path)
         before = path.read_bytes()
         tm.ShapeDataset(tmp_path, other)[0]
         assert path.read_bytes() != before
+    # Damaged ones are made again; where nothing can be written, nothing is.
+    path.write_bytes(path.read_bytes()[:-100])
     assert_same(batches(tm.ShapeDataset(tmp_path, blend)), first)
+    path.unlink()
+    assert_same(batches(tm.ShapeDataset(tmp_path, blend, folder=None)), first)
+    assert not path.exists()
 
 
-def test_tables_of_other_modes_faces_settings_or_versions_are_not_read(
+def test_tables_of_other_faces_or_versions_are_not_read(
     bars: Shapes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The file is exchanged for zeros under the same key: whoever reads it is found out."""
-    path = tmp_path / "between-0-1.safetensors"
+    path = tmp_path / "between-all.safetensors"
 
-    def table(bases: list[tm.ModalBasis] = bars.bases, faces: torch.Tensor = bars.faces, **options: Any) -> Any:
-        return tm.ShapeSpace(bases, faces, folder=tmp_path, **options).in_betweens.table(0, 1)
+    def table(faces: torch.Tensor = bars.faces) -> torch.Tensor:
+        return tm.ShapeSpace(bars.keyframes, faces, folder=tmp_path).members(2, 0.2, 3.0, (0.0, 0.0))
 
     right = table()
     key = TensorFile(path, FORMAT, VERSION).metadata
@@ -366,45 +352,10 @@ def test_tables_of_other_modes_faces_settings_or_versions_are_not_read(
 
     plant()
     assert float(table().abs().max()) == 0
-    first = bars.bases[0]
-    modes = first.modes + 0.1 * torch.sin(first.reference)  # eigenvalues and shape stay
-    other = tm.ModalBasis(first.reference, first.eigenvalues, modes, first.rigid_eigenvalues)
-    changes: list[dict[str, Any]] = [
-        {"bases": [other, *bars.bases[1:]]},
-        {"times": 9},
-        {"faces": bars.faces.roll(1, 1)},
-        {"preset": "accurate"},
-        {"objective": tm.Objective(coarse_faces=300, beta=torch.full((1,), 20.0))},
-        {"objective": tm.Objective(coarse_faces=300, terms=(Bend(3.0),))},
-        {"objective": tm.Objective(coarse_faces=300, terms=(Bend(torch.tensor([3.0])),))},
-        {"solver": tm.Solver(tolerance=1e-5, local_steps=1)},
-        {"keyframe_times": (0, 1, 2)},
-        {"keyframe_times": (0, 1, 3)},
-    ]
-    for change in changes:
-        plant()
-        found = table(**change)
-        assert torch.equal(found[0], bars.keyframes[0].float()), change
-        path.unlink()
-        assert torch.equal(table(**change), found)
+    assert float(table(bars.faces.roll(1, 1)).abs().max()) > 1
     plant()
     monkeypatch.setattr("torch_modal.data.in_betweens.__version__", "0.0.1")
     assert torch.equal(table(), right)
-
-
-class Area(tm.Term):
-    def elements(self, mesh: Any) -> torch.Tensor:
-        return mesh.faces
-
-    def measure(self, edges: torch.Tensor) -> torch.Tensor:
-        return 0.5 * torch.linalg.cross(edges[0], edges[1]).norm()
-
-
-def test_tables_of_a_users_own_term_are_not_stored(bars: Shapes, tmp_path: Path) -> None:
-    """Its code is no part of any key, so that another term's table would be read."""
-    objective = tm.Objective(coarse_faces=300, terms=(Area(2.0),))
-    tm.ShapeSpace(bars.bases, bars.faces, objective=objective, folder=tmp_path).in_betweens.table(0, 1)
-    assert not list(tmp_path.iterdir())
 
 
 def test_what_does_not_converge_is_warned_of(bars: Shapes, tmp_path: Path) -> None:
@@ -412,13 +363,9 @@ def test_what_does_not_converge_is_warned_of(bars: Shapes, tmp_path: Path) -> No
     tm.write_set(tmp_path / "set", *bars, ["0", "1", "2"])
     between = tm.RandomInBetween(t=(0.4, 0.6), p=1.0)
     data = tm.ShapeDataset(tmp_path, between, preset="modal", solver=hasty, samples_per_set=3)
-    with pytest.warns(tm.ConvergenceWarning, match=r"of 17 in-betweens near the key-frames . and . "):
+    with pytest.warns(tm.ConvergenceWarning, match=r"1 of 1 in-betweens near the key-frames . and . "):
         data[0]
-    # It is not kept, so that the next run hears of it too.
-    assert not list(tmp_path.rglob("between-*"))
-    space = tm.ShapeSpace(bars.bases, bars.faces, preset="modal", solver=hasty, times=None)
-    with pytest.warns(tm.ConvergenceWarning, match=r"1 of 1 in-betweens near the key-frames 0 and 1"):
-        space.in_betweens.of_keyframes(1, 0, torch.tensor([0.5], dtype=torch.float64))
+    space = tm.ShapeSpace(bars.bases, bars.faces, preset="modal", solver=hasty)
     x = bars.keyframes + 0.01 * torch.sin(bars.keyframes)
     with pytest.warns(tm.ConvergenceWarning, match="did not converge"):
         between(x, space=space)
@@ -432,7 +379,23 @@ def test_sets_with_one_key_frame(bars: Shapes, tmp_path: Path) -> None:
     tm.write_set(tmp_path / "one", bars.keyframes[:1], bars.faces, bars.bases[:1], ["0"])
     data = tm.ShapeDataset(tmp_path, everything(p=1.0), samples_per_set=2)
     assert bool(data[1]["vertices"].isfinite().all())
-    assert torch.equal(tm.ShapeDataset(tmp_path)[0]["vertices"], bars.keyframes[0].float())
+    with pytest.raises(ValueError, match="one key-frame alone does not vary"):
+        tm.ShapeDataset(tmp_path)[0]
+    data = tm.ShapeDataset(tmp_path, tm.RandomInBetween(p=1.0))
+    assert torch.equal(data[0]["vertices"], bars.keyframes[0].float())
+
+
+def labels_of_keyframes(stored: StoredSet) -> dict[str, torch.Tensor]:
+    return {"shape_labels": torch.arange(len(stored.keyframes))}
+
+
+def test_the_default_mixes_all_key_frames_and_refuses_labels_that_differ(bars: Shapes, tmp_path: Path) -> None:
+    tm.write_set(tmp_path / "set", *bars, ["0", "1", "2"])
+    x = tm.ShapeDataset(tmp_path)[0]["vertices"]
+    assert all(float((x - key).abs().max()) > 1e-3 for key in bars.keyframes)
+    with pytest.raises(ValueError, match="labels differ between its key-frames"):
+        tm.ShapeDataset(tmp_path, labels=labels_of_keyframes)[0]
+    assert tm.ShapeDataset(tmp_path, tm.RandomInBetween(), labels=labels_of_keyframes)[0]["shape_labels"] in range(3)
 
 
 def test_only_the_last_sets_stay_open(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:

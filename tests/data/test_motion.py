@@ -8,6 +8,7 @@ import torch
 from conftest import Shapes
 
 import torch_modal as tm
+from torch_modal.data.shape_batch import ShapeBatch
 
 F64 = torch.float64
 TIMES = (0.0, 0.5, 2.0, 3.0, 4.5)
@@ -21,6 +22,13 @@ def bar_motion(bars: Shapes) -> Shapes:
 
 def space_of(shapes: Shapes, **options: Any) -> tm.ShapeSpace:
     return tm.ShapeSpace(shapes.bases, shapes.faces, **{"dtype": F64, "keyframe_times": TIMES, **options})
+
+
+def between(space: tm.ShapeSpace, i: int, j: int, t: torch.Tensor) -> torch.Tensor:
+    """Shapes between two key-frames. *Shape:* ``(B,) -> (B, V, 3)``."""
+    x = space.keyframes()
+    ends = (x[k].expand(len(t), -1, -1) for k in (i, j))
+    return space.in_betweens(*ends, t, *(torch.full((len(t),), k) for k in (i, j)))
 
 
 def largest(x: torch.Tensor) -> float:
@@ -39,7 +47,7 @@ def largest(x: torch.Tensor) -> float:
 def test_neighbours_in_time(bars: Shapes, places: tuple[int, ...], cyclic: bool, wanted: list[list[int]]) -> None:
     n = len(places)
     space = space_of(bars.pick(*places), keyframe_times=range(n + cyclic), cyclic=cyclic)
-    pool, draw = tm.ShapeBatch.of_keyframes(space), torch.tensor([0.2, 0.8]).repeat(n)
+    pool, draw = ShapeBatch.of_keyframes(space), torch.tensor([0.2, 0.8]).repeat(n)
     partners = pool.partners(torch.arange(n).repeat_interleave(2), draw, space, pool)
     assert partners is not None and partners.nearest is not None
     assert partners.nearest.view(n, 2).tolist() == wanted
@@ -50,37 +58,29 @@ def test_neighbours_in_time(bars: Shapes, places: tuple[int, ...], cyclic: bool,
 def test_neighbours_are_joined_by_the_path_and_others_by_the_pair(bar_motion: Shapes, cyclic: bool) -> None:
     when = (*TIMES, 6.0) if cyclic else TIMES
     shapes = bar_motion if not cyclic else bar_motion.pick(0, 1, 2, 1, 2)  # the last is not the first
-    space = space_of(shapes, times=None, keyframe_times=when, cyclic=cyclic)
-    pairs = space_of(shapes, times=None, keyframe_times=None)
+    space = space_of(shapes, keyframe_times=when, cyclic=cyclic)
+    pairs = space_of(shapes, keyframe_times=None)
     path = tm.Path(shapes.bases, shapes.faces, when, cyclic, preset="fast")
     u = torch.tensor([0.0, 0.2, 0.5, 0.9, 1.0], dtype=F64)
     for i in range(len(when) - 1):
         j = (i + 1) % 5
         with torch.no_grad():
             expected = path(shapes.keyframes, torch.lerp(*torch.tensor(when[i : i + 2], dtype=F64), u))
-        found = space.in_betweens.of_keyframes(i, j, u)
+        found = between(space, i, j, u)
         assert largest(found - expected) < 1e-12
-        assert largest(pairs.in_betweens.of_keyframes(i, j, u) - expected) > 2e-2
+        assert largest(between(pairs, i, j, u) - expected) > 2e-2
         assert torch.equal(found[[0, -1]], shapes.keyframes[[i, j]])
-        torch.testing.assert_close(space.in_betweens.of_keyframes(j, i, 1 - u), found, rtol=0, atol=1e-6)
-    assert torch.equal(space.in_betweens.of_keyframes(0, 2, u), pairs.in_betweens.of_keyframes(0, 2, u))
+        torch.testing.assert_close(between(space, j, i, 1 - u), found, rtol=0, atol=1e-6)
+    assert torch.equal(between(space, 0, 2, u), between(pairs, 0, 2, u))
     x = shapes.keyframes[:2] + 0.01 * torch.sin(shapes.keyframes[:2])
     given = x[:1], x[1:], u[2:3], *torch.tensor([[0], [1]])
     assert torch.equal(space.in_betweens(*given), pairs.in_betweens(*given))
 
 
-def test_tables_hold_the_path(bar_motion: Shapes) -> None:
-    t = torch.linspace(0, 1, 23, dtype=F64)
-    solved = space_of(bar_motion, times=None).in_betweens.of_keyframes(1, 2, t)
-    read = space_of(bar_motion).in_betweens.of_keyframes(1, 2, t)
-    pair = space_of(bar_motion, keyframe_times=None).in_betweens.table(1, 2)[8]
-    assert largest(read - solved) < 0.05 * largest(pair - solved[11])
-
-
 # ------------------------------------------------------------------------------------------------------ transforms
 def test_partners_of_key_frames_are_their_neighbours(bar_motion: Shapes) -> None:
     space = space_of(bar_motion)
-    pool = tm.ShapeBatch.of_keyframes(space, bar_motion.keyframes, shape_labels=torch.arange(5))
+    pool = ShapeBatch.of_keyframes(space, bar_motion.keyframes, shape_labels=torch.arange(5))
     augment = tm.RandomInBetween(t=(0.6, 0.9), p=1.0, space=space)
     start = torch.arange(5).repeat(40)
     params = augment.forward_parameters(200, generator=torch.Generator().manual_seed(0))
@@ -92,7 +92,7 @@ def test_partners_of_key_frames_are_their_neighbours(bar_motion: Shapes) -> None
     assert 0.35 < float((partner > start)[inner].double().mean()) < 0.65
     for row in range(10):
         i, j = int(start[row]), int(partner[row])
-        expected = space.in_betweens.of_keyframes(i, j, params["t"][row : row + 1])[0]
+        expected = between(space, i, j, params["t"][row : row + 1])[0]
         torch.testing.assert_close(out.shapes[row], expected, rtol=0, atol=1e-12)
 
 
@@ -104,7 +104,7 @@ def test_other_shapes_are_solved_with_their_partner_alone(bar_motion: Shapes) ->
     # Of a batch: as without times.
     assert torch.equal(augment(x, params=params, space=space), augment(x, params=params, space=pairs))
     # Of the key-frames: the one after the nearest.
-    pool = tm.ShapeBatch.of_keyframes(space, x)
+    pool = ShapeBatch.of_keyframes(space, x)
     found = augment(x, params=params, space=space, pool=pool)
     nearest = space.nearest(x)
     for row, i in enumerate(nearest.tolist()):

@@ -17,7 +17,7 @@ from torch_modal.cli import main as cli
 from torch_modal.data import precompute
 from torch_modal.data.precompute import Options, Record, read_record
 from torch_modal.data.stored import SET_FILE, StoredSet, find_sets, write_set
-from torch_modal.io.write import save_frames
+from torch_modal.io.write import save_mesh
 from torch_modal.modes.processes import ChildError
 
 FAILURES = {
@@ -239,15 +239,15 @@ def test_real_sets(capsule: tuple[np.ndarray, np.ndarray], tmp_path: Path, capsy
     vertices, faces = capsule
     root, out = tmp_path / "shapes", tmp_path / "out"
     shapes = np.stack([vertices * (1, 1, 1 + 0.1 * i) for i in range(11)])
-    save_frames(shapes[:2], faces, root / "good", fmt="obj", stem="key")
-    save_frames(shapes, faces, tmp_path / "all", fmt="obj", stem="f")
+    save_mesh(shapes[:2], faces, root / "good", fmt="obj", stem="key")
+    save_mesh(shapes, faces, tmp_path / "all", fmt="obj", stem="f")
     (root / "order").mkdir(parents=True)
     for i in (9, 10):
         (tmp_path / "all" / f"f-{i:03d}.obj").rename(root / "order" / f"frame-{i}.obj")
-    save_frames(shapes[:1], faces, root / "differs", fmt="obj", stem="a")
-    save_frames(shapes[:1], faces[1:], root / "differs", fmt="obj", stem="b")
-    save_frames(shapes[:1], faces, root / "twice", fmt="obj")
-    save_frames(shapes[:1], faces, root / "twice", fmt="ply")
+    save_mesh(shapes[:1], faces, root / "differs", fmt="obj", stem="a")
+    save_mesh(shapes[:1], faces[1:], root / "differs", fmt="obj", stem="b")
+    save_mesh(shapes[:1], faces, root / "twice", fmt="obj")
+    save_mesh(shapes[:1], faces, root / "twice", fmt="ply")
     (root / "good" / "key-001.mtl").write_text("")
     argv = ["precompute", str(root), "--out", str(out), "--modes", "4", "--mesher", "lattice"]
     assert cli.main(argv) == 3
@@ -262,7 +262,7 @@ def test_real_sets(capsule: tuple[np.ndarray, np.ndarray], tmp_path: Path, capsy
     assert torch.equal(stored.keyframes, keyframes) and torch.equal(stored.faces, own_faces)
     assert stored.names == ("key-000.obj", "key-001.obj")
     assert StoredSet(out / "order").names == ("frame-9.obj", "frame-10.obj")
-    torch.testing.assert_close(StoredSet(out / "order").keyframes, torch.from_numpy(shapes[9:]), rtol=0, atol=0)
+    torch.testing.assert_close(StoredSet(out / "order").keyframes, torch.from_numpy(shapes[9:]), rtol=1e-7, atol=1e-9)
     for mine, its in zip(tm.extract_bases(keyframes, own_faces, 4, mesher="lattice"), stored.bases, strict=True):
         torch.testing.assert_close(its.eigenvalues, mine.eigenvalues)
         torch.testing.assert_close(its.modes, mine.modes, rtol=1e-6, atol=1e-9)
@@ -279,9 +279,9 @@ def test_times_of_a_sequence(
 
     monkeypatch.setattr(precompute, "extract_bases", extract)
     source, target = tmp_path / "a", tmp_path / "out"
-    files = save_frames(np.stack([capsule[0] * s for s in (1, 1.1, 1.2)]), capsule[1], source, fmt="obj")
+    files = save_mesh(np.stack([capsule[0] * s for s in (1, 1.1, 1.2)]), capsule[1], source, fmt="obj")
 
-    def compute(times: str | None, sequence: bool = True) -> tm.StoredSet:
+    def compute(times: str | None, sequence: bool = True) -> StoredSet:
         if times is not None:
             (source / "times.txt").write_text(times)
         options = Options(sequence=sequence)

@@ -20,7 +20,7 @@ import torch_modal as tm
 from torch_modal.cli import main as cli
 from torch_modal.data.precompute import DONE, Options, precompute_tree, run_set
 from torch_modal.data.stored import SET_FILE, StoredSet, find_sets
-from torch_modal.io.write import save_frames
+from torch_modal.io.write import save_mesh
 
 OPTIONS = Options(n_modes=4, mesher="lattice")  # the lattice always gives the same tetrahedra
 ARGUMENTS = ["--modes", "4", "--mesher", "lattice"]
@@ -32,7 +32,7 @@ def make_tree(root: Path, n_sets: int) -> Path:
     vertices, faces = np.array(bar.vertices), np.array(bar.faces, dtype=np.int64)
     for i in range(n_sets):
         poses = np.stack([vertices, vertices * (1.0 + 0.01 * i, 1.1, 1.0)])
-        save_frames(poses, faces, root / f"group{i % 3}" / f"s{i}", stem="key")
+        save_mesh(poses, faces, root / f"group{i % 3}" / f"s{i}", stem="key")
     return root
 
 

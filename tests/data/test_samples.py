@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from torch_modal import keyframe_places, linear_sequence, load_keyframes
+from torch_modal import load_keyframes
 from torch_modal.data.samples import FOLDER, SAMPLES, load_sample, sample_files
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.inspect import (
@@ -18,6 +18,8 @@ from torch_modal.geometry.inspect import (
     find_repeated_faces,
     volume_of,
 )
+from torch_modal.motion.subdivide import keyframe_places
+from torch_modal.times import fill_linear
 
 ROOT = Path(__file__).parents[2]
 
@@ -58,7 +60,7 @@ def test_size_and_number_of_frames(name: str, n_vertices: int, n_keyframes: int,
 def test_true_frames_lie_where_their_times_say(name: str) -> None:
     """A true frame is nearer to the linear shape of its own time than to that of any other key-frame or half."""
     sample = load_sample(name)
-    linear = linear_sequence(sample.keyframes, keyframe_places(len(sample.keyframes), 2, cyclic=sample.cyclic))
+    linear = fill_linear(sample.keyframes, keyframe_places(len(sample.keyframes), 2, cyclic=sample.cyclic))
     for when, true in zip(sample.true_times, sample.truth, strict=True):
         distance = (linear - true).square().sum((1, 2))
         assert int(distance.argmin()) == pytest.approx(4 * when, abs=1)

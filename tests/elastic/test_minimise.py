@@ -16,7 +16,8 @@ from torch_modal.elastic.formulas import periodic_square
 from torch_modal.elastic.minimise import Solution, Status, minimise
 from torch_modal.elastic.shell import ShellEnergy
 from torch_modal.elastic.term import Term
-from torch_modal.inbetween.results import ConvergenceError, report
+from torch_modal.errors import ConvergenceError
+from torch_modal.inbetween.results import report
 from torch_modal.inbetween.settings import Solver
 from torch_modal.layers.mid_shape import MidShape
 

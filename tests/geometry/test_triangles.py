@@ -240,21 +240,6 @@ def test_poisson_gives_shapes_back(two_pieces: tuple[Connectivity, torch.Tensor]
     assert torch.equal(found[..., lone], near[..., lone])  # bit for bit
 
 
-# -------------------------------------------------------------------------------------------------------- mirror
-def test_mirror_is_the_linear_one_for_small_steps(bars: Shapes) -> None:
-    x = bars.keyframes[1]
-    solver = Reconstruction(x, bars.faces)
-    field = torch.sin(x)
-    errors = []
-    for size in (1e-2, 1e-3, 1e-4):
-        found = solver.extrapolate(x[None], (x + size * field)[None])[0]
-        errors.append(float((found - (x - size * field)).norm() / (size * field).norm()))
-    # Position and velocity are continuous at the ends: what differs is of second order.
-    assert errors[1] == pytest.approx(errors[0] / 10, rel=0.1)
-    assert errors[2] == pytest.approx(errors[1] / 10, rel=0.1)
-    assert errors[2] < 1e-3
-
-
 @pytest.mark.parametrize("has_cholespy", [True, False])
 def test_sparse_solver(has_cholespy: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """Against a dense inverse: more columns than are solved at once, some unknowns only, with gradients, pickled."""

@@ -15,7 +15,7 @@ from gltf_validator import accessor
 from textured import textured_obj
 
 from torch_modal.io.read import open_asset
-from torch_modal.io.write import save_frames
+from torch_modal.io.write import save_mesh
 from torch_modal.view.animation import save_animation
 
 FACES = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])
@@ -43,50 +43,48 @@ def played(gltf, time):
     return result
 
 
-@pytest.mark.parametrize(("fmt", "tolerance"), [("ply", None), ("obj", 0.0), ("off", 0.0)])
+@pytest.mark.parametrize(("fmt", "tolerance"), [("ply", None), ("obj", 1e-8), ("off", 0.0)])
 def test_frames_read_back(tmp_path, fmt, tolerance):
     frames = tetrahedra()
-    paths = save_frames(frames, FACES, tmp_path / "new" / "folder", fmt=fmt, stem="shape")
+    paths = save_mesh(frames, FACES, tmp_path / "new" / "folder", fmt=fmt, stem="shape")
     assert sorted(paths[0].parent.iterdir()) == paths
     assert [path.name for path in paths] == [f"shape-{n:03d}.{fmt}" for n in range(5)]
     for path, frame in zip(paths, frames, strict=True):
         mesh = trimesh.load_mesh(path, process=False, maintain_order=True)
         expected = frame.astype(np.float32) if tolerance is None else frame
-        np.testing.assert_array_equal(mesh.vertices, expected)
+        np.testing.assert_allclose(mesh.vertices, expected, rtol=tolerance or 0)
+        np.testing.assert_array_equal(np.float32(mesh.vertices), np.float32(frame))
         np.testing.assert_array_equal(mesh.faces, FACES)
 
 
 def test_torch_and_numpy_give_the_same_files(tmp_path):
     frames = tetrahedra()
     tensor = torch.tensor(frames, requires_grad=True)
-    a = save_frames(frames, FACES, tmp_path / "a", fmt="obj")
+    a = save_mesh(frames, FACES, tmp_path / "a", fmt="obj")
     a += [save_animation(frames, FACES, tmp_path / "a" / "x.glb")]
-    b = save_frames(tensor, torch.tensor(FACES), tmp_path / "b", fmt="obj")
+    b = save_mesh(tensor, torch.tensor(FACES), tmp_path / "b", fmt="obj")
     b += [save_animation(tensor, torch.tensor(FACES), tmp_path / "b" / "x.glb")]
     assert [path.read_bytes() for path in a] == [path.read_bytes() for path in b]
     half = tensor.bfloat16()  # which NumPy does not have
-    (path, *_) = save_frames(half, FACES, tmp_path / "half")
+    (path, *_) = save_mesh(half, FACES, tmp_path / "half")
     np.testing.assert_array_equal(trimesh.load_mesh(path, process=False).vertices, half.detach()[0].float().numpy())
 
 
-def test_existing_files_stay_unless_asked(tmp_path):
+def test_existing_files_stay_if_asked(tmp_path):
     frames = tetrahedra(3)
     kept = tmp_path / "frame-002.ply"
     kept.write_text("mine")
-    message = re.escape(str(kept)) + r" exists.*overwrite=True \(--overwrite\)"
+    message = re.escape(str(kept)) + r" exists.*\(--overwrite\)"
     with pytest.raises(FileExistsError, match=message) as error:
-        save_frames(frames, FACES, tmp_path)
+        save_mesh(frames, FACES, tmp_path, overwrite=False)
     assert "\n" not in str(error.value)
     assert kept.read_text() == "mine" and list(tmp_path.iterdir()) == [kept]  # none of the others either
-    save_frames(frames, FACES, tmp_path, overwrite=True)
+    save_mesh(frames, FACES, tmp_path)  # as torch.save and savefig do
     assert kept.read_bytes().startswith(b"ply") and len(list(tmp_path.iterdir())) == 3
 
     animation = tmp_path / "a.glb"
     animation.write_text("mine")
-    with pytest.raises(FileExistsError, match="--overwrite"):
-        save_animation(frames, FACES, animation)
-    assert animation.read_text() == "mine"
-    save_animation(frames, FACES, animation, overwrite=True)
+    save_animation(frames, FACES, animation)
     assert animation.read_bytes().startswith(b"glTF")
 
 
@@ -108,25 +106,24 @@ def test_a_full_disk_leaves_no_part_of_a_sequence(tmp_path, monkeypatch, with_as
 
     monkeypatch.setattr(Path, "write_bytes", full)
     with pytest.raises(OSError, match=r"No space left on device: '[^']*out/frame-003\.obj'"):
-        save_frames(frames, faces, out, "obj", overwrite=True, asset=asset)
+        save_mesh(frames, faces, out, "obj", overwrite=True, asset=asset)
     assert [path.name for path in out.rglob("*") if path.is_file()] == ["frame-001.obj"]
     assert (out / "frame-001.obj").read_text() == "old"
     monkeypatch.undo()
-    assert len(save_frames(frames, faces, out, "obj", overwrite=True, asset=asset)) == 5
+    assert len(save_mesh(frames, faces, out, "obj", overwrite=True, asset=asset)) == 5
     assert len(list(out.glob("*.obj"))) == 5 and (out / "frame-001.obj").read_text() != "old"
 
 
 @pytest.mark.skipif(os.name != "posix", reason="file modes are a POSIX matter")
 def test_files_get_the_usual_mode(tmp_path):
     (tmp_path / "plain").write_text("")
-    (path,) = save_frames(tetrahedra(1), FACES, tmp_path)
+    (path,) = save_mesh(tetrahedra(1), FACES, tmp_path)
     assert path.stat().st_mode == (tmp_path / "plain").stat().st_mode
 
 
 @pytest.mark.parametrize(
     ("frames", "faces", "message"),
     [
-        (np.zeros((4, 3)), FACES, r"\(4, 3\).*frames\[None\]"),
         (np.zeros((2, 4, 2)), FACES, r"\(N, V, 3\).*\(2, 4, 2\)"),
         (np.zeros((0, 4, 3)), FACES, r"\(0, 4, 3\)"),
         (np.zeros((2, 4, 3)), FACES[:, :2], r"faces.*\(4, 2\)"),
@@ -139,7 +136,7 @@ def test_files_get_the_usual_mode(tmp_path):
 )
 def test_wrong_input_is_refused_before_anything_is_written(tmp_path, frames, faces, message):
     with pytest.raises(ValueError, match=message):
-        save_frames(frames, faces, tmp_path / "folder")
+        save_mesh(frames, faces, tmp_path / "folder")
     with pytest.raises(ValueError, match=message):
         save_animation(frames, faces, tmp_path / "a.glb")
     assert not list(tmp_path.iterdir())
@@ -151,10 +148,10 @@ def test_wrong_animation_options(tmp_path):
             save_animation(tetrahedra(), FACES, tmp_path / "a.glb", keyframe_indices=wrong)
     (tmp_path / "a.glb").mkdir()
     with pytest.raises(IsADirectoryError, match="is a folder"):
-        save_animation(tetrahedra(), FACES, tmp_path / "a.glb", overwrite=True)
+        save_animation(tetrahedra(), FACES, tmp_path / "a.glb")
     with pytest.raises(OSError, match="file"):
         (tmp_path / "file").write_text("")
-        save_frames(tetrahedra(), FACES, tmp_path / "file")
+        save_mesh(tetrahedra(), FACES, tmp_path / "file")
 
 
 def test_animation_plays_the_frames(tmp_path):
@@ -237,7 +234,7 @@ def test_normals_have_unit_length_everywhere(tmp_path):
     frames = np.concatenate([tetrahedra(1)[0] - [10, -3, 0], [[5, 5, 5], [6, 6, 6], [7, 7, 7.0]]])[None]
     faces = np.concatenate([FACES, [[5, 6, 6]]])
     for scale in (1.0, 1e-30):
-        path = save_animation(frames * scale, faces, tmp_path / "a.glb", overwrite=True)
+        path = save_animation(frames * scale, faces, tmp_path / "a.glb")
         gltf = pygltflib.GLTF2().load(path)
         normals = accessor(gltf, gltf.meshes[0].primitives[0].attributes.NORMAL)
         np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-6)

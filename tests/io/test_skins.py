@@ -194,7 +194,7 @@ def test_what_cannot_be_written(tmp_path, options, message):
 
 
 def test_subdivide_command_writes_bones_and_targets(tmp_path, capsys):
-    keys = tm.save_frames(FRAMES[:3], FACES, tmp_path / "keys", fmt="obj")
+    keys = tm.save_mesh(FRAMES[:3], FACES, tmp_path / "keys", fmt="obj")
     common = ["subdivide", *map(str, keys), "--levels", "2", "--quiet", "--out"]
     assert main([*common, str(tmp_path / "a.glb"), "--bones", "6"]) == 0
     assert main([*common, str(tmp_path / "b.glb"), "--targets", "4"]) == 0

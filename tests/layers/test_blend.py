@@ -16,11 +16,11 @@ from torch import Tensor
 import torch_modal as tm
 from torch_modal.data.samples import load_sample
 from torch_modal.elastic.minimise import Status
+from torch_modal.errors import ConvergenceError
 from torch_modal.geometry.rigid import best_fit
 from torch_modal.geometry.rotations import about, arc, conjugate, mean, product
 from torch_modal.geometry.triangle_frames import sides
 from torch_modal.geometry.vectors import cross
-from torch_modal.inbetween.results import ConvergenceError
 from torch_modal.layers.blend import Blend
 from torch_modal.layers.in_between import InBetween
 

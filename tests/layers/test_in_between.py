@@ -20,10 +20,11 @@ import torch_modal as tm
 from torch_modal.elastic import implicit
 from torch_modal.elastic.minimise import Status
 from torch_modal.elastic.shell import ShellEnergy
+from torch_modal.errors import ConvergenceError
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.inbetween.joint import JointSpace
-from torch_modal.inbetween.results import ConvergenceError, ConvergenceWarning
-from torch_modal.inbetween.settings import Solver
+from torch_modal.inbetween.results import ConvergenceWarning
+from torch_modal.inbetween.settings import PRESETS, Solver
 from torch_modal.layers.in_between import InBetween
 from torch_modal.modes.basis import ModalBasis
 
@@ -418,7 +419,7 @@ def test_modes_that_span_all_shapes() -> None:
     found = []
     for method in ("solid", "shell"):
         bases = tm.extract_bases(torch.stack([first, second]), faces, 30, method=method, cache=False)
-        free = replace(tm.PRESETS["modal"].objective, anchor=0.0)
+        free = replace(PRESETS["modal"].objective, anchor=0.0)
         found.append(tm.InBetween(bases, faces, objective=free)(first, second, 0.5))
     for one in found:
         torch.testing.assert_close(one, found[0], rtol=0, atol=1e-4)

@@ -15,8 +15,8 @@ from torch import Tensor
 
 import torch_modal as tm
 from torch_modal import threads
-from torch_modal.errors import MeshWarning
-from torch_modal.inbetween.results import ConvergenceError, ConvergenceWarning
+from torch_modal.errors import ConvergenceError, MeshWarning
+from torch_modal.inbetween.results import ConvergenceWarning
 
 DOUBLE = torch.float64
 

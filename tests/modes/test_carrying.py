@@ -6,10 +6,11 @@ import torch
 from bodies import bend
 from solids import as_mesh, box, eigenmodes
 
+from torch_modal.errors import ModalAnalysisError
 from torch_modal.geometry.surface import Surface
 from torch_modal.modes import carrying
 from torch_modal.modes.carrying import Carrier, nearest_rotations
-from torch_modal.modes.eigen import ModalAnalysisError, lowest_modes
+from torch_modal.modes.eigen import lowest_modes
 from torch_modal.modes.embedding import find_neighbours
 from torch_modal.modes.extract import extract_bases
 from torch_modal.modes.solid import Solid

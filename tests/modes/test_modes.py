@@ -14,14 +14,15 @@ from conftest import COARSE
 from solids import as_mesh, box, eigenmodes, lumped_mass, surface, together
 
 from torch_modal import threads
+from torch_modal.errors import ModalAnalysisError
 from torch_modal.geometry.canonical import to_canonical
 from torch_modal.keyframes.check import MeshError, MeshWarning
 from torch_modal.modes import eigen, extract
 from torch_modal.modes import lattice as lattice_module
-from torch_modal.modes.eigen import ElasticModes, ModalAnalysisError
+from torch_modal.modes.eigen import ElasticModes
 from torch_modal.modes.extract import extract_bases, extract_modes
 from torch_modal.modes.stiffness import HESSIAN_FORMS, arap_hessian, mass_matrix
-from torch_modal.modes.tetrahedra import Tetrahedra, TetrahedralizationError
+from torch_modal.modes.tetrahedra import Tetrahedra
 from torch_modal.modes.tetwild import TetWild
 
 Mesh = tuple[np.ndarray, np.ndarray]
@@ -265,14 +266,14 @@ def test_errors_name_the_keyframe(boxed: Mesh, monkeypatch: pytest.MonkeyPatch) 
     vertices, faces = boxed
 
     def fail(*args: object, **kwargs: object) -> None:
-        raise TetrahedralizationError("no luck")
+        raise ModalAnalysisError("no luck")
 
     with pytest.raises(MeshError, match=r"key-frame 1: the surface is flat"):
         extract_bases(np.stack([vertices, vertices * (1, 1, 0)]), faces, 4, method="solid", cache=False)
     monkeypatch.setattr(TetWild, "fill", fail)
-    with pytest.raises(TetrahedralizationError, match=r"key-frame [01]: no luck"):
+    with pytest.raises(ModalAnalysisError, match=r"key-frame [01]: no luck"):
         extract_bases(np.stack([vertices, vertices]), faces, 4, method="solid", mesher="tetwild", cache=False)
-    with pytest.raises(TetrahedralizationError, match=r"^no luck"):
+    with pytest.raises(ModalAnalysisError, match=r"^no luck"):
         extract_modes(vertices, faces, 4, method="solid", mesher="tetwild", cache=False)
 
 

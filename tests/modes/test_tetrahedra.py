@@ -13,6 +13,7 @@ from conftest import COARSE
 from solids import box, together
 
 from torch_modal.data.samples import load_sample
+from torch_modal.errors import ModalAnalysisError
 from torch_modal.geometry.surface import Surface
 from torch_modal.modes import tetwild
 from torch_modal.modes.extract import extract_modes
@@ -20,7 +21,6 @@ from torch_modal.modes.lattice import Lattice
 from torch_modal.modes.surface import CanonicalSurface
 from torch_modal.modes.tetrahedra import (
     Tetrahedra,
-    TetrahedralizationError,
     edge_lengths,
     orient,
     tet_volumes,
@@ -92,7 +92,7 @@ def worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
 )
 def test_failure_says_which_mesh_and_why(worker, capsule: Mesh, code: str, says: str) -> None:
     worker(code)
-    with pytest.raises(TetrahedralizationError, match=says) as caught:
+    with pytest.raises(ModalAnalysisError, match=says) as caught:
         TetWild().fill(Surface(*capsule), threading.Event())
     assert f"a mesh of {len(capsule[0])} vertices and {len(capsule[1])} faces" in str(caught.value)
 
@@ -139,7 +139,7 @@ def test_auto_takes_the_lattice_unless_parts_touch(monkeypatch: pytest.MonkeyPat
 
     def fails(self: TetWild, surface: Surface, stop: threading.Event) -> Tetrahedra:
         asked.append(surface)
-        raise TetrahedralizationError("it failed")
+        raise ModalAnalysisError("it failed")
 
     monkeypatch.setattr(TetWild, "fill", fails)
     keyframes, faces, *_ = load_sample("hand")
@@ -202,6 +202,6 @@ def test_edges_follow_the_thinnest_part(monkeypatch: pytest.MonkeyPatch) -> None
     ball = trimesh.creation.icosphere(subdivisions=3)
     wire = trimesh.creation.cylinder(0.05, 4.0, sections=16).apply_translation([2.0, 0, 0])  # a tenth of the area
     for mesh in (ball, trimesh.util.concatenate([ball, wire])):
-        with pytest.raises(TetrahedralizationError, match="stopped"):
+        with pytest.raises(ModalAnalysisError, match="stopped"):
             TetWild().fill(CanonicalSurface(mesh.vertices, mesh.faces), threading.Event())
     assert given == [EDGE_RANGE[1], EDGE_RANGE[0]]

@@ -20,6 +20,8 @@ from torch_modal.geometry.rotations import exp
 from torch_modal.motion import subdivide as sequence
 from torch_modal.motion.cubics import Cubics, Squared, cubics
 from torch_modal.motion.path import Path
+from torch_modal.motion.subdivide import keyframe_places
+from torch_modal.times import fill_linear
 
 DOUBLE = torch.float64
 
@@ -215,10 +217,10 @@ def test_subdivide_is_the_path_at_even_times(motion: Shapes) -> None:
     path = Path(motion.bases, motion.faces, when)
     for options in ({"levels": 2}, {"n_frames": 11}):
         frames = tm.subdivide(motion.keyframes, motion.faces, bases=motion.bases, times=when, progress=False, **options)
-        at = tm.frame_times(5, times=when, **options)
+        places = keyframe_places(5, times=when, **options)
+        at = fill_linear(torch.tensor(when, dtype=DOUBLE), places)
         assert len(at) == len(frames)
         torch.testing.assert_close(frames, path(motion.keyframes, at), rtol=0, atol=1e-9)
-        places = tm.keyframe_places(5, times=when, **options)
         assert at[places].tolist() == when
         assert torch.equal(frames[places], motion.keyframes)
 

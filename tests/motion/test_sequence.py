@@ -11,10 +11,11 @@ from torch import Tensor
 
 import torch_modal as tm
 from torch_modal.elastic.backend import TorchBackend, WarpBackend
-from torch_modal.inbetween.settings import Objective, Solver
+from torch_modal.inbetween.settings import PRESETS, Objective, Solver
 from torch_modal.layers.mid_shape import MidShape
 from torch_modal.motion import subdivide as sequence
-from torch_modal.motion.subdivide import keyframe_places, linear_sequence, subdivide
+from torch_modal.motion.subdivide import keyframe_places, subdivide
+from torch_modal.times import fill_linear
 
 COARSE: dict[str, Any] = {"objective": Objective(coarse_faces=200)}
 PAIRED: dict[str, Any] = {"objective": Objective(space="paired", coarse_faces=200), "solver": Solver(local_steps=0)}
@@ -96,7 +97,7 @@ def test_takes_arrays_and_two_keyframes(scattered: Shapes) -> None:
 
 def test_presets_are_those_of_the_layers(scattered: Shapes) -> None:
     pair = scattered.pick(0, 1)
-    for preset in tm.PRESETS:
+    for preset in PRESETS:
         found = subdivide(pair.keyframes, pair.faces, 1, bases=pair.bases, preset=preset, progress=False)[1]
         layer = MidShape(pair.bases, pair.faces, preset=preset)
         torch.testing.assert_close(found, layer(*pair.keyframes), rtol=0, atol=1e-12)
@@ -163,14 +164,14 @@ def test_makes_bases_where_none_are_given(scattered: Shapes, monkeypatch: pytest
 
 
 # ----------------------------------------------------------------------------------------------- linear, for comparison
-def test_linear_sequence(scattered: Shapes) -> None:
+def test_linear_between_key_frames(scattered: Shapes) -> None:
     x = scattered.keyframes
-    straight = linear_sequence(x, [0, 4, 6])
+    straight = fill_linear(x, [0, 4, 6])
     assert straight.shape == (7, *x.shape[1:])
     assert torch.equal(straight[[0, 4, 6]], x)
     torch.testing.assert_close(straight[1], 0.75 * x[0] + 0.25 * x[1])
     torch.testing.assert_close(straight[5], 0.5 * x[1] + 0.5 * x[2])
-    cycle = linear_sequence(x, [0, 4, 6, 8])
+    cycle = fill_linear(x, [0, 4, 6, 8])
     assert cycle.shape == (8, *x.shape[1:])
     torch.testing.assert_close(cycle[7], 0.5 * x[2] + 0.5 * x[0])
 

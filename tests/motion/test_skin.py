@@ -13,6 +13,7 @@ import torch_modal as tm
 from torch_modal.data.samples import load_sample
 from torch_modal.errors import MeshWarning
 from torch_modal.geometry.rotations import exp, log
+from torch_modal.geometry.skin import Skin
 from torch_modal.motion.skin import _convex_weights, _Decomposition, _halfway_errors
 
 X, FACES = triangles_of_tube()
@@ -32,7 +33,7 @@ def arm(generator: torch.Generator, units: float = 1.0) -> tuple[Tensor, Tensor,
     return units * frames, torch.tensor(FACES), weights
 
 
-def off_at_frames(skin: tm.Skin, frames: Tensor) -> float:
+def off_at_frames(skin: Skin, frames: Tensor) -> float:
     """Root mean square distance over the diagonal."""
     diagonal = (frames[0].amax(0) - frames[0].amin(0)).norm()
     return float((skin.shapes() - frames).square().sum(-1).mean().sqrt() / diagonal)
@@ -124,7 +125,7 @@ def test_errors_half_way_between_frames_by_hand() -> None:
     frames = BENT[0] @ turns.mT + torch.tensor([[[0.0, 0, 0]], [[5, 0, 0]], [[5, 5, 0]]])
     maps = torch.eye(4, dtype=torch.float64).repeat(3, 1, 1, 1)
     maps[:, 0, :3, :3], maps[1:, 0, 0, 3], maps[2, 0, 1, 3] = turns, 5, 5
-    skin = tm.Skin(BENT[0], torch.ones(len(X), 1, dtype=torch.float64), maps, 0.0, 0.0)
+    skin = Skin(BENT[0], torch.ones(len(X), 1, dtype=torch.float64), maps, 0.0, 0.0)
     assert _halfway_errors(skin, frames).abs().max() < 1e-9
     wrong = skin.transforms.clone()
     wrong[2, 0, 2, 3] += 0.5

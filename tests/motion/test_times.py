@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 import torch
 
-from torch_modal.times import check_times, fill_times, locate_times
+from torch_modal.times import check_times, fill_linear, locate_times
 
 F64 = torch.float64
 CYCLE = torch.tensor([1.0, 2.0, 4.0], dtype=F64)
@@ -35,7 +35,7 @@ def test_times_are_given_even_or_those_of_a_cycle() -> None:
 
 
 def test_times_are_even_within_intervals() -> None:
-    assert fill_times(CYCLE, [0, 2, 6]).tolist() == [1, 1.5, 2, 2.5, 3, 3.5, 4]
+    assert fill_linear(CYCLE, [0, 2, 6]).tolist() == [1, 1.5, 2, 2.5, 3, 3.5, 4]
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ from torch import Tensor
 import torch_modal as tm
 from torch_modal.geometry.decimation import decimate
 from torch_modal.geometry.rigid import best_fit
+from torch_modal.registration.report import Registration
 from torch_modal.registration.surface import MeshSurface
 
 LONG, START, STOP = 6.0, 1.0, 5.0
@@ -34,7 +35,7 @@ def coarse(gallop: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
 
 
 @pytest.fixture(scope="module")
-def registration(gallop: tuple[Tensor, Tensor], coarse: tuple[Tensor, Tensor]) -> tm.Registration:
+def registration(gallop: tuple[Tensor, Tensor], coarse: tuple[Tensor, Tensor]) -> Registration:
     return tm.register(coarse[0][0], coarse[1], gallop[0][0], gallop[1], same_subject=False, cache=False)
 
 
@@ -71,7 +72,7 @@ def test_a_body_moves_as_itself(gallop: tuple[Tensor, Tensor], anchors: bool) ->
 
 
 def test_another_triangulation(
-    gallop: tuple[Tensor, Tensor], coarse: tuple[Tensor, Tensor], registration: tm.Registration
+    gallop: tuple[Tensor, Tensor], coarse: tuple[Tensor, Tensor], registration: Registration
 ) -> None:
     """With a map of its own, the motion is as near to the truth as the map is."""
     (x, faces), (truth, own) = gallop, coarse
@@ -191,7 +192,7 @@ def test_inputs_of_all_kinds(gallop: tuple[Tensor, Tensor], coarse: tuple[Tensor
 
 
 def test_what_cannot_work_says_why(
-    gallop: tuple[Tensor, Tensor], coarse: tuple[Tensor, Tensor], registration: tm.Registration
+    gallop: tuple[Tensor, Tensor], coarse: tuple[Tensor, Tensor], registration: Registration
 ) -> None:
     (x, faces), (truth, own) = gallop, coarse
     broken = x.clone()

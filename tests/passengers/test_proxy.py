@@ -12,7 +12,8 @@ from torch import Tensor
 import torch_modal as tm
 from torch_modal.cli import main as cli
 from torch_modal.geometry.connectivity import Connectivity
-from torch_modal.io.write import save_frames
+from torch_modal.io.write import save_mesh
+from torch_modal.motion.subdivide import keyframe_places
 from torch_modal.passengers.proxy import Proxy, proxy_size
 
 
@@ -51,7 +52,7 @@ def test_cycles_and_numbers_of_frames(rough: tuple[Tensor, Tensor]) -> None:
     cycle = tm.subdivide(keyframes, faces, 1, cyclic=True, **options)
     assert len(cycle) == 6 and torch.equal(cycle[::2], keyframes)
     single = tm.subdivide(keyframes.float(), faces, 1, n_frames=8, **options)
-    places = tm.keyframe_places(3, 1, n_frames=8)
+    places = keyframe_places(3, 1, n_frames=8)
     assert single.dtype == torch.float32 and torch.equal(single[places], keyframes.float())
 
 
@@ -77,7 +78,7 @@ def test_sizes_of_a_proxy_that_are_refused(bars: Shapes, proxy: float) -> None:
 
 def test_the_command(rough: tuple[Tensor, Tensor], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     keyframes, faces = rough
-    meshes = save_frames(keyframes[:2].numpy(), faces.numpy(), tmp_path, fmt="obj", stem="key")
+    meshes = save_mesh(keyframes[:2].numpy(), faces.numpy(), tmp_path, fmt="obj", stem="key")
     options = ["--modes", "6", "--levels", "1", "--preset", "fast", "--proxy", "300", "--out", str(tmp_path / "out")]
     assert cli.main(["subdivide", *map(str, meshes), *options]) == 0
     assert "moved by a proxy of about 300" in capsys.readouterr().out

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from torch_modal.cli import main as cli
 from torch_modal.io.ply import PlyFile
 from torch_modal.io.points import PointFile, evaluate_harmonics, rotate_harmonics
-from torch_modal.io.write import save_frames
+from torch_modal.io.write import save_mesh
 
 NAMES = ["x", "y", "z", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3)), *(f"f_rest_{i}" for i in range(45))]
 NAMES += ["opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
@@ -92,7 +92,7 @@ class TestCarry:
     @pytest.fixture
     def meshes(self, bars: Shapes, tmp_path: Path) -> list[str]:
         frames = bars.keyframes[:2].numpy()
-        return [str(file) for file in save_frames(frames, bars.faces.numpy(), tmp_path / "meshes", fmt="obj")]
+        return [str(file) for file in save_mesh(frames, bars.faces.numpy(), tmp_path / "meshes", fmt="obj")]
 
     def test_splats_and_points_follow(
         self, meshes: list[str], bars: Shapes, tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -8,10 +8,13 @@ from types import ModuleType, SimpleNamespace
 from typing import Any
 from unittest.mock import MagicMock
 
+import numpy as np
 import pytest
 import torch
 from conftest import Shapes
 from test_examples import load_example
+
+import torch_modal as tm
 
 EXTENSION = Path(__file__).parents[2] / "examples" / "blender" / "in_between_keys"
 PROGRAM = str(Path(sys.executable).with_name("torch-modal"))
@@ -76,7 +79,7 @@ def test_shapes_are_added_and_animated(addon: ModuleType, bars: Shapes) -> None:
         own = body.keys[3:]
         assert [key.name for key in own] == [f"between {i:04d}" for i in range(5)]
     points = torch.tensor([[point.co for point in key.data] for key in own], dtype=torch.float64)
-    assert torch.equal(points[::2], bars.keyframes)
+    torch.testing.assert_close(points[::2], bars.keyframes, rtol=1e-8, atol=1e-12)  # nine digits
     straight = 0.5 * (bars.keyframes[0] + bars.keyframes[1])
     assert 1e-3 < float((points[1] - straight).abs().max()) < 1
     assert own[2].inserted == [("value", 12, 0.0), ("value", 14, 1.0), ("value", 16, 0.0)]
@@ -156,6 +159,53 @@ def test_shape_keys_and_bones_in_blender(blender: Any, bars: Shapes) -> None:
         expected, found = posed(blender, own), posed(blender, baked)
         diagonal = (expected.amax(0) - expected.amin(0)).norm()
         assert (expected - found).norm(dim=1).max() < 0.004 * diagonal
+
+
+def test_quads_that_deform_keep_polygons_materials_and_coordinates(blender: Any) -> None:
+    """A grid of quads under a wave: the diagonal of a quad that bends is another one in other frames."""
+    blender.ops.mesh.primitive_grid_add(x_subdivisions=12, y_subdivisions=8, size=2)
+    own, scene = blender.context.active_object, blender.context.scene
+    for color in ("red", "blue"):
+        own.data.materials.append(blender.data.materials.new(color))
+    for polygon in own.data.polygons:
+        polygon.material_index = polygon.index % 2
+    own.shape_key_add(name="flat", from_mix=False)
+    bent = own.shape_key_add(name="bent", from_mix=False)
+    for point in bent.data:
+        x, y, _ = point.co
+        point.co = (x, y, 0.4 * x * y + 0.2 * x * x)
+    scene.frame_start, scene.frame_end = 1, 5
+    for frame, value in ((1, 0.0), (3, 1.0), (5, -1.0)):
+        bent.slider_min, bent.value = -1.0, value
+        bent.keyframe_insert("value", frame=frame)
+    there = set(blender.data.objects)
+    assert blender.ops.object.bake_to_bones(bones=8) == {"FINISHED"}
+    added = set(blender.data.objects) - there
+    assert sorted(each.type for each in added) == ["ARMATURE", "MESH"]  # and no Icosphere
+    baked = next(each for each in added if each.type == "MESH")
+    assert [p.vertices[:] for p in baked.data.polygons] == [p.vertices[:] for p in own.data.polygons]
+    assert [m.name for m in baked.data.materials] == ["red", "blue"]
+    assert [p.material_index for p in baked.data.polygons] == [p.material_index for p in own.data.polygons]
+    ours, theirs = (np.array([d.uv[:] for d in each.data.uv_layers[0].data]) for each in (baked, own))
+    assert np.array_equal(ours, theirs)
+    for frame in range(1, 6):
+        scene.frame_set(frame)
+        assert (posed(blender, own) - posed(blender, baked)).norm(dim=1).max() < 0.02
+
+
+def test_usd_and_glb_have_one_size(blender: Any, bars: Shapes, tmp_path: Path) -> None:
+    pytest.importorskip("pxr", reason="usd-core is not installed")
+    sizes = []
+    for suffix in ("glb", "usdc"):
+        path = tm.save_animation(bars.keyframes[:2], bars.faces, tmp_path / f"a.{suffix}")
+        there = set(blender.data.objects)
+        load = blender.ops.import_scene.gltf if suffix == "glb" else blender.ops.wm.usd_import
+        load(filepath=str(path))
+        mesh = next(each for each in set(blender.data.objects) - there if each.type == "MESH")
+        blender.context.view_layer.update()
+        points = torch.tensor([list(mesh.matrix_world @ vertex.co) for vertex in mesh.data.vertices])
+        sizes.append(float((points.amax(0) - points.amin(0)).norm()))
+    assert sizes[1] == pytest.approx(sizes[0], rel=1e-3)
 
 
 def test_blender_accepts_the_extension(blender: Any) -> None:

@@ -149,3 +149,18 @@ def test_figures_of_the_paper_run_on_its_own_meshes(tmp_path: Path, monkeypatch:
     monkeypatch.setattr(sys, "argv", ["run", "--meshes", str(tmp_path / "elsewhere"), "--parts", "2"])
     with pytest.raises(SystemExit, match="poses of the lion are needed there"):
         run.main()
+
+
+def test_small_examples_run(tmp_path: Path) -> None:
+    """One of each public thing that needs no more than thirty lines."""
+    sample = load_sample("creature")
+    shapes = load_example("blend").main(tmp_path / "blend")
+    assert len(list((tmp_path / "blend").glob("*.obj"))) == len(shapes) == 2
+    means = edge_lengths(sample.keyframes, sample.faces).mean(0)
+    both = (shapes[0], sample.keyframes.mean(0))
+    ours, linear = (float((edge_lengths(x, sample.faces) / means - 1).abs().mean()) for x in both)
+    assert ours < 0.3 * linear
+    speeds = load_example("path").main(tmp_path / "path.glb")
+    assert (tmp_path / "path.glb").stat().st_size > 1e5 and 0.2 < float(speeds.min()) < float(speeds.max()) < 20
+    plain, stiffer = load_example("own_term").main()
+    assert 1e-4 < float((stiffer - plain).norm(dim=-1).mean()) < 0.1

@@ -43,6 +43,8 @@ def test_error_or_right_result(name: str, tmp_path: Path) -> None:
 
 CALL = """
 import sys, numpy as np, torch_modal as tm
+from torch_modal.modes.lattice import Lattice
+from torch_modal.modes.tetwild import TetWild
 from hostile_inputs import capsule
 v, f = capsule()
 for basis in tm.extract_bases(np.stack([v, v * (1, 1, 1.2)]), f, 10, mesher="tetwild"):
@@ -50,9 +52,8 @@ for basis in tm.extract_bases(np.stack([v, v * (1, 1, 1.2)]), f, 10, mesher="tet
 """
 
 
-FINE = CALL.replace('"tetwild"', "tm.TetWild(0.02, 1e-3, 10.0, 10_000)")
+FINE = CALL.replace('"tetwild"', "TetWild(0.02, 1e-3, 10.0, 10_000)")
 EACH = """
-import torch_modal as tm
 from torch_modal.modes import carrying
 carrying.MAX_FIT = -1  # no tetrahedra are carried
 
@@ -62,7 +63,7 @@ class OneByLattice:
         return {"mesher": "one by lattice"}
     def fill(self, surface, stop):
         self.calls += 1
-        mesher = tm.Lattice() if self.calls == 1 else tm.TetWild(0.02, 1e-3, 10.0, 10_000)
+        mesher = Lattice() if self.calls == 1 else TetWild(0.02, 1e-3, 10.0, 10_000)
         return mesher.fill(surface, stop)
 """ + CALL.replace("[v, v", "[v, v * (1, 1, 1.1), v").replace('"tetwild"', "OneByLattice()")
 

@@ -16,7 +16,7 @@ import torch_modal as tm
 from torch_modal.cli import main as cli
 from torch_modal.data.stored import StoredSet
 from torch_modal.geometry.canonical import size
-from torch_modal.io.write import save_frames
+from torch_modal.io.write import save_mesh
 from torch_modal.modes.sheet import THICKNESS
 
 pytestmark = pytest.mark.filterwarnings("ignore::torch_modal.keyframes.check.MeshWarning")
@@ -75,7 +75,7 @@ def test_commands_and_trees(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
 ) -> None:
     shapes = torch.stack([roll(0.0), roll(1.0)])
-    files = save_frames(shapes.numpy(), TRIANGLES, tmp_path / "in" / "roll", fmt="obj")
+    files = save_mesh(shapes.numpy(), TRIANGLES, tmp_path / "in" / "roll", fmt="obj")
     out = ["--out", str(tmp_path / "frames"), "--modes", "8", "--levels", "1", "--no-cache"]
     modal = ["--format", "obj", "--preset", "modal"]
     with caplog.at_level(logging.INFO, "torch_modal"):

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import trimesh
 
-import torch_modal as tm
 from torch_modal.registration.maps import CoarsePair, SpectralShape
 from torch_modal.registration.register import register
+from torch_modal.registration.report import Registration
 from torch_modal.registration.surface import MeshSurface
 
 for library in ("robust_laplacian", "potpourri3d", "igl"):
@@ -88,6 +88,6 @@ def test_other_proportions_need_no_landmarks() -> None:
     target, _ = figure(np.array([1.6, 3.8, 3.8, 2.0, 2.0]))
     order = np.random.default_rng(0).permutation(len(target))
     meshes = rest, faces, target[order], np.argsort(order)[faces]
-    found: tm.Registration = register(*meshes, same_subject=False, cache=False, progress=False)
+    found: Registration = register(*meshes, same_subject=False, cache=False, progress=False)
     size = np.linalg.norm(np.ptp(target, axis=0))
     assert np.linalg.norm(found.positions.numpy() - target, axis=1).mean() < 0.05 * size

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import pytest
 import torch
 from conftest import Shapes, seeded
-from shapes import edge_lengths
+from shapes import edge_error, edge_lengths
 from test_coordinates import far
 
 import torch_modal as tm
@@ -80,30 +80,30 @@ def test_folds_are_counted(space: tm.ShapeSpace, bars: Shapes) -> None:
 
 def test_a_draw_that_folds_is_made_less_local(space: tm.ShapeSpace, monkeypatch: pytest.MonkeyPatch) -> None:
     variation = space.variation()
-    weights, factors = (one[0] for one in variation.draw(1, 1.0, 3.0, seeded()))
-    smoother = variation.member(weights, 0.25 * factors)[0]
+    weights, factors, _ = (one[0] for one in variation.draw(1, 1.0, 3.0, (0, 0), seeded()))
+    smoother = variation.member(weights, 0.25 * factors, 0.0)[0]
     counts = iter([1, 1, 0])
     monkeypatch.setattr(variation, "folds", lambda _: next(counts))
-    assert torch.equal(variation.member(weights, factors)[0], smoother)
+    assert torch.equal(variation.member(weights, factors, 0.0)[0], smoother)
 
 
 def test_a_draw_that_always_folds_is_a_key_frame(space: tm.ShapeSpace, monkeypatch: pytest.MonkeyPatch) -> None:
     variation = space.variation()
-    weights, factors = (one[0] for one in variation.draw(1, 1.0, 3.0, seeded()))
+    weights, factors, _ = (one[0] for one in variation.draw(1, 1.0, 3.0, (0, 0), seeded()))
     shapes = variation.shapes.unbind()
     monkeypatch.setattr(variation, "folds", lambda x: int(not any(torch.equal(x, shape) for shape in shapes)))
-    x, own = variation.member(weights, factors)
+    x, own = variation.member(weights, factors, 0.0)
     assert torch.equal(x, shapes[int(weights.argmax())])
     assert torch.equal(own.argmax(0), weights.argmax().expand(own.shape[1])) and torch.equal(own.sum(0), own.amax(0))
 
 
 def test_concentration_and_locality(space: tm.ShapeSpace) -> None:
     variation = space.variation()
-    few, many = (variation.draw(50, c, 0.0, seeded())[0] for c in (0.1, 100.0))
+    few, many = (variation.draw(50, c, 0.0, (0, 0), seeded())[0] for c in (0.1, 100.0))
     assert float(few.amax(1).mean()) > 0.85 and float(many.amax(1).mean()) < 0.45
-    weights, factors = (one[0] for one in variation.draw(1, 1.0, 0.0, seeded()))
+    weights, factors, _ = (one[0] for one in variation.draw(1, 1.0, 0.0, (0, 0), seeded()))
     assert not bool(factors.any())
-    local = variation.member(weights, factors)[1]
+    local = variation.member(weights, factors, 0.0)[1]
     torch.testing.assert_close(local, weights[:, None].expand_as(local))
 
 
@@ -115,10 +115,23 @@ def test_densities_that_do_not_exist(space: tm.ShapeSpace, options: dict[str, fl
         tm.RandomBlend(**options)
 
 
+def test_shapes_beyond_the_key_frames(space: tm.ShapeSpace, bars: Shapes) -> None:
+    """Of little locality and one key-frame each: bent farther than the key-frames, and as large as they are."""
+    options = {"concentration": 0.01, "locality": 0.0}
+    within, beyond = (space.sample(20, seeded(), beyond=(b, b), **options) for b in (0.0, 0.3))
+    mean = space.mean()
+    far = [(tm.align(x, mean) - mean).norm(dim=-1).mean(-1) for x in (within.double(), beyond.double())]
+    assert bool((far[1] > 1.1 * far[0]).all())
+    assert edge_error(beyond[0].double(), bars.keyframes[0], bars.faces) < 0.05
+    with pytest.raises(ValueError, match="beyond is a range"):
+        space.sample(1, beyond=(0.5, 0.1))
+
+
 def drawn(space: tm.ShapeSpace, n: int) -> dict[str, torch.Tensor]:
     """Parameters of the members of :meth:`tm.ShapeSpace.sample`."""
-    weights, factors = space.variation().draw(n, 0.2, 3.0, seeded())
-    return {"batch_prob": torch.ones(n, dtype=torch.bool), "weights": weights, "factors": factors}
+    weights, factors, beyond = space.variation().draw(n, 0.2, 3.0, (0, 0), seeded())
+    chosen = torch.ones(n, dtype=torch.bool)
+    return {"batch_prob": chosen, "weights": weights, "factors": factors, "beyond": beyond}
 
 
 class TestRandomBlend:

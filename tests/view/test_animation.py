@@ -11,6 +11,7 @@ from textured import bend, textured_obj, triangles_of_tube
 
 import torch_modal as tm
 from torch_modal.errors import MeshWarning, MissingPackageError
+from torch_modal.geometry.vectors import vertex_normals
 from torch_modal.io.formats import ANIMATION_FORMATS, Timing
 from torch_modal.view import animation
 
@@ -105,11 +106,11 @@ def test_pc2_by_the_letter(tmp_path):
 @pytest.mark.parametrize("suffix", ["usda", "usdc", "usd"])
 def test_usd_read_back(tmp_path, suffix):
     usd = pytest.importorskip("pxr.Usd", reason="usd-core is not installed")
-    from pxr import UsdGeom
+    from pxr import UsdGeom, UsdShade
 
     asset = tm.open_asset(textured_obj(tmp_path, "bar.obj"))
     frames = np.stack([bend(asset.positions, turn) for turn in (0.01, 0.5, 0.9)])
-    with pytest.warns(MeshWarning, match="without the normals, 2 materials and groups"):
+    with pytest.warns(MeshWarning, match="without the groups"):
         path = tm.save_animation(frames, asset.faces, tmp_path / f"a.{suffix}", duration=3, fps=24, asset=asset)
     stage = usd.Stage.Open(str(path))
     assert (stage.GetTimeCodesPerSecond(), stage.GetEndTimeCode()) == (24, 72)
@@ -121,6 +122,20 @@ def test_usd_read_back(tmp_path, suffix):
     st = UsdGeom.PrimvarsAPI(mesh).GetPrimvar("st")
     assert st.GetInterpolation() == "faceVarying" and len(st.Get()) == 84 * 4 + 24 * 3
     assert np.allclose(next(iter(mesh.GetDisplayColorPrimvar().Get())), [0.2140, 0.0509, 1.0], atol=1e-3)
+    assert UsdGeom.GetStageMetersPerUnit(stage) == 1.0  # as in glTF: of the same size in Blender
+    normals = np.array(mesh.GetNormalsAttr().Get(36))
+    np.testing.assert_allclose(normals, vertex_normals(frames[1], asset.faces), atol=1e-5)
+    subsets = UsdGeom.Subset.GetAllGeomSubsets(mesh)
+    covered = np.concatenate([np.array(each.GetIndicesAttr().Get()) for each in subsets])
+    assert sorted(covered) == list(range(108)) and [len(each.GetIndicesAttr().Get()) for each in subsets] == [84, 24]
+    textures = []
+    for each in subsets:
+        material = UsdShade.MaterialBindingAPI(each.GetPrim()).ComputeBoundMaterial()[0]
+        surface = material.ComputeSurfaceSource()[0]
+        assert surface.GetIdAttr().Get() == "UsdPreviewSurface"
+        if source := surface.GetInput("diffuseColor").GetConnectedSources()[0]:
+            textures.append(UsdShade.Shader(source[0].source.GetPrim()).GetInput("file").Get().path)
+    assert textures and all((tmp_path / name).read_bytes().startswith(b"\x89PNG") for name in textures)
     assert [p.name for p in tmp_path.iterdir() if p.name.startswith(".")] == []
 
 
@@ -182,11 +197,10 @@ def test_missing_packages_are_named_before_the_work(tmp_path, monkeypatch, suffi
 
 
 @pytest.mark.parametrize("suffix", ["mdd", "pc2", "npz", "usda", "gif"])
-def test_one_frame_and_nothing_overwritten(tmp_path, suffix, small_pictures):
+def test_one_frame_and_another_in_its_place(tmp_path, suffix, small_pictures):
     if suffix == "usda":
         pytest.importorskip("pxr")
     path = tm.save_animation(FRAMES[:1], FACES, tmp_path / "new" / f"a.{suffix}")
     before = path.read_bytes()
-    with pytest.raises(FileExistsError, match="--overwrite"):
-        tm.save_animation(FRAMES, FACES, path)
-    assert path.read_bytes() == before and list(path.parent.iterdir()) == [path]
+    tm.save_animation(FRAMES[1:], FACES, path)
+    assert path.read_bytes() != before and list(path.parent.iterdir()) == [path]

@@ -22,6 +22,7 @@ from torch_modal.data.sequence import read_shapes
 from torch_modal.errors import MeshError
 from torch_modal.registration.landmarks import read_landmarks
 from torch_modal.registration.load import load_keyframes
+from torch_modal.view.page import Page, show_landmarks
 from torch_modal.view.page_data import GRID_STEPS, pack_faces, pack_group
 
 Ball = tuple[np.ndarray, np.ndarray]
@@ -44,7 +45,7 @@ def growing(ball: Ball) -> np.ndarray:
     return np.stack([centre + (1 + 0.1 * n) * (vertices - centre) for n in range(7)])
 
 
-def data_of(page: tm.Page) -> dict[str, Any]:
+def data_of(page: Page) -> dict[str, Any]:
     """What the page's scripts find in it."""
     found = re.search(r'<script type="application/json" id="data">(.*?)</script>', page.html, re.S)
     assert found
@@ -126,13 +127,11 @@ def test_save_and_notebook(tmp_path: Path, ball: Ball, growing: np.ndarray) -> N
     page = tm.show(growing, ball[1], height=321)
     path = page.save(tmp_path / "new" / "page.html")
     assert path.read_text(encoding="utf-8") == page.html
-    with pytest.raises(FileExistsError, match="overwrite"):
-        page.save(path)
     with pytest.raises(ValueError, match=r"\.html"):
         page.save(tmp_path / "page.png")
     assert "height: 321px" in page._repr_html_()
     assert len(repr(page)) < 100
-    assert page.save(path, overwrite=True) == path
+    assert page.save(path) == path
 
 
 @pytest.mark.parametrize(
@@ -160,7 +159,7 @@ def test_animation_is_read_back(tmp_path: Path, ball: Ball, growing: np.ndarray)
     np.testing.assert_allclose(frames, growing, atol=1e-6)
     np.testing.assert_array_equal(faces, ball[1])
     assert options == {"keyframe_indices": [0, 4], "fps": 12.0, "cyclic": True}
-    tm.save_animation(growing[:1], ball[1], path, overwrite=True)
+    tm.save_animation(growing[:1], ball[1], path)
     assert read_shapes([path])[0].shape == (1, *growing[0].shape)
 
 
@@ -188,19 +187,19 @@ def test_view_command_writes_a_page(
     tmp_path: Path, ball: Ball, growing: np.ndarray, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     glb = tm.save_animation(growing, ball[1], tmp_path / "grow.glb", keyframe_indices=[0, 6])
-    tm.save_frames(growing, ball[1], tmp_path / "frames")
+    tm.save_mesh(growing, ball[1], tmp_path / "frames")
     out = tmp_path / "page.html"
     arguments = ["view", str(glb), "--compare", str(tmp_path / "frames"), "--linear", "--page", str(out)]
     assert main(arguments) == 0
     assert f"page: {out}" in capsys.readouterr().out
-    data = data_of(tm.Page(out.read_text(encoding="utf-8")))
+    data = data_of(Page(out.read_text(encoding="utf-8")))
     names, packed = zip(*[(one["name"], one["frames"]) for one in data["groups"][0]["sequences"]], strict=True)
     assert names == ("grow", "frames", "linear")
     assert len(set(packed)) == 1, "the ball grows linearly"
     assert main(arguments) == 1
     assert "--overwrite" in capsys.readouterr().err
     assert main([*arguments, "--overwrite", "--keyframes", "0", "3", "6", "--up", "z", "--quiet"]) == 0
-    data = data_of(tm.Page(out.read_text(encoding="utf-8")))
+    data = data_of(Page(out.read_text(encoding="utf-8")))
     assert data["groups"][0]["view"]["world_up"] == [0, 0, 1]
     assert [one["name"] for one in data["groups"][0]["sequences"]] == list(names)
     assert data["keyframes"] == [0, 3, 6]
@@ -222,7 +221,7 @@ def test_command_says_what_is_wrong(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     tm.save_animation(growing, ball[1], "grow.glb", keyframe_indices=[0, 6])
-    tm.save_frames(growing[:3], ball[1], "short")
+    tm.save_mesh(growing[:3], ball[1], "short")
     trimesh.creation.box().export("cube.ply")
     for arguments, message in (
         (["--compare", "short"], "(3, "),
@@ -546,7 +545,7 @@ def test_landmarks_as_points_become_vertices(two: list[Path], tmp_path: Path) ->
     file, out = tmp_path / "points.txt", tmp_path / "page.html"
     file.write_text(" ".join(map(str, [*(shapes[0][4] + 1e-4), *(shapes[1][6] - 1e-4)])))
     assert main(["view", *map(str, two), "--landmarks", str(file), "--page", str(out)]) == 0
-    assert data_of(tm.Page(out.read_text(encoding="utf-8")))["landmarks"] == [[4, 6]]
+    assert data_of(Page(out.read_text(encoding="utf-8")))["landmarks"] == [[4, 6]]
 
 
 def test_landmarks_that_cannot_be_shown(
@@ -563,7 +562,7 @@ def test_landmarks_that_cannot_be_shown(
     with pytest.raises(SystemExit):
         main(["view", str(two[0]), "--landmarks", *pages])
     with pytest.raises(ValueError, match="two meshes or more"):
-        tm.show_landmarks({"a": ball})
+        show_landmarks({"a": ball})
     for wrong in (np.zeros((3, 3), dtype=int), np.array([[0, -1]]), np.array([[0.0, 1.0]])):
         with pytest.raises(ValueError, match="a column for each of the meshes"):
-            tm.show_landmarks({"a": ball, "b": ball}, wrong)
+            show_landmarks({"a": ball, "b": ball}, wrong)

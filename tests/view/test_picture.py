@@ -93,7 +93,7 @@ def test_sheet_has_every_shape_at_its_place(tmp_path):
 
 
 def test_columns_and_keyframes_are_chosen(tmp_path):
-    options = {"overwrite": True}
+    options = {}
     rows, faces, out = {"a": growing(9)}, np.asarray(BALL.faces), tmp_path / "a.png"
     largest = np.pi * (picture.CELL_PIXELS / 2 / picture.CELL_MARGIN) ** 2
 
@@ -120,7 +120,7 @@ def test_titles_stand_above_the_columns(tmp_path):
     rows, faces = {"a": growing(3)}, np.asarray(BALL.faces)
     sheets = []
     for titles in (None, ["t = 0", "mode 2", "t = 1"]):
-        render_sequence(rows, faces, tmp_path / "a.png", titles=titles, overwrite=True)
+        render_sequence(rows, faces, tmp_path / "a.png", titles=titles)
         sheets.append(np.asarray(Image.open(tmp_path / "a.png").convert("RGB")).astype(int))
     changed = np.argwhere(np.abs(sheets[0] - sheets[1]).sum(2) > 0)
     height, width = sheets[0].shape[:2]
@@ -218,13 +218,18 @@ def test_what_rests_stays_and_what_travels_is_followed():
     assert np.abs(moved).max() <= 1.0 + 1e-12
 
 
-def test_existing_pictures_stay_unless_asked(tmp_path):
+def test_half_of_the_panels_are_in_betweens() -> None:
+    for n_keys, levels in ((2, 4), (3, 2), (4, 2), (7, 2), (7, 3), (6, 1), (13, 2)):
+        keys = [2**levels * i for i in range(n_keys)]
+        chosen = picture.choose_columns(None, keys[-1] + 1, keys)
+        assert 2 * len(set(chosen) - set(keys)) >= len(chosen) and chosen[0] == 0 and chosen[-1] == keys[-1]
+    assert picture.choose_columns(7, 25, list(range(0, 25, 4))) == list(range(0, 25, 4))  # as asked
+
+
+def test_existing_pictures_are_replaced(tmp_path):
     rows, faces, out = {"a": growing(2)}, np.asarray(BALL.faces), tmp_path / "a.png"
     out.write_text("mine")
-    with pytest.raises(FileExistsError, match=r"a\.png exists.*--overwrite"):
-        render_sequence(rows, faces, out)
-    assert out.read_text() == "mine" and list(tmp_path.iterdir()) == [out]
-    render_sequence(rows, faces, out, overwrite=True)
+    render_sequence(rows, faces, out)
     assert Image.open(out).format == "PNG"
     assert render_sequence(rows, faces, tmp_path / "a.pdf").read_bytes().startswith(b"%PDF")
 

@@ -84,7 +84,7 @@ def run(args: argparse.Namespace) -> None:
     asset = None if files[0].suffix.lower() == ".npz" else tm.open_asset(files[0])
     if asset is not None:
         asset.carries.pop("posing", None)  # it is what is written
-    options = pick_options(args, "cyclic", "overwrite", "targets", "progress")
+    options = pick_options(args, "cyclic", "targets", "progress")
     tm.save_animation(frames, faces, args.out, fps, bones=skin, asset=asset, **options)
     bones = f", {skin.weights.shape[1]} bones" if skin else ""
     args.report(f"animation: {args.out}, {args.out.stat().st_size / 1e6:.2f} MB{bones}")

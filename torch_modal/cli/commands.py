@@ -7,25 +7,28 @@ from pathlib import Path
 
 from torch_modal.cli import arguments, subdivide
 from torch_modal.cli.arguments import check_output, pick_options
+from torch_modal.io.files import write_files
 from torch_modal.io.formats import MESH_FORMATS, PICTURES
 from torch_modal.io.write import check_suffix
 
 DEMO_SAMPLES = ("creature", "hand")
-INCOMPLETE = 3  # exit status of `precompute` when some sets have no bases
+INCOMPLETE = 3  # exit status of `precompute` when some sets have no bases, of `register` when some are doubtful
+TABLE = "target,confidence,to target (%),from target (%),stretch,warnings"
 CROSSES = 3  # exit status of `check` when parts newly pass through each other
 
 
 def add_register(sub: argparse.ArgumentParser) -> None:
     """Add the arguments of ``register``."""
-    sub.add_argument("meshes", nargs=2, type=Path, metavar="MESH", help="the template, and the target")
-    text = f"the template laid onto the target, {', '.join(MESH_FORMATS)}"
-    sub.add_argument("--out", type=Path, required=True, metavar="FILE", help=text)
+    text = "the template, and the target; or several targets, or a folder of them"
+    sub.add_argument("meshes", nargs="+", type=Path, metavar="MESH", help=text)
+    text = f"the template laid onto the target, {', '.join(MESH_FORMATS)}; of several, a folder, also for report.csv"
+    sub.add_argument("--out", type=Path, required=True, metavar="FILE_OR_FOLDER", help=text)
     sub.add_argument("--keep-doubtful", action="store_true", help="write a doubtful result too, with a warning")
     arguments.add_registration(sub)
     arguments.add_cache(sub)
 
 
-def register(args: argparse.Namespace) -> None:
+def register(args: argparse.Namespace) -> int:
     """Lay one mesh's connectivity onto another.
 
     Lay the connectivity of the first mesh onto another mesh of the same subject, or,
@@ -35,29 +38,64 @@ def register(args: argparse.Namespace) -> None:
     A report is printed; a doubtful result is an error. Landmarks help: a text file
     with a line for each, which names one vertex of each mesh, counted from 0.
 
+    Of several targets, each result is a mesh with the target's name in the folder, beside
+    a table of their confidence, distances and stretch. Doubtful ones are left out.
+
+    exit status: 3 if some of several are doubtful, 1 if one alone is
+
     Examples:
       torch-modal register open.obj scan.ply --out wrapped.obj
+      torch-modal register template.obj scans/ --across --out wrapped
       landmarks are picked on a page, and saved there as pairs.txt:
         torch-modal view cat.obj dog.obj --landmarks
         torch-modal register cat.obj dog.obj --across --landmarks pairs.txt --out wrapped.obj
     """
-    check_suffix(args.out, MESH_FORMATS)
-    check_output(args, [args.out], args.meshes)
+    from torch_modal.data.tree import mesh_files
+
+    first, *targets = args.meshes
+    several = len(targets) > 1 or any(path.is_dir() for path in targets)
+    targets = [file for path in targets for file in (mesh_files(path) if path.is_dir() else [path])]
+    targets = [path for path in targets if path.resolve() != first.resolve()]
+    if not targets:
+        args.fail("register needs a template and one target or more")
+    files, table = [args.out], args.out / "report.csv"
+    if several:
+        files = [args.out / path.with_suffix(first.suffix).name for path in targets]
+        if len(set(files)) < len(files):
+            raise ValueError("several targets have the same name; each names the file of its result")
+    for path in files:
+        check_suffix(path, MESH_FORMATS)
+    check_output(args, [*files, *[table] * several], [first, *targets])
 
     import torch_modal as tm
+    from torch_modal.registration.landmarks import landmark_vertices
     from torch_modal.registration.load import ADVICE
 
-    template, target = map(tm.open_asset, args.meshes)
-    options = pick_options(args, *arguments.REGISTRATION)
-    result = tm.register(template.positions, template.faces, target.positions, target.faces, **options)
-    args.report(result.summary())
-    if result.doubtful:
-        why = f"the result is doubtful: {'; '.join(result.warnings)}"
-        if not args.keep_doubtful:
-            raise ValueError(f"{why}. To help it, {ADVICE}; --keep-doubtful writes it all the same")
-        warnings.warn(why, stacklevel=2)
-    tm.save_mesh(result.positions, template.faces, args.out, args.overwrite, template)
-    args.report(f"written: {args.out}")
+    template, *assets = map(tm.open_asset, [first, *targets])
+    options, lines, doubtful = pick_options(args, *arguments.REGISTRATION), [TABLE], 0
+    if marks := options.pop("landmarks"):
+        marks = landmark_vertices(marks, [each.positions for each in (template, *assets)])
+    for i, (path, target, out) in enumerate(zip(targets, assets, files, strict=True), 1):
+        pair = {} if marks is None else {"landmarks": marks[:, [0, i]]}
+        result = tm.register(template.positions, template.faces, target.positions, target.faces, **pair, **options)
+        args.report(f"{path.name}: {result.summary()}" if several else result.summary())
+        if several:
+            distances = f"{result.to_target.mean:.3f},{result.from_target.mean:.3f},{result.stretch:.4f}"
+            lines.append(f'{path.name},{result.confidence:.3f},{distances},"{"; ".join(result.warnings)}"')
+        if result.doubtful:
+            doubtful += 1
+            why = f"the result is doubtful: {'; '.join(result.warnings)}"
+            if not args.keep_doubtful and not several:
+                raise ValueError(f"{why}. To help it, {ADVICE}; --keep-doubtful writes it all the same")
+            warnings.warn(f"{path.name}: {why}" if several else why, stacklevel=2)
+            if not args.keep_doubtful:
+                continue
+        tm.save_mesh(result.positions, template.faces, out, overwrite=args.overwrite, asset=template)
+        args.report(f"written: {out}")
+    if several:
+        write_files([(table, ("\n".join(lines) + "\n").encode("utf-8"))])
+        args.report(f"report:  {table}, {doubtful} of {len(targets)} doubtful")
+    return INCOMPLETE if several and doubtful else 0
 
 
 def add_check(sub: argparse.ArgumentParser) -> None:
@@ -100,6 +138,7 @@ def check(args: argparse.Namespace) -> int:
         check_output(args, [args.picture], [*args.meshes, *args.keyframes])
 
     import torch_modal as tm
+    from torch_modal.times import fill_linear
 
     shapes, faces = tm.load_keyframes([*args.keyframes, *args.meshes])
     welded = tm.weld_seams(shapes, faces)
@@ -107,9 +146,9 @@ def check(args: argparse.Namespace) -> int:
     names = [str(mesh) for mesh in args.meshes]
     if args.between:
         keyframes, started = welded.keyframes, time.perf_counter()
-        frames = tm.subdivide(shapes, welded.faces, 3, **pick_options(args, "contact", "progress"))
+        frames = tm.interpolate(shapes, welded.faces, 3, **pick_options(args, "contact", "progress"))
         seconds, shell = time.perf_counter() - started, tm.losses.ShellLoss(welded.faces)
-        motions = frames, tm.linear_sequence(shapes, tm.keyframe_places(len(names), 3))
+        motions = frames, fill_linear(shapes, range(0, 8 * len(names), 8))
         ours, linear = (float((len(x) - 1) * shell(x[1:], x[:-1]).sum()) for x in motions)
         args.report(f"shell energy of the motion: {ours:.4g}, of linear interpolation: {linear:.4g}; {seconds:.1f} s")
         names, shapes = [f"t = {i / 8:g}" for i in range(len(frames))], frames
@@ -137,7 +176,6 @@ def check(args: argparse.Namespace) -> int:
             keyframe_indices=[0],
             colors={"crossings": marks},
             color_label="1: crosses, 2: new",
-            overwrite=args.overwrite,
         )
         args.report(f"picture: {args.picture}")
     return CROSSES if bool(contacts.n_far.any()) else 0
@@ -285,7 +323,7 @@ def demo(args: argparse.Namespace) -> None:
     Run the main job on the samples that come with the package: a galloping creature
     (a cycle of six key-frames) and a closing hand (two key-frames).
 
-    For each it runs `subdivide`, which writes an animation (GLB) and a picture of the sequence
+    For each it runs `interpolate`, which writes an animation (GLB) and a picture of the sequence
     next to linear interpolation.
 
     Examples:
@@ -298,7 +336,7 @@ def demo(args: argparse.Namespace) -> None:
 
     for name in names:
         plays = ["--cyclic" if SAMPLES[name]["cyclic"] else "--ping-pong", "--duration", str(SAMPLES[name]["seconds"])]
-        command = ["subdivide", *map(str, sample_files(name)), "--levels", str(args.levels), *plays, "--overwrite"]
+        command = ["interpolate", *map(str, sample_files(name)), "--levels", str(args.levels), *plays, "--overwrite"]
         command += ["--out", str(args.out / f"{name}.glb"), "--picture", str(args.out / f"{name}.png")]
         args.report(" ".join(["torch-modal", *command]))
         subdivide.run(args.parse(command, argparse.Namespace(progress=args.progress, report=args.report)))

@@ -62,6 +62,7 @@ def run(args: argparse.Namespace) -> None:
 
     import torch_modal as tm
     from torch_modal.data.tree import natural
+    from torch_modal.times import fill_linear
 
     names = [f.as_posix() for f in args.observations if f.suffix.lower() != ".csv"]
     if not args.times and names != sorted(names, key=natural):
@@ -82,7 +83,8 @@ def run(args: argparse.Namespace) -> None:
     if len(knots) > 1 and args.frames:
         when = torch.linspace(float(knots[0]), float(knots[-1]), args.frames, dtype=torch.float64)
     elif len(knots) > 1:
-        when = tm.frame_times(len(knots), min(3, max(0, 6 - (len(knots) - 2).bit_length())), times=knots)
+        step = 2 ** min(3, max(0, 6 - (len(knots) - 2).bit_length()))
+        when = fill_linear(knots, range(0, step * len(knots), step))
     frames, asset = welded.scatter(completion(when)), tm.open_asset(args.mesh)
     keys = [i for i, t in enumerate(when.tolist()) if t in (times or ())]
     write_sequence(args, animation, frames, faces, asset, keyframe_indices=keys, times=when.tolist())
@@ -100,7 +102,6 @@ def run(args: argparse.Namespace) -> None:
             colors={"completed": 1 - completion.confidence[chosen]},
             color_label="1 - confidence",
             points={"seen": [torch.cat([o.points for o, n in zip(seen, at, strict=True) if n == i]) for i in chosen]},
-            overwrite=args.overwrite,
         )
         args.report(f"picture:   {args.picture}")
     used, low = welded.keyframes[0, welded.faces.unique()], (completion.confidence < 0.5).double().mean(1)

@@ -26,14 +26,14 @@ the same vertex order, in any units. Results are in the same units and coordinat
 EXAMPLES = """\
 start here:
   torch-modal demo                                        try it on the samples that come with it
-  torch-modal subdivide a.obj b.obj --out between.glb     from your meshes to an animation
-  torch-modal subdivide a.obj scan.ply --register --out between.glb   of different connectivity
+  torch-modal interpolate a.obj b.obj --out between.glb     from your meshes to an animation
+  torch-modal interpolate a.obj scan.ply --register --out between.glb   of different connectivity
   torch-modal bake frames/*.obj --bones 40 --out x.glb                from a sequence to one file
   torch-modal complete a.obj scans/*.ply --out motion.glb             from scans and a template
-  torch-modal subdivide --help                            all that can be set"""
+  torch-modal interpolate --help                            all that can be set"""
 
 COMMANDS: dict[str, tuple[Callable[[Any], None], Callable[[Any], int | None]]] = {
-    "subdivide": (subdivide.add_arguments, subdivide.run),
+    "interpolate": (subdivide.add_arguments, subdivide.run),
     "bake": (bake.add_arguments, bake.run),
     "complete": (complete.add_arguments, complete.run),
     "transfer": (transfer.add_arguments, transfer.run),
@@ -63,7 +63,8 @@ def build_parser() -> argparse.ArgumentParser:
         description, _, examples = rest.rpartition("\n\n")
         texts = {"description": description, "epilog": examples, "formatter_class": formatter}
         short = summary[:1].lower() + summary[1:].removesuffix(".")
-        sub = subparsers.add_parser(name, help=short, allow_abbrev=False, **texts)  # type: ignore[arg-type]
+        aliases = ["subdivide"] if name == "interpolate" else []  # the paper's word
+        sub = subparsers.add_parser(name, help=short, aliases=aliases, allow_abbrev=False, **texts)  # type: ignore[arg-type]
         add_arguments(sub)
         group = sub.add_argument_group("files and messages")
         group.add_argument("--overwrite", action="store_true", help="replace files that exist (default: refuse)")

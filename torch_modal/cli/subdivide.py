@@ -1,4 +1,4 @@
-"""``torch-modal subdivide``: from key-frames to files."""
+"""``torch-modal interpolate``, also called ``subdivide``: from key-frames to files."""
 
 import argparse
 import warnings
@@ -42,20 +42,19 @@ def write_sequence(
     """Write frames, if --out is a folder, and the animation; ``options`` are passed to `save_animation`."""
     import torch_modal as tm
 
-    same = {"overwrite": args.overwrite, "asset": asset}
     if animation != args.out:
-        written = tm.save_frames(frames, faces, args.out, args.format, **same)
+        written = tm.save_mesh(frames, faces, args.out, args.format, overwrite=args.overwrite, asset=asset)
         args.report(f"frames:    {written[0]} to {written[-1].name}")
         left = sorted({*args.out.glob("frame-*")} - {*written})
         if left:  # they look like the end of this sequence
             message = f"{args.out} also holds {len(left)} frames of an earlier run, from {left[0].name}"
             warnings.warn(message, stacklevel=2)
-    tm.save_animation(frames, faces, animation, args.fps, progress=args.progress, **same, **options)
+    tm.save_animation(frames, faces, animation, args.fps, asset=asset, progress=args.progress, **options)
     args.report(f"animation: {animation}")
 
 
 def add_arguments(sub: argparse.ArgumentParser) -> None:
-    """Add the arguments of ``subdivide``."""
+    """Add the arguments of ``interpolate``."""
     add = sub.add_argument
     add("meshes", nargs="+", type=Path, metavar="MESH", help="key-frames, two or more, in their order")
     add_output(sub, "the sequence next to linear interpolation")
@@ -94,33 +93,37 @@ def run(args: argparse.Namespace) -> None:
 
     Examples:
       one animated file, with a picture next to linear interpolation:
-        torch-modal subdivide open.obj fist.obj --out hand.glb --picture hand.png
+        torch-modal interpolate open.obj fist.obj --out hand.glb --picture hand.png
       a cycle of six key-frames as 96 numbered OBJ files and animation.glb in a folder:
-        torch-modal subdivide gait-?.ply --cyclic --levels 4 --out gait --format obj
+        torch-modal interpolate gait-?.ply --cyclic --levels 4 --out gait --format obj
       a GIF that goes there and back again:
-        torch-modal subdivide open.obj fist.obj --out hand.gif --ping-pong --ease
+        torch-modal interpolate open.obj fist.obj --out hand.gif --ping-pong --ease
       a point cache for the mesh that is already in Blender:
-        torch-modal subdivide open.obj fist.obj --out hand.mdd --duration 3 --fps 24
+        torch-modal interpolate open.obj fist.obj --out hand.mdd --duration 3 --fps 24
     """
     if len(args.meshes) < 2:
-        args.fail("subdivide needs two key-frames or more")
+        args.fail("interpolate needs two key-frames or more")
     animation = check_files(args, args.meshes)
     check_forms(animation, args.bones, args.targets)
     Timing(len(args.meshes), **pick_options(args, *ANIMATION))
 
+    import torch
+
     import torch_modal as tm
+    from torch_modal.motion.subdivide import keyframe_places
     from torch_modal.passengers.proxy import proxy_size
+    from torch_modal.times import fill_linear
 
     n, spread = len(args.meshes), pick_options(args, "cyclic", "n_frames", "times")
-    places = tm.keyframe_places(n, args.levels, **spread)
-    when = tm.frame_times(n, args.levels, **spread).tolist() + args.times[-1:] * args.cyclic if args.times else None
+    places = keyframe_places(n, args.levels, **spread)
+    when = fill_linear(torch.tensor(args.times, dtype=torch.float64), places).tolist() if args.times else None
     registration = pick_options(args, "register", "report", *arguments.REGISTRATION)
     keyframes, faces = tm.load_keyframes(args.meshes, **registration)
     asset = tm.open_asset(args.meshes[0])
     welded = tm.weld_seams(keyframes, faces)
     bases = partial(tm.extract_bases, **pick_options(args, *arguments.MODES))
     options = pick_options(args, "smooth", "preset", "contact", "proxy", "progress")
-    solved = tm.subdivide(welded.keyframes, welded.faces, args.levels, bases=bases, **spread, **options)
+    solved = tm.interpolate(welded.keyframes, welded.faces, args.levels, bases=bases, **spread, **options)
     if n_proxy := proxy_size(args.proxy, welded.keyframes.shape[1]):
         args.report(f"moved by a proxy of about {n_proxy} vertices (--proxy 0: by the whole mesh)")
     frames = welded.scatter(solved)
@@ -131,6 +134,6 @@ def run(args: argparse.Namespace) -> None:
     options = pick_options(args, "cyclic", "duration", "ping_pong", "ease", "bones", "targets")
     write_sequence(args, animation, frames, faces, asset, keyframe_indices=keys, times=when, **options)
     if args.picture:
-        rows = {"torch_modal": frames, "linear": tm.linear_sequence(keyframes, places)}
-        tm.render_sequence(rows, faces, args.picture, keyframe_indices=keys, overwrite=args.overwrite)
+        rows = {"torch_modal": frames, "linear": fill_linear(keyframes, places)}
+        tm.render_sequence(rows, faces, args.picture, keyframe_indices=keys)
         args.report(f"picture:   {args.picture}")

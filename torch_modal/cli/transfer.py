@@ -48,6 +48,7 @@ def run(args: argparse.Namespace) -> None:
     import torch_modal as tm
     from torch_modal.data.sequence import sequence_files
     from torch_modal.motion.transfer import correspond
+    from torch_modal.registration.report import Registration
 
     files = sequence_files(args.meshes)
     animation = check_files(args, [*files, args.to, *filter(None, [args.rest, args.landmarks])])
@@ -58,7 +59,7 @@ def run(args: argparse.Namespace) -> None:
         rest = tm.load_keyframes([args.rest]).keyframes[0]
     options = pick_options(args, "landmarks", "cache", "progress")
     found = correspond(rest, faces, asset.positions, asset.faces, **options)
-    if isinstance(found, tm.Registration):
+    if isinstance(found, Registration):
         args.report(f"map:       {found.summary()}")
         low = float((found.vertex_confidence < 0.5).double().mean())
         args.report(f"{100 * low:.0f} % of the vertices have no sure counterpart and follow their neighbours")
@@ -68,5 +69,5 @@ def run(args: argparse.Namespace) -> None:
     options = pick_options(args, "cyclic", "bones", "targets")
     write_sequence(args, animation, moved, asset.faces, asset, keyframe_indices=[], **options)
     if args.picture:
-        tm.render_sequence({"moved": moved}, asset.faces, args.picture, keyframe_indices=[], overwrite=args.overwrite)
+        tm.render_sequence({"moved": moved}, asset.faces, args.picture, keyframe_indices=[])
         args.report(f"picture:   {args.picture}")

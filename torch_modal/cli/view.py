@@ -68,7 +68,7 @@ def run(args: argparse.Namespace) -> None:
 
     page = _landmarks(args) if args.landmarks else _sequences(sequences, args)
     # Without --page it goes to a temporary folder, and stays: the browser reads it after this process.
-    path = page.save(args.page or Path(tempfile.mkdtemp(prefix="torch_modal-"), "page.html"), args.overwrite)
+    path = page.save(args.page or Path(tempfile.mkdtemp(prefix="torch_modal-"), "page.html"))
     args.report(f"page: {path}")
     if not args.page and not webbrowser.open(path.absolute().as_uri()):
         print(f"no browser was found to open it; open it yourself, or write it elsewhere with --page: {path}")
@@ -76,14 +76,14 @@ def run(args: argparse.Namespace) -> None:
 
 def _landmarks(args: argparse.Namespace) -> Page:
     """A page to pick landmarks on meshes of any connectivity."""
-    import torch_modal as tm
     from torch_modal.io.read import open_asset
     from torch_modal.registration.landmarks import landmark_vertices
+    from torch_modal.view.page import show_landmarks
 
     meshes = [(asset.positions, asset.faces) for asset in map(open_asset, args.meshes)]
     rows = None if args.landmarks is True else landmark_vertices(args.landmarks, [points for points, _ in meshes])
     names = _number_names([path.name for path in args.meshes])
-    return tm.show_landmarks(dict(zip(names, meshes, strict=True)), rows, title="Landmarks")
+    return show_landmarks(dict(zip(names, meshes, strict=True)), rows, title="Landmarks")
 
 
 def _sequences(sequences: list[list[Path]], args: argparse.Namespace) -> Page:
@@ -94,6 +94,7 @@ def _sequences(sequences: list[list[Path]], args: argparse.Namespace) -> Page:
     from torch_modal.data.sequence import read_shapes
     from torch_modal.io.read import require_same_mesh
     from torch_modal.io.write import check_indices
+    from torch_modal.times import fill_linear
 
     first, faces, options = read_shapes(sequences[0])
     names = [(paths[0] if len(paths) == 1 else paths[0].parent).absolute().stem for paths in sequences]
@@ -109,7 +110,7 @@ def _sequences(sequences: list[list[Path]], args: argparse.Namespace) -> Page:
         ends = [0] if cyclic else [0, n - 1]
         keys = check_indices([*ends, *(options.get("keyframe_indices") or [n - 1])], n, "key-frames")
         names.append("linear")
-        shapes.append(tm.linear_sequence(torch.from_numpy(first[keys]), [*keys, n] if cyclic else keys).numpy())
+        shapes.append(fill_linear(torch.from_numpy(first[keys]), [*keys, n] if cyclic else keys).numpy())
     return tm.show(dict(zip(_number_names(names), shapes, strict=True)), faces, **options, title=names[0])
 
 

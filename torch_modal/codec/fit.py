@@ -14,7 +14,6 @@ MAX_STEPS = 6
 MIN_GAIN = 0.01  # a frame has converged when a step lowers the squared residual by less than this fraction
 AMPLITUDE_RIDGE = 1e-4
 """Times the mean diagonal of the normal equations: amplitudes that hardly move the vertices stay near zero."""
-AMPLITUDE_STEP = 1e-3  # difference of amplitudes, for the Jacobian
 MAX_TURN = 0.3
 """Change of edges, over their lengths, from which on the Jacobian is recomputed; about a rotation in radians."""
 TURN_QUANTILE = 0.95  # quantile of the edges' changes that is compared with that limit
@@ -64,17 +63,15 @@ class _Linearisation:
     """
 
     def __init__(self, decoder: ModalDecoder, a: Tensor, t: Tensor) -> None:
-        k = decoder.n_modes
         self._ends = decoder.faces[:, :2].T
         self.x = decoder(a, t)
-        shapes = decoder(a + AMPLITUDE_STEP * torch.eye(k).double(), t)
-        flat = ((shapes - self.x) / AMPLITUDE_STEP).flatten(1)
+        flat = decoder.tangents(a, t).flatten(1)
         rigid = torch.linalg.qr(infinitesimal_motions(self.x - self.x.mean(0)).flatten(1).mT).Q
         #: *Shape:* ``(k, 3V)``.
         self.rows = flat - (flat @ rigid) @ rigid.mT
         normal = self.rows @ self.rows.mT
         self.ridge = AMPLITUDE_RIDGE * normal.diagonal().mean().clamp_min(torch.finfo(torch.float64).tiny)
-        self.factor = torch.linalg.cholesky(normal + self.ridge * torch.eye(k).double())
+        self.factor = torch.linalg.cholesky(normal + self.ridge * torch.eye(len(flat)).double())
 
     def holds(self, x: Tensor) -> bool:
         """True if a shape is so near that the derivatives are valid for it. *Shape:* ``(V, 3)``."""

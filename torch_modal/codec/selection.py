@@ -8,56 +8,12 @@ from torch import Tensor
 
 from torch_modal.codec.fit import fit
 from torch_modal.keyframes.check import check_keyframes
-from torch_modal.modes.extract import extract_modes
 from torch_modal.motion.decoder import ModalDecoder
 from torch_modal.progress import Progress, ProgressReport
-from torch_modal.times import Times, check_times
+from torch_modal.times import check_times
 
 LARGEST_ERROR = 0.002  # default for the largest mean distance of a frame's vertices, over the diagonal
-FRAMES_TO_FIT = 5  # frames of an interval that are fitted to estimate its error
-
-
-def select_keyframes(
-    frames: Any,
-    faces: Any,
-    n_keyframes: int | None = None,
-    *,
-    error: float = LARGEST_ERROR,
-    n_modes: int = 60,
-    times: Times = None,
-    cyclic: bool = False,
-    cache_dir: str | None = None,
-    cache: bool = True,
-    progress: Progress = None,
-) -> list[int]:
-    """Select the frames of a motion that serve best as its key-frames.
-
-    Key-frames are inserted one by one where the errors of the frames between are largest; a given number of them is
-    then moved, by steps that halve, while the mean error falls. Errors are the errors of :func:`torch_modal.encode`,
-    estimated from a few frames of each interval.
-
-    Args:
-        frames: A motion of one connectivity, in any units. *Shape:* ``(T, V, 3)``.
-        faces: Vertex indices. *Shape:* ``(F, 3)``.
-        n_keyframes: How many. Default: as few as the ``error`` needs.
-        error: Largest estimated mean distance of a frame's vertices, over the diagonal.
-        n_modes: Amplitudes of a frame; fewer need more key-frames.
-        times: As for :func:`torch_modal.encode`, like the following.
-        cyclic: Whether the last frame leads on to the first.
-        cache_dir: Folder where modes are cached.
-        cache: Whether they are.
-        progress: See :data:`torch_modal.progress.Progress`.
-
-    Returns:
-        Ascending frame numbers, with the first, and, if not cyclic, the last.
-
-    Raises:
-        MeshError: Frames that cannot be used.
-        ValueError: Times or numbers that cannot be used.
-    """
-    x, triangles, when = check_motion(frames, faces, times, cyclic)
-    modes = extract_modes(x[0], triangles, n_modes, cache_dir=cache_dir, cache=cache).modes
-    return insert_keyframes(x, triangles, when, cyclic, modes, n_keyframes, error, progress)
+FRAMES_TO_FIT = 3  # frames of an interval that are fitted to estimate its error
 
 
 def check_motion(frames: Any, faces: Any, times: Any, cyclic: bool) -> tuple[Tensor, Tensor, Tensor]:
@@ -76,7 +32,10 @@ def insert_keyframes(
     error: float,
     progress: Progress = None,
 ) -> list[int]:
-    """Key-frames of a checked motion with modes of its first frame, ``(k, V, 3)``; see :func:`select_keyframes`.
+    """Key-frames of a checked motion with modes of its first frame, ``(k, V, 3)``.
+
+    Each new one is put into the interval that costs the most, and a given number of them is then moved while that
+    lowers the error, estimated from a few frames of each interval.
 
     Raises:
         ValueError: More key-frames than frames, or fewer than two.
@@ -92,7 +51,7 @@ def insert_keyframes(
         samples = torch.linspace(a + 1, b - 1, min(FRAMES_TO_FIT, b - a - 1)).round().long()
         cycles, keys = torch.tensor(around) // n, torch.tensor(around) % n
         path = decoder.with_keyframes(frames[keys], times[keys] + (times[-1] - times[0]) * cycles)
-        return samples, fit(path, frames[samples], times[samples]).errors
+        return samples, fit(path, frames[samples], times[samples], bar.update).errors
 
     def fit_intervals(keys: list[int]) -> list[tuple[int, int, Tensor, Tensor]]:
         """Ends, samples and errors of all intervals with frames between."""
@@ -106,26 +65,26 @@ def insert_keyframes(
         return sum(float(errors.mean()) * (b - a - 1) for a, b, _, errors in fit_intervals(keys))
 
     keys = [0, n // 2] if cyclic else [0, n - 1]
-    with ProgressReport(n_keyframes or n, "key-frames", progress) as bar:
+    with ProgressReport(None, "frames fitted for the choice of key-frames", progress, unit="frame") as bar:
         while len(keys) < (n_keyframes or n):
             intervals = fit_intervals(keys)
             if n_keyframes is None:
-                scores = [float(errors.max()) for *_, errors in intervals]
-                if max(scores) <= error:
+                chosen = [each for each in intervals if float(each[3].max()) > error]
+                if not chosen:
                     break
             else:
-                scores = [float(errors.sum()) * (b - a - 1) for a, b, _, errors in intervals]
-            a, b, samples, errors = intervals[scores.index(max(scores))]
-            centre = float((samples * errors).sum() / errors.sum()) if errors.any() else (a + b) / 2
-            keys = sorted([*keys, min(max(round(centre), a + 1), b - 1)])
-            bar.update()
-    least, step = sum_errors(keys), 0 if n_keyframes is None else max(1, n // (4 * len(keys)))
-    while step:
-        before = least
-        for j in range(1, len(keys) - (not cyclic)):
-            for place in (keys[j] - step, keys[j] + step):
-                moved = [*keys[:j], place, *keys[j + 1 :]]
-                if moved == sorted({*moved} & {*range(n)}) and (total := sum_errors(moved)) < least * (1 - 1e-3):
-                    least, keys = total, moved
-        step //= 2 if least == before else 1
+                chosen = [max(intervals, key=lambda each: float(each[3].sum()) * (each[1] - each[0] - 1))]
+            for a, b, samples, errors in chosen:
+                centre = float((samples * errors).sum() / errors.sum()) if errors.any() else (a + b) / 2
+                keys.append(min(max(round(centre), a + 1), b - 1))
+            keys.sort()
+        least, step = sum_errors(keys), 0 if n_keyframes is None else max(1, n // (4 * len(keys)))
+        while step:
+            before = least
+            for j in range(1, len(keys) - (not cyclic)):
+                for place in (keys[j] - step, keys[j] + step):
+                    moved = [*keys[:j], place, *keys[j + 1 :]]
+                    if moved == sorted({*moved} & {*range(n)}) and (total := sum_errors(moved)) < least * (1 - 1e-3):
+                        least, keys = total, moved
+            step //= 2 if least == before else 1
     return keys

@@ -159,17 +159,18 @@ class FramePoses:
     def _search(self, i: int, starts: Sequence[tuple[Tensor, ModalPose]]) -> ModalFit:
         """The best pose of a frame from several starts, or one of these.
 
-        Surface that a camera should see and that has no points may hold a limb back as well as guide it: each start
-        descends with and without it, and the score with it decides.
+        Surface that a camera should see and that has no points guides limbs between key-frames. With a template alone,
+        it may also hold them back: each start descends with and without it, and the score with it decides.
         """
-        frame, poses = self.frames[i], self.poses
-        ways = [frame, frame.without_cameras()][: 1 + any(one.camera is not None for one in frame.seen)]
+        frame, poses, alone = self.frames[i], self.poses, not self.whole
+        both = alone and any(one.camera is not None for one in frame.seen)
+        ways, n_modes = [frame, frame.without_cameras()][: 1 + both], N_SOFT if alone else None
         fits, begun = [], []
         for base, start in starts:
             coarse = self._coarsen(base)
             fits.append((base, start, poses.score(coarse, start, frame)))
             for way in ways:
-                pose = poses.descend(coarse, start, way, part=FIRST, n_modes=N_SOFT)
+                pose = poses.descend(coarse, start, way, part=FIRST, n_modes=n_modes)
                 begun.append((base, pose, way, poses.score(coarse, pose, frame._replace(unit=AFTER_FIRST))))
         for base, pose, way, _ in sorted(begun, key=lambda one: one[-1])[:N_KEPT]:
             coarse = self._coarsen(base)

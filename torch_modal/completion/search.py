@@ -19,7 +19,7 @@ from torch_modal.geometry.rigid import infinitesimal_motions
 STEPS, FAR, NEAR = 12, 20.0, 2.0
 # Steps of all starts, after which the score at this distance chooses those that take the others.
 ALL, FIRST, REST, N_KEPT, AFTER_FIRST = slice(None), slice(4), slice(4, None), 2, 8.0
-# Modes in the first steps.
+# Modes in the first steps from a template alone.
 N_SOFT = 24
 # Points of a cloud, and visible places of a surface, that take part in a step, and in one of the pose alone.
 N_POINTS, N_RIGID = 800, 200

@@ -168,18 +168,21 @@ class ShapeAugmentation(nn.Module):
         """Transform shapes, their normals and labels.
 
         Args:
-            inputs: One for each data key.
+            inputs: One for each data key; or one graph of PyTorch Geometric, a ``Data`` with ``pos`` (V, 3).
             params: Parameters of an earlier call, to repeat it.
             space: Key-frames and modes; by default the module's.
             pool: As for :meth:`transform`, with labels if ``inputs`` have any.
 
         Returns:
-            A tensor, or a tuple of one for each data key. One shape gives a batch of one, unless ``keepdim`` is set.
+            A tensor, or a tuple of one for each data key. One shape gives a batch of one, unless ``keepdim`` is set. A
+            graph gives a copy with other positions.
 
         Raises:
             ValueError: The inputs do not fit the data keys, each other or the space; or as for :meth:`transform`.
         """
         space = self._space(space)
+        if len(inputs) == 1 and hasattr(inputs[0], "pos"):
+            return self._of_graph(inputs[0], params, space, pool)
         if len(inputs) != len(self.data_keys):
             raise ValueError(f"the data keys are {self.data_keys}; got {len(inputs)} arguments")
         named: dict[str, Any] = dict(zip(self.data_keys, inputs, strict=True))
@@ -200,6 +203,14 @@ class ShapeAugmentation(nn.Module):
         if single and self.keepdim:
             results = [None if value is None else value[0] for value in results]
         return results[0] if len(results) == 1 else tuple(results)
+
+    def _of_graph(self, data: Any, params: Any, space: ShapeSpace | None, pool: ShapeBatch | None) -> Any:
+        """A copy of a graph of PyTorch Geometric with other positions ``pos (V, 3)``."""
+        if self.data_keys != ("shapes",):
+            raise ValueError(f"a graph takes other positions alone; of {self.data_keys}, pass tensors")
+        data = data.clone()
+        data.pos = self(data.pos[None], params=params, space=space, pool=pool)[0]
+        return data
 
     def _space(self, space: ShapeSpace | None) -> Any:
         space = self.space if space is None else space

@@ -12,7 +12,7 @@ from torch.utils.data import BatchSampler, Dataset, Sampler, get_worker_info
 
 from torch_modal.autograd import Recent
 from torch_modal.data.augmentation import AugmentationSequential, ShapeAugmentation
-from torch_modal.data.random_transforms import RandomInBetween
+from torch_modal.data.random_transforms import RandomBlend
 from torch_modal.data.shape_batch import ShapeBatch, check_labels
 from torch_modal.data.space import ShapeSpace
 from torch_modal.data.stored import StoredSet, find_sets
@@ -43,7 +43,8 @@ class ShapeDataset(Dataset[Sample]):
 
     Args:
         root: Folder of stored sets, at any depth.
-        transform: Transforms the key-frames; in-betweens by default. Its ``same_on_batch`` has no effect here.
+        transform: Transforms the key-frames; mixtures of all (:class:`RandomBlend`) by default, for labels that all
+            key-frames of a set share. Its ``same_on_batch`` has no effect here.
         samples_per_set: Samples of each set in an epoch.
         labels: Returns the labels of a set: ``vertex_labels`` (V, ...) or (K, V, ...), and ``shape_labels`` (K, ...),
             each if there are any. A function of a module, if workers are spawned.
@@ -51,7 +52,7 @@ class ShapeDataset(Dataset[Sample]):
         dtype: Dtype of the vertices.
         faces: Whether samples have their faces. A loader stacks them for each sample; a :meth:`space` has them once.
         normals: Whether samples have normals.
-        options: Options of the spaces (:class:`ShapeSpace`), such as ``preset`` or ``times``.
+        options: Options of the spaces (:class:`ShapeSpace`), such as ``preset`` or ``dtype``.
 
     Raises:
         FileNotFoundError: There is no such folder, or no set in it.
@@ -76,7 +77,9 @@ class ShapeDataset(Dataset[Sample]):
         self.sets = [str(path) for path in find_sets(root)]
         if not self.sets:
             raise FileNotFoundError(f"no stored key-frame set in {root}; torch-modal precompute makes them")
-        transform = RandomInBetween(p=1.0) if transform is None else transform
+        #: True if samples keep the labels of all key-frames alike.
+        self._mixes_all = transform is None
+        transform = RandomBlend(p=1.0) if transform is None else transform
         if not isinstance(seed, int | np.integer) or seed < 0:
             raise ValueError(f"seed is an integer, 0 or more; got {seed!r}")
         is_chain = isinstance(transform, AugmentationSequential)
@@ -187,6 +190,11 @@ class ShapeDataset(Dataset[Sample]):
             check_labels((k, v), labels)
         except ValueError as error:
             raise ValueError(f"{stored.folder}: {error}") from error
+        if self._mixes_all and any(bool((each != each[:1]).any()) for each in labels.values()):
+            raise ValueError(
+                f"{stored.folder}: labels differ between its key-frames, and the default transform mixes all of them; "
+                "pass transform=RandomInBetween(p=1.0), which follows labels"
+            )
         pool = ShapeBatch.of_keyframes(space, None, labels.get("vertex_labels"), labels.get("shape_labels"))
         return space, pool
 

@@ -1,4 +1,4 @@
-"""Random in-betweens, extrapolations, members of the space, and rigid motions."""
+"""Random in-betweens, members of the space, and rigid motions."""
 
 import math
 from typing import Any
@@ -10,7 +10,6 @@ from torch.nn.functional import normalize
 
 from torch_modal.data.augmentation import Parameters, ShapeAugmentation, check_range, draw_normal, draw_uniform
 from torch_modal.data.shape_batch import ShapeBatch
-from torch_modal.data.space import ShapeSpace
 from torch_modal.geometry.rigid import RigidMotion, best_fit
 from torch_modal.geometry.rotations import exp
 from torch_modal.statistics.variation import check_density
@@ -54,21 +53,16 @@ class RandomInBetween(ShapeAugmentation):
     def apply_transform(
         self, batch: ShapeBatch, params: Parameters, space: Any, partners: ShapeBatch | None
     ) -> ShapeBatch:
-        """Move each shape towards its partner, or away from it."""
+        """Move each shape towards its partner."""
         assert partners is not None and batch.nearest is not None and partners.nearest is not None
         t = params["t"]
         nearer = (t.detach() > 0.5).cpu()
         return batch._replace(
-            shapes=self.shapes(batch, partners, t, space),
+            shapes=space.in_betweens(batch.shapes, partners.shapes, t, batch.nearest, partners.nearest),
             nearest=torch.where(nearer, partners.nearest, batch.nearest),
             vertex_labels=self._labels(batch.vertex_labels, partners.vertex_labels, t),
             shape_labels=self._labels(batch.shape_labels, partners.shape_labels, t),
         )
-
-    def shapes(self, batch: ShapeBatch, partners: ShapeBatch, t: Tensor, space: ShapeSpace) -> Tensor:
-        """The shapes at the times ``t``. *Shape:* ``(B,) -> (B, V, 3)``."""
-        assert batch.nearest is not None and partners.nearest is not None
-        return space.in_betweens(batch.shapes, partners.shapes, t, batch.nearest, partners.nearest)
 
     def _labels(self, labels: Tensor | None, others: Tensor | None, t: Tensor) -> Tensor | None:
         if labels is None or others is None:
@@ -79,46 +73,6 @@ class RandomInBetween(ShapeAugmentation):
         if not labels.is_floating_point():
             raise ValueError(f"blended labels must be floating-point, one-hot for classes; got {labels.dtype}")
         return torch.lerp(labels, others, t.clamp(0, 1).to(labels.dtype))
-
-
-class RandomExtrapolation(RandomInBetween):
-    r"""Replaces a shape by an extrapolation of the motion between it and a partner.
-
-    The shape at :math:`1 + s` is the mirror image of the in-between at :math:`1 - s` in the partner, and the shape at
-    :math:`-s` the image of the in-between at :math:`s` in the shape itself: each triangle gets the inverse of its
-    rotation and stretch, and a Poisson problem gives the vertices. So the partner is the shape half-way
-    between the two, as the discrete geodesics of shells continue (Heeren et al. 2014), and position and velocity are
-    continuous at the ends. (With a negative weight, the energies of the in-between would have no minimum.)
-
-    Args:
-        beyond: Range of s, how far outside [0, 1] the times are, drawn uniformly; at most 1. The end is drawn
-            with equal probability.
-        blend_labels: As for :class:`RandomInBetween`, with times of 0 and 1: a shape gets the labels of the nearer end.
-        p: Probability that a shape is transformed.
-        options: As for :class:`ShapeAugmentation`.
-
-    Raises:
-        ValueError: ``beyond`` is no range within [0, 1].
-    """
-
-    def __init__(
-        self, beyond: tuple[float, float] = (0.0, 0.2), blend_labels: bool = False, p: float = 0.5, **options: Any
-    ) -> None:
-        super().__init__(blend_labels=blend_labels, p=p, **options)
-        self.beyond = check_range("beyond", beyond, 0, 1)
-
-    def generate_parameters(self, n: int, space: Any, generator: torch.Generator | None) -> Parameters:
-        """``partner`` as for :class:`RandomInBetween`, and times ``t`` beyond one end or the other."""
-        partner, draw = draw_uniform(n, generator), draw_uniform(n, generator, (0.0, 1.0), 2)
-        beyond = self.beyond[0] + (self.beyond[1] - self.beyond[0]) * draw[:, 0]
-        return {"partner": partner, "t": torch.where(draw[:, 1] < 0.5, -beyond, 1 + beyond)}
-
-    def shapes(self, batch: ShapeBatch, partners: ShapeBatch, t: Tensor, space: ShapeSpace) -> Tensor:
-        """Mirror images of in-betweens. *Shape:* ``(B,) -> (B, V, 3)``."""
-        after = t > 0.5
-        before_end = super().shapes(batch, partners, torch.where(after, 2 - t, -t), space)
-        ends = torch.where(after[:, None, None], partners.shapes, batch.shapes)
-        return space.reconstruction(ends.device).extrapolate(ends, before_end)
 
 
 class RandomBlend(ShapeAugmentation):
@@ -136,10 +90,11 @@ class RandomBlend(ShapeAugmentation):
         on_keyframes: Whether mixtures are laid on the key-frames, as by :meth:`ShapeSpace.sample`, wherever the given
             shapes are: transforms that move shapes come after this one. Otherwise each is laid on the shape that it
             replaces, by least squares over the surface, which turns it by some degrees where the two differ in pose.
+        beyond: As for :meth:`ShapeSpace.sample`: shapes beyond the key-frames.
         options: As for :class:`ShapeAugmentation`.
 
     Raises:
-        ValueError: ``concentration``, ``locality`` or ``members`` is out of range.
+        ValueError: ``concentration``, ``locality``, ``beyond`` or ``members`` is out of range.
     """
 
     def __init__(
@@ -150,24 +105,25 @@ class RandomBlend(ShapeAugmentation):
         *,
         members: int | None = None,
         on_keyframes: bool = True,
+        beyond: tuple[float, float] = (0.0, 0.0),
         **options: Any,
     ) -> None:
         super().__init__(p, **options)
-        check_density(concentration, locality)
+        check_density(concentration, locality, beyond)
         if members is not None and members < 1:
             raise ValueError(f"members must be 1 or more, or None; got {members}")
         self.concentration, self.locality, self.members = concentration, locality, members
-        self.on_keyframes = on_keyframes
+        self.on_keyframes, self.beyond = on_keyframes, beyond
 
     def generate_parameters(self, n: int, space: Any, generator: torch.Generator | None) -> Parameters:
-        """``weights`` of the key-frames, and ``factors`` by which they vary over the surface.
+        """``weights`` of the key-frames, ``factors`` by which they vary over the surface, and how far ``beyond``.
 
         With a table, the place of the ``member`` in it, in [0, 1).
         """
         if self.members is not None:
             return {"member": draw_uniform(n, generator)}
-        weights, factors = space.variation().draw(n, self.concentration, self.locality, generator)
-        return {"weights": weights, "factors": factors}
+        drawn = space.variation().draw(n, self.concentration, self.locality, self.beyond, generator)
+        return dict(zip(("weights", "factors", "beyond"), drawn, strict=True))
 
     def apply_transform(
         self, batch: ShapeBatch, params: Parameters, space: Any, partners: ShapeBatch | None
@@ -176,9 +132,9 @@ class RandomBlend(ShapeAugmentation):
         drawn = {name: value.detach().double().cpu() for name, value in params.items()}
         if self.members is None:
             variation = space.variation()
-            members = variation.members(drawn["weights"], drawn["factors"]) + variation.origin
+            members = variation.members(drawn["weights"], drawn["factors"], drawn["beyond"]) + variation.origin
         else:
-            table = space.members(self.members, self.concentration, self.locality)
+            table = space.members(self.members, self.concentration, self.locality, self.beyond)
             members = table[(drawn["member"] * len(table)).long().clamp_max(len(table) - 1)]
         shapes: Tensor = members.to(batch.shapes)
         if not self.on_keyframes:

@@ -3,13 +3,14 @@
 import os
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from torch_modal.autograd import Recent, outside_inference_mode
-from torch_modal.data.in_betweens import PairTables, read_or_compute
+from torch_modal.data.in_betweens import InBetweens, read_or_compute
 from torch_modal.data.stored import StoredSet, motion_times
 from torch_modal.data.strain import mode_scales
 from torch_modal.geometry.canonical import size
@@ -32,7 +33,7 @@ _FLOAT32_SIZES = 1e-3, 1e6
 class ShapeSpace:
     """Key-frames of one connectivity; random shapes are drawn from it.
 
-    Results that take long and that not every use needs (in-betweens of a pair, scales of the modes of a key-frame, the
+    Results that take long and that not every use needs (layers of a pair, scales of the modes of a key-frame, the
     variation of the key-frames) are computed once, when they are needed. Copies and pickles leave them out, so that
     worker processes can receive a space.
 
@@ -43,10 +44,8 @@ class ShapeSpace:
         preset: Preset of the in-betweens, as for :class:`torch_modal.InBetween`.
         objective: Their objective; replaces the preset's.
         solver: Their solver, whose backend also computes new members; replaces the preset's.
-        times: Number of even times at which the in-betweens of two key-frames are solved once; cubics interpolate
-            among them. None solves each in-between. At least 4.
-        dtype: Dtype of the tables.
-        folder: Folder that stores tables between runs; by default none is stored.
+        dtype: Dtype of new members and of :meth:`keyframes`. Default: of the key-frames.
+        folder: Folder that stores tables of members between runs; by default none is stored.
         keyframe_times: Times of the key-frames, if they are a motion, as for :class:`torch_modal.Path`. Partners of
             key-frames are then their neighbours in time, and in-betweens lie on that path.
         cyclic: Whether the last key-frame of the motion leads on to the first.
@@ -54,8 +53,7 @@ class ShapeSpace:
             (docs/contact.md; extra ``contact``).
 
     Raises:
-        ValueError: The bases do not fit each other or the faces, ``times`` is below 4, or ``keyframe_times`` do not
-            ascend.
+        ValueError: The bases do not fit each other or the faces, or ``keyframe_times`` do not ascend.
     """
 
     @outside_inference_mode
@@ -67,8 +65,7 @@ class ShapeSpace:
         preset: Preset = "fast",
         objective: Objective | None = None,
         solver: Solver | None = None,
-        times: int | None = 17,
-        dtype: torch.dtype = torch.float32,
+        dtype: torch.dtype | None = None,
         folder: str | os.PathLike[str] | None = None,
         keyframe_times: Times = None,
         cyclic: bool = False,
@@ -78,10 +75,11 @@ class ShapeSpace:
         # Checks and repairs the faces.
         self.faces = check_keyframes([self.bases[0].reference.double()], faces, warn=False).faces.cpu()
         self.settings = settings(preset, objective, solver, contact=contact)
-        self.dtype = dtype
+        self.dtype = self.bases[0].reference.dtype if dtype is None else dtype
         #: Times of the key-frames, if they are a motion; if cyclic, with the time when the first comes again.
         self.motion, self.cyclic = motion_times(keyframe_times, len(self.bases), cyclic), cyclic
-        self.in_betweens = PairTables(self.bases, self.faces, self.settings, self.motion, times, dtype, folder)
+        self.folder = None if folder is None else Path(folder)
+        self.in_betweens = InBetweens(self.bases, self.faces, self.settings, self.motion)
         self._keyframes = self.in_betweens.keyframes
         length = size(self._keyframes[0].numpy(), self.faces.numpy())
         #: The least precise dtype that can square areas of these shapes.
@@ -201,6 +199,7 @@ class ShapeSpace:
         *,
         concentration: float = 0.2,
         locality: float = 3.0,
+        beyond: tuple[float, float] = (0.0, 0.0),
         on_keyframes: bool = True,
     ) -> Tensor:
         """New members: random mixtures of the key-frames, with weights that vary from part to part of the surface.
@@ -217,6 +216,8 @@ class ShapeSpace:
                 key-frames, more their mean.
             locality: Standard deviation of the logarithms of the weights over the surface; 0 means the same weights
                 everywhere.
+            beyond: Range of a factor, at most 1, drawn uniformly for each member: the weights are so much farther from
+                even ones, and the shape from the mean, than a mixture. 0.2 continues a little beyond the key-frames.
             on_keyframes: Whether each member is laid on the mean of the key-frames by its weights, by least squares
                 over the surface. Otherwise all are laid on the mean shape, whose pose is near the first key-frame's.
 
@@ -227,19 +228,19 @@ class ShapeSpace:
             ValueError: An argument is out of range.
         """
         variation = self.variation()
-        drawn = variation.draw(n, concentration, locality, generator)
+        drawn = variation.draw(n, concentration, locality, beyond, generator)
         return (variation.members(*drawn, on_keyframes) + variation.origin).to(self.dtype)
 
-    def members(self, n: int, concentration: float, locality: float) -> Tensor:
+    def members(self, n: int, concentration: float, locality: float, beyond: tuple[float, float]) -> Tensor:
         """Table of members that are drawn once, with a fixed seed, and stored with the other tables.
 
         Arguments and shape as for :meth:`sample`, in the dtype of the tables.
         """
-        settings, folder = (n, concentration, locality), self.in_betweens.folder
+        settings, folder = (n, concentration, locality, beyond), self.folder
 
         def draw() -> tuple[Tensor, bool]:
             generator = torch.Generator().manual_seed(0)
-            return self.sample(n, generator, concentration=concentration, locality=locality), True
+            return self.sample(n, generator, concentration=concentration, locality=locality, beyond=beyond), True
 
         content = [self._keyframes, self.faces, str(self.dtype), settings, "on key-frames"]
         return self._made.get(settings, lambda: read_or_compute(folder, "between-all", content, draw))

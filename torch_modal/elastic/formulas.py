@@ -337,7 +337,7 @@ def periodic_curvature(q: Pair, to: Six) -> Scalar:
 
 
 def periodic_square(difference: Scalar) -> Scalar:
-    """The function of :class:`~torch_modal.PeriodicTerm`, of an angle's difference from one rest angle."""
+    """The function of :class:`~torch_modal.elastic.term.PeriodicTerm`, of an angle's difference from one rest angle."""
     half = sin(HALF * difference)
     versine = TWO * half * half
     return versine * (TWO + THIRD * versine)

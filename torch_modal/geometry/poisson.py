@@ -13,7 +13,7 @@ from torch_modal.autograd import Recent, is_eager
 from torch_modal.geometry.connectivity import Connectivity, half_cotangents, label_pieces, vertex_areas
 from torch_modal.geometry.rigid import RigidMotion, best_fit
 from torch_modal.geometry.sparse import SparseSolver, graph_laplacian, solve_by
-from torch_modal.geometry.triangle_frames import Sides, edge_means, frames_of, mirror_sides
+from torch_modal.geometry.triangle_frames import Sides, edge_means
 
 # Bounds of cotangent weights, for slivers. Positive weights make the matrix positive definite.
 WEIGHT_RANGE = (0.02, 20.0)
@@ -195,13 +195,3 @@ class Reconstruction(nn.Module):
             centre = self.poisson.shares.to(rest)[None, piece] @ rest[:, piece]
             out = out.index_copy(1, piece.to(out.device), placed[:, piece] + motion.apply(centre) - centre)
         return out
-
-    def extrapolate(self, centre: Tensor, other: Tensor) -> Tensor:
-        """The shapes as far beyond ``centre`` as ``other`` is before it, rigid motions included.
-
-        *Shape:* ``(B, V, 3), (B, V, 3) -> (B, V, 3)``.
-        """
-        motion = best_fit(other, centre, self.areas.to(centre))
-        aligned = motion.apply(other)
-        beyond = self(mirror_sides(frames_of(centre, self.faces), frames_of(aligned, self.faces)), centre)
-        return motion._replace(source=motion.target, target=2 * motion.target - motion.source).apply(beyond)

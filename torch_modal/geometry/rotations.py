@@ -2,12 +2,14 @@ r"""Finite rotations: exponential, logarithm, quaternions, weighted means.
 
 Closed forms with all derivatives everywhere but at a whole turn; near zero, where they divide zero by zero, series
 replace them. Quaternions have their real part first; their sign distinguishes the two ways round. Components come
-first, as in :mod:`~torch_modal.geometry.vectors`.
+first, as in :mod:`~torch_modal.geometry.vectors`: kornia's conversions, which take them last, would copy the fields of
+all triangles twice. Its logarithm also leaves the axis at half a turn open, and its quaternions their sign.
 """
 
 from math import factorial, pi
 
 import torch
+from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from torch import Tensor
 
 from torch_modal.geometry.vectors import cross
@@ -36,7 +38,7 @@ SMALLEST_CURVATURE = 0.1
 
 def exp(vector: Tensor) -> Tensor:
     """Rotation matrix of axis times angle in radians (Rodrigues). *Shape:* ``(..., 3) -> (..., 3, 3)``."""
-    return matrix(about(0.5 * vector.movedim(-1, 0))).movedim((0, 1), (-2, -1))
+    return axis_angle_to_rotation_matrix(vector.reshape(-1, 3)).reshape(*vector.shape, 3)
 
 
 def log(rotation: Tensor) -> Tensor:

@@ -178,6 +178,20 @@ def bend_sides(rotation: Tensor, strain: Tensor, reference: Frames) -> Sides:
     return rotate_by(rotation, reference.world(*first)), rotate_by(rotation, reference.world(*second))
 
 
+def bent_sides(turn: Tensor, strain: Tensor, shape: Frames) -> Sides:
+    """Displacements of the sides by infinitesimal turns and strains in the frames, of which :func:`bend` finds them.
+
+    *Shape:* ``(3, B, F), (3, B, F)``.
+    """
+
+    def displace(x: Tensor, y: Tensor) -> Tensor:
+        plane = shape.world(strain[0] * x + (strain[1] - turn[2]) * y, (strain[1] + turn[2]) * x + strain[2] * y)
+        return plane + (turn[0] * y - turn[1] * x) * shape.normal
+
+    first, second = transform(shape.xx, shape.xy, shape.xy, shape.yy)
+    return displace(*first), displace(*second)
+
+
 def bending_between(reference: Frames, other: Frames, quaternions: Tensor) -> tuple[Tensor, Tensor]:
     """Rotation and strain from one shape to another: :func:`bend_sides` of it are the sides of the other.
 

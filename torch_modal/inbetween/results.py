@@ -12,11 +12,8 @@ from torch_modal import trees
 from torch_modal.autograd import is_eager, is_traced, is_transformed, run_outside_transforms
 from torch_modal.elastic.implicit import ConvergenceWarning
 from torch_modal.elastic.minimise import Solution, Status
+from torch_modal.errors import ConvergenceError
 from torch_modal.inbetween.settings import Solver
-
-
-class ConvergenceError(RuntimeError):
-    """A gradient was requested through a minimisation that did not converge."""
 
 
 class InBetweenResult(NamedTuple):

@@ -26,10 +26,10 @@ FPS = 24.0
 class OutputFormat:
     """A function that writes a format, with what must be known before it is imported.
 
-    In :data:`MESH_FORMATS`, for :func:`torch_modal.save_frames`, it takes vertices ``(V, 3)``, faces ``(F, 3)`` and the
-    :class:`torch_modal.Asset` that they come from, or None, and returns the bytes of a file. In
-    :data:`ANIMATION_FORMATS`, for :func:`torch_modal.save_animation`, it takes a :class:`torch_modal.Animation` and the
-    path of a new file, which is renamed when the function returns.
+    In :data:`MESH_FORMATS`, for :func:`torch_modal.save_mesh`, it takes vertices ``(V, 3)``, faces ``(F, 3)`` and the
+    :class:`torch_modal.io.asset.Asset` that they come from, or None, and returns the bytes of a file. In
+    :data:`ANIMATION_FORMATS`, for :func:`torch_modal.save_animation`, it takes an :class:`Animation` and the path of a
+    new file, which is renamed when the function returns.
 
     Attributes:
         function: The function; of built-in formats its place, ``module:name``.
@@ -56,6 +56,7 @@ class OutputFormat:
 
 GLB_HOLDS = ("texcoords", "normals", "colors", "materials")
 """From a file of another format; of materials, colour, roughness and the texture of the colour."""
+USD_HOLDS = ("polygons", "texcoords", "normals", "colors", "materials")
 MESH_FORMATS: dict[str, OutputFormat] = {
     ".ply": OutputFormat("torch_modal.io.ply:ply_bytes"),
     ".obj": OutputFormat("torch_modal.io.obj:obj_bytes"),
@@ -68,7 +69,7 @@ ANIMATION_FORMATS: dict[str, OutputFormat] = {
     ".gif": OutputFormat("torch_modal.view.animation:write_gif", FEATURES),
     **dict.fromkeys(
         (".usd", ".usda", ".usdc"),
-        OutputFormat("torch_modal.io.animations:write_usd", ("polygons", "texcoords", "colors"), ("pxr",), "usd"),
+        OutputFormat("torch_modal.io.usd:write_usd", USD_HOLDS, ("pxr",), "usd"),
     ),
     **dict.fromkeys((".mdd", ".pc2"), OutputFormat("torch_modal.io.animations:write_point_cache", FEATURES)),
     ".npz": OutputFormat("torch_modal.io.animations:write_npz", FEATURES),

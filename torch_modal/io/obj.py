@@ -90,7 +90,7 @@ class ObjAsset(Asset):
         """The file with other positions."""
         lines = list(self.lines)
         for number, (x, y, z) in zip(self._line_of["v"], positions.tolist(), strict=True):
-            lines[number] = " ".join([f"v {x!r} {y!r} {z!r}", *lines[number].split(None, 4)[4:]])
+            lines[number] = " ".join([f"v {x:.9g} {y:.9g} {z:.9g}", *lines[number].split(None, 4)[4:]])
         if "normals" in self.carries:
             self._write_normals(lines, positions)
         return ("\n".join(lines) + "\n").encode("utf-8", errors="surrogateescape")
@@ -171,6 +171,6 @@ def _numbers(rows: list[list[str]], width: int) -> FloatArray:
 
 
 def obj_bytes(vertices: FloatArray, faces: IntArray, asset: Any = None) -> bytes:
-    """An OBJ file of vertices and faces; repr() gives the fewest digits that read back as the same float64."""
-    points = "".join(f"v {x!r} {y!r} {z!r}\n" for x, y, z in vertices.tolist())
+    """An OBJ file of vertices and faces; with nine digits, float32 reads back as it was."""
+    points = "".join(f"v {x:.9g} {y:.9g} {z:.9g}\n" for x, y, z in vertices.tolist())
     return (points + "".join(f"f {a} {b} {c}\n" for a, b, c in (faces + 1).tolist())).encode("ascii")

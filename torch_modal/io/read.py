@@ -53,12 +53,12 @@ def open_asset(path: str | os.PathLike[str]) -> Asset:
     """
     path = Path(path)
     suffix = path.suffix.lower()
-    if suffix not in READERS:
+    if not os.path.lexists(path):
+        raise FileNotFoundError(f"{str(path)[:300]}: no such file or folder")
+    if suffix not in READERS and not path.is_dir():
         raise MeshError(
             f"{path}: unknown extension {suffix!r}; supported are {', '.join(SUFFIXES)} (STL has no shared vertices)"
         )
-    if not os.path.lexists(path):
-        raise FileNotFoundError(f"{str(path)[:300]}: no such file")
     if not os.path.isfile(path):
         raise MeshError(f"{path}: not a file, or a link to none")
     with mesh_errors(f"{path}: cannot be read as {suffix[1:].upper()}"):

@@ -33,8 +33,7 @@ def check_frames(frames: Array, faces: Array, name: str = "frames") -> tuple[Flo
     """
     shapes, triangles = to_numpy(frames), to_numpy(faces)
     if shapes.ndim != 3 or shapes.shape[2] != 3 or 0 in shapes.shape:
-        hint = "; one shape alone is frames[None]" if shapes.ndim == 2 else ""
-        raise ValueError(f"{name} must have shape (N, V, 3) with N, V >= 1, got {shapes.shape}{hint}")
+        raise ValueError(f"{name} must have shape (N, V, 3) with N, V >= 1, got {shapes.shape}")
     if triangles.ndim != 2 or triangles.shape[1] != 3 or len(triangles) == 0:
         raise ValueError(f"faces must have shape (F, 3), triangles, with F >= 1, got {triangles.shape}")
     if triangles.dtype.kind not in "iu":
@@ -71,79 +70,67 @@ def check_suffix(path: Path, suffixes: Collection[str]) -> str:
     return suffix
 
 
-def refuse_existing(path: Path, overwrite: bool) -> None:
-    """Raise an OSError, before any work is done, if ``path`` must not be written."""
+def refuse_existing(path: Path, overwrite: bool = True) -> None:
+    """Raise an OSError, before any work is done, if ``path`` is a folder, or exists and may not be replaced."""
     if path.is_dir():
         raise IsADirectoryError(f"{path} is a folder; name a file")
     if path.exists() and not overwrite:
-        raise FileExistsError(f"{path} exists; pass overwrite=True (--overwrite) to replace it")
+        raise FileExistsError(f"{path} exists, and may not be replaced (--overwrite)")
 
 
-def save_frames(
-    frames: Array,
+def save_mesh(
+    shapes: Array,
     faces: Array,
     out: str | Path,
     fmt: str | None = None,
+    *,
     stem: str = "frame",
-    overwrite: bool = False,
+    overwrite: bool = True,
     asset: Asset | None = None,
 ) -> list[Path]:
-    """Write every shape as a mesh of its own: ``frame-000.ply``, ``frame-001.ply``, ...
+    """Write one shape as a mesh file, or several as ``frame-000.ply``, ``frame-001.ply``, ... of a folder.
 
-    Vertices and faces keep their order. OBJ and OFF are text and hold float64 exactly; PLY is binary and holds float32
-    (about seven digits), which is what viewers expect: take OBJ where the files are computed with again.
+    Vertices and faces keep their order. OBJ has nine digits, as float32 needs, OFF float64, PLY and GLB float32.
 
     With an asset, each file is a copy of the asset's with other positions: polygons, texture coordinates, materials,
     groups and everything else stay, normals turn with the surface, and material libraries and textures are copied too.
 
     Args:
-        frames: Vertex positions, in the caller's coordinates. *Shape:* ``(N, V, 3)``.
+        shapes: Vertex positions, in the caller's coordinates. *Shape:* ``(V, 3)``, or ``(N, V, 3)``.
         faces: Vertex indices. *Shape:* ``(F, 3)``.
-        out: Folder; it is made if missing.
-        fmt: ``"ply"``, ``"obj"``, ``"off"`` or ``"glb"``; by default the asset's, or PLY. Another format than the
-            asset's gets the bare mesh (GLB: also materials and textures), with a warning of what is lost.
-        stem: Start of the file names.
-        overwrite: Replace files that exist. Files with other numbers, of a longer sequence, stay.
-        asset: The mesh file that the frames come from, see :func:`torch_modal.open_asset`.
+        out: Of one shape, the file: ``.ply``, ``.obj``, ``.off`` or ``.glb``. Of several, their folder. Folders are
+            made if missing.
+        fmt: Format of several: ``"ply"``, ``"obj"``, ``"off"`` or ``"glb"``; by default the asset's, or PLY. Another
+            format than the asset's gets the bare mesh (GLB: also materials and textures), with a warning of what is
+            lost.
+        stem: Start of the names of several.
+        overwrite: Whether files that exist are replaced. Files with other numbers, of a longer sequence, stay.
+        asset: The mesh file that the shapes come from, see :func:`torch_modal.open_asset`.
 
     Returns:
-        The files, in the order of the frames.
+        The files, in the order of the shapes.
 
     Raises:
-        ValueError: ``frames``, ``faces`` or ``fmt`` cannot be used; the message says why.
+        ValueError: ``shapes``, ``faces``, ``fmt`` or the ending of ``out`` cannot be used; the message says why.
         FileExistsError: One of the files exists and ``overwrite`` is off; then none is written.
         OSError: A file cannot be written. Then none is, and existing files stay.
 
     Warns:
         MeshWarning: The format cannot hold what the asset carries.
     """
-    shapes, triangles = check_frames(frames, faces)
-    suffix = (".ply" if asset is None else asset.suffix) if fmt is None else f".{fmt}"
-    if suffix not in MESH_FORMATS:
-        raise ValueError(f"fmt must be one of {', '.join(known[1:] for known in MESH_FORMATS)}, got {fmt!r}")
-    digits = max(3, len(str(len(shapes) - 1)))
-    paths = [Path(out) / f"{stem}-{number:0{digits}d}{suffix}" for number in range(len(shapes))]
-    _write(shapes, triangles, paths, asset, overwrite)
+    one = to_numpy(shapes).ndim == 2
+    frames, triangles = check_frames(to_numpy(shapes)[None] if one else shapes, faces, "shapes")
+    if one:
+        check_suffix(Path(out), MESH_FORMATS)
+        paths = [Path(out)]
+    else:
+        suffix = (".ply" if asset is None else asset.suffix) if fmt is None else f".{fmt}"
+        if suffix not in MESH_FORMATS:
+            raise ValueError(f"fmt must be one of {', '.join(known[1:] for known in MESH_FORMATS)}, got {fmt!r}")
+        digits = max(3, len(str(len(frames) - 1)))
+        paths = [Path(out) / f"{stem}-{number:0{digits}d}{suffix}" for number in range(len(frames))]
+    _write(frames, triangles, paths, asset, overwrite)
     return paths
-
-
-def save_mesh(
-    vertices: Array, faces: Array, out: str | Path, overwrite: bool = False, asset: Asset | None = None
-) -> Path:
-    """Write one shape in the format of the file's extension. Everything else is as for :func:`torch_modal.save_frames`.
-
-    Args:
-        vertices: Vertex positions. *Shape:* ``(V, 3)``.
-        faces: Vertex indices. *Shape:* ``(F, 3)``.
-        out: The file: ``.ply``, ``.obj``, ``.off`` or ``.glb``.
-        overwrite: Replace files that exist. Materials and textures of equal content need no overwriting.
-        asset: The mesh file whose materials, texture coordinates and other content the shape keeps.
-    """
-    path = Path(out)
-    shapes, triangles = check_frames(to_numpy(vertices)[None], faces, "vertices[None]")
-    check_suffix(path, MESH_FORMATS)
-    _write(shapes, triangles, [path], asset, overwrite)
-    return path
 
 
 def _write(shapes: FloatArray, faces: IntArray, paths: list[Path], asset: Asset | None, overwrite: bool) -> None:

@@ -11,6 +11,9 @@ from torch_modal.inbetween.settings import Objective, Preset, Solver, settings
 from torch_modal.keyframes.arrays import broadcast_leading
 from torch_modal.layers.base import Bases, InBetweenLayer, basis_buffers
 
+ROUNDING = 1e-6
+"""Distance from [0, 1] within which a time counts as 0 or 1."""
+
 
 class InBetween(InBetweenLayer):
     r"""Shapes :math:`x(t)` that are cheap to reach from both key-frames: local rotations, then steps of all vertices.
@@ -81,7 +84,7 @@ class InBetween(InBetweenLayer):
         Args:
             x_a: Key-frames at 0. *Shape:* ``(..., V, 3)``.
             x_b: Key-frames at 1. *Shape:* ``(..., V, 3)``.
-            t: Times in [0, 1]. *Shape:* ``(...)``, or a number.
+            t: Times in [0, 1]; those within 1e-6 of it count as its ends. *Shape:* ``(...)``, or a number.
 
         Returns:
             The key-frames exactly at 0 and 1. *Shape:* ``(..., V, 3)``.
@@ -99,6 +102,8 @@ class InBetween(InBetweenLayer):
         """The in-betweens, and how each minimisation went, without a warning. Arguments as for :meth:`forward`."""
         self.check_shapes(x_a=x_a, x_b=x_b)
         times = torch.as_tensor(t, dtype=self.dtype, device=x_a.device)
+        # Sums of steps end beside 0 and 1. Gradients stay, which they would not through a clamp.
+        times = times + (times.detach().clamp(0, 1) - times.detach()).clamp(-ROUNDING, ROUNDING)
         hint = "for all times of all pairs pass x_a[:, None] and x_b[:, None]"
         lead = broadcast_leading(hint, x_a=x_a.shape[:-2], x_b=x_b.shape[:-2], t=times.shape)
         if is_traced(times):

@@ -62,6 +62,9 @@ class ModalBasis:
     modes: torch.Tensor
     rigid_eigenvalues: torch.Tensor
 
+    def __repr__(self) -> str:
+        return f"<ModalBasis of {self.n_modes} modes, {self.n_vertices:,} vertices>"
+
     @outside_inference_mode
     def __post_init__(self) -> None:
         shapes = {name: tuple(tensor.shape) for name, tensor in self._tensors().items()}

@@ -10,6 +10,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import LinearOperator, eigsh
 
 from torch_modal.arrays import BoolArray, FloatArray
+from torch_modal.errors import ModalAnalysisError
 from torch_modal.geometry.sparse import factorize
 
 N_RIGID = 6
@@ -25,10 +26,6 @@ ZERO = 1e-7
 10,000 is near 1e-6."""
 LARGEST_RESIDUAL = 1e-3
 """Largest residual of a mode; typically 1e-11. For wires and flat tetrahedra it is the rounding of ``K phi``."""
-
-
-class ModalAnalysisError(RuntimeError):
-    """The eigenproblem has no trustworthy solution; the message says which check failed."""
 
 
 class ElasticBody(NamedTuple):

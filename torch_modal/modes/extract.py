@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from torch_modal.arrays import FloatArray, IntArray
-from torch_modal.errors import MeshError, MeshWarning
+from torch_modal.errors import MeshError, MeshWarning, ModalAnalysisError
 from torch_modal.geometry.bodies import bodies
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.inspect import OPEN, open_part
@@ -19,13 +19,13 @@ from torch_modal.io.cache import Arrays, Cache
 from torch_modal.keyframes.check import check_keyframes
 from torch_modal.modes.basis import ModalBasis
 from torch_modal.modes.carrying import Carrier
-from torch_modal.modes.eigen import N_RIGID, ElasticBody, ModalAnalysisError, lowest_modes
+from torch_modal.modes.eigen import N_RIGID, ElasticBody, lowest_modes
 from torch_modal.modes.lattice import Lattice
 from torch_modal.modes.sheet import n_coarse_faces, sheet_body
 from torch_modal.modes.solid import Solid
 from torch_modal.modes.stiffness import HESSIAN_FORMS, HessianForm
 from torch_modal.modes.surface import CanonicalSurface, self_proximity
-from torch_modal.modes.tetrahedra import Mesher, TetrahedralizationError
+from torch_modal.modes.tetrahedra import Mesher, MesherError
 from torch_modal.modes.tetwild import Auto, TetWild
 from torch_modal.progress import Progress, ProgressReport, logger
 from torch_modal.threads import StoppedError, one_blas_thread, run
@@ -102,7 +102,7 @@ def extract_bases(
     Raises:
         MeshError: A mesh cannot work.
         ValueError: ``n_modes`` is more than the shape has, or a setting is out of range.
-        TetrahedralizationError: The mesher failed or took too long.
+        ModalAnalysisError: The mesher failed or took too long.
         ModalAnalysisError: The modes failed a check.
 
     Warns:
@@ -214,7 +214,7 @@ class _Extraction:
         try:
             return self.solids(form)
         except ModalAnalysisError as error:
-            if method == "solid":
+            if method == "solid" or isinstance(error, MesherError):
                 raise
             logger.info("modes of the surface itself, not of a solid: %s", error)
         self.stop.clear()
@@ -301,7 +301,7 @@ class _Extraction:
         self.bar.set_description(f"key-frame {index + 1}/{self.n_keyframes}: {what}")
         try:
             yield
-        except (MeshError, TetrahedralizationError, ModalAnalysisError) as error:
+        except (MeshError, ModalAnalysisError) as error:
             if self.n_keyframes == 1:
                 raise
             raise type(error)(f"key-frame {index}: {error}") from error

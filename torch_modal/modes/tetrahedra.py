@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torch_modal.arrays import BoolArray, FloatArray, IntArray
+from torch_modal.errors import ModalAnalysisError
 from torch_modal.geometry.connectivity import label_pieces
 from torch_modal.geometry.surface import Surface
 
@@ -40,8 +41,8 @@ class Tetrahedra(NamedTuple):
         return {name: array for name, array in self._asdict().items() if array is not None}
 
 
-class TetrahedralizationError(RuntimeError):
-    """The mesher failed; the message names the mesh, the reason and a remedy."""
+class MesherError(ModalAnalysisError):
+    """The mesher failed, which other modes do not make good; the message names the mesh, the reason and a remedy."""
 
 
 class Mesher(Protocol):
@@ -59,7 +60,7 @@ class Mesher(Protocol):
             stop: Event that cancels the work.
 
         Raises:
-            TetrahedralizationError: The mesher failed.
+            MesherError: It failed.
             StoppedError: ``stop`` was set.
         """
         ...

@@ -17,7 +17,7 @@ from torch_modal.geometry.surface import Surface
 from torch_modal.modes.lattice import Lattice
 from torch_modal.modes.processes import ChildError, run_child
 from torch_modal.modes.surface import clearances, self_proximity
-from torch_modal.modes.tetrahedra import Tetrahedra, TetrahedralizationError, edge_lengths, orient, without_debris
+from torch_modal.modes.tetrahedra import MesherError, Tetrahedra, edge_lengths, orient, without_debris
 from torch_modal.progress import logger
 
 WORKER = Path(__file__).resolve().with_name("_tetwild_worker.py")
@@ -94,7 +94,7 @@ class TetWild:
         """Fill a closed surface with tetrahedra of positive volume.
 
         Raises:
-            TetrahedralizationError: The child process crashed, took longer than the timeout, or gave no tetrahedra or
+            MesherError: The child process crashed, took longer than the timeout, or gave no tetrahedra or
                 ones that do not fill the surface.
             StoppedError: ``stop`` was set, and the child process killed.
         """
@@ -124,7 +124,7 @@ class TetWild:
             if n_far := int((cKDTree(tetrahedra.vertices).query(points)[0] > reach).sum()):
                 raise ValueError(f"{n_far} of its vertices are far from the result")
         except (ChildError, OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
-            raise TetrahedralizationError(
+            raise MesherError(
                 f"cannot fill a mesh of {len(points)} vertices and {len(faces)} faces with tetrahedra: {error}. Check "
                 "that the surface is closed, its winding consistent, without self-intersections, and no part thinner "
                 f"than {100 * self.epsilon:g} % of the diagonal; or give a longer timeout or processor_time, a smaller "
@@ -146,7 +146,7 @@ class Auto:
         if self_proximity(surface) > TOUCHING:
             try:
                 return TetWild(processor_time=PATIENCE).fill(surface, stop)
-            except TetrahedralizationError as error:
+            except MesherError as error:
                 logger.info("a lattice, in which parts that touch are joined: %s", error)
         return Lattice().fill(surface, stop)
 

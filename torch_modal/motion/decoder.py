@@ -17,7 +17,7 @@ from torch_modal.autograd import disable_compile, full_precision, outside_infere
 from torch_modal.elastic.backend import TorchBackend
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.rotations import exp
-from torch_modal.geometry.triangle_frames import bend, frames_of, sides
+from torch_modal.geometry.triangle_frames import bend, bent_sides, edge_means, frames_of, sides
 from torch_modal.keyframes.arrays import broadcast_leading, check_tensor
 from torch_modal.keyframes.check import check_arrays
 from torch_modal.motion.cubics import evaluate_by_interval
@@ -177,6 +177,29 @@ class ModalDecoder(nn.Module):
         bending = (a @ self.columns.flatten(1)).unflatten(1, (6, -1)).movedim(1, 0)
         x = self.spline(knots, i, which, u, straight, bending)
         return self.spline.alignment.to_caller(x, self.spline.pose(knots, i, which, u))
+
+    @torch.no_grad()
+    def tangents(self, amplitudes: Tensor, t: Tensor) -> Tensor:
+        """Derivatives of one shape with respect to the amplitudes, about; a fit takes them for its steps.
+
+        Turns and strains of a mode act on the triangles of the shape, as if those of the others came before.
+        *Shape:* ``(k,), () -> (k, V, 3)``.
+        """
+        segment, u = self.locate(t.reshape(1))
+        i, which = int(segment), torch.zeros_like(segment)
+        shape = self._shapes(self.knots, i, amplitudes[None], u)
+        pose = self.spline.pose(self.knots, i, which, u)
+        rotations, frames = self.spline.rotations[i], frames_of(shape, self.faces)
+        areas, out = frames.twice_areas.repeat(1, 3), shape.new_empty(self.n_modes, *shape.shape[1:])
+        for chunk in torch.arange(self.n_modes).split(max(1, VERTICES_OF_CHUNK // shape.shape[1])):
+            columns = self.columns[chunk].movedim(1, 0)
+            moved = bent_sides(columns[:3], columns[3:], frames)
+            edges = edge_means(moved, areas, rotations.sides, rotations.side_signs, rotations.n_edges)
+            centres = torch.zeros_like(out[chunk])
+            if self.moves.shape[1]:
+                centres = (self.moves[chunk] / self.spline.alignment.scale).unflatten(1, (-1, 3)) @ pose.rotation.mT
+            out[chunk] = self.spline.poisson.forward_or_near(self.spline.poisson.right_hand_side(edges), centres)
+        return out
 
     def locate(self, t: Tensor) -> tuple[Tensor, Tensor]:
         """Interval of each time, and its fraction of the interval. *Shape:* ``(B,)``."""

@@ -6,7 +6,7 @@ from torch import Tensor
 from torch_modal.autograd import outside_inference_mode
 from torch_modal.keyframes.arrays import check_tensor
 from torch_modal.motion.path import Path
-from torch_modal.times import fill_times
+from torch_modal.times import fill_linear
 
 UNSEEN_CHANGE = 1e-6
 """An interval is computed again where an edit moves its shapes by more than about this part of the diagonal."""
@@ -74,7 +74,7 @@ class PathEditor:
     def times(self) -> Tensor:
         """Times of the shapes. *Shape:* ``(T,)``, float64."""
         times = self.path.times
-        at = fill_times(times, range(0, self.steps * len(times), self.steps))
+        at = fill_linear(times, range(0, self.steps * len(times), self.steps))
         return at[:-1] if self.path.cyclic else at
 
     @outside_inference_mode

@@ -1,4 +1,4 @@
-"""From key-frames to a dense sequence: recursive subdivision (section 3.3 of the paper) and linear fill."""
+"""From key-frames to a dense sequence, also by recursive subdivision (section 3.3 of the paper)."""
 
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -23,12 +23,12 @@ from torch_modal.modes.extract import bases_of_checked
 from torch_modal.motion.path import Path
 from torch_modal.passengers.proxy import Proxy, proxy_size
 from torch_modal.progress import Progress, ProgressReport
-from torch_modal.times import Times, check_times, fill_times
+from torch_modal.times import Times, check_times
 
 MAX_LEVELS = 12
 
 
-def subdivide(
+def interpolate(
     keyframes: Any,
     faces: Any,
     levels: int = 3,
@@ -66,8 +66,8 @@ def subdivide(
         cyclic: True where the last key-frame leads on to the first. The sequence then ends one frame before it would
             repeat the first key-frame.
         n_frames: Number of frames of the result, evenly in time. The key-frames keep their places in it
-            (:func:`keyframe_places`): frames are even within each interval. Not with ``preset="paper"``. Default:
-            ``2**levels`` to each interval.
+            (:func:`~torch_modal.motion.subdivide.keyframe_places`): frames are even within each interval. Not with
+            ``preset="paper"``. Default: ``2**levels`` to each interval.
         times: When the key-frames are, as for :class:`torch_modal.Path`. Default: evenly.
         smooth: False treats each pair of key-frames alone. Default: True where there are three key-frames or more.
         preset: As for :class:`torch_modal.InBetween`.
@@ -139,6 +139,10 @@ def subdivide(
     return carrier.carry(sequence, places, originals) if carrier else sequence
 
 
+subdivide = interpolate
+"""The paper's name of :func:`interpolate`."""
+
+
 def _follow_path(path: Path, keyframes: Tensor, faces: Tensor, places: Sequence[int]) -> Iterator[Tensor]:
     """Shapes between the key-frames of each interval."""
     motion = keyframes[None].to(path.dtype)
@@ -187,7 +191,7 @@ def _nearest_ends(shapes: Tensor, edges: Tensor) -> list[int]:
 def keyframe_places(
     n_keyframes: int, levels: int = 3, *, cyclic: bool = False, n_frames: int | None = None, times: Times = None
 ) -> list[int]:
-    """Places of the key-frames in the result of :func:`subdivide`.
+    """Places of the key-frames in the result of :func:`torch_modal.interpolate`.
 
     Returns:
         The frame number of each key-frame; if cyclic, a further one where the first key-frame would come again.
@@ -202,9 +206,7 @@ def keyframe_places(
     if n_frames is None:
         return [i * 2**levels for i in range(len(when))]
     if n_frames < n_keyframes:
-        raise ValueError(
-            f"n_frames={n_frames} leaves no room for {n_keyframes} key-frames; ask for {n_keyframes} or more"
-        )
+        raise ValueError(f"{n_frames} frames leave no room for {n_keyframes} key-frames; ask for {n_keyframes} or more")
     total = n_frames if cyclic else n_frames - 1
     share = (when - when[0]) / (when[-1] - when[0])
     places = torch.floor(share * total + 0.5).long()
@@ -212,33 +214,6 @@ def keyframe_places(
     order = torch.arange(intervals + 1)
     places = (places - order).cummax(0).values.clamp_max(total - intervals) + order
     return places.tolist()
-
-
-def frame_times(
-    n_keyframes: int, levels: int = 3, *, cyclic: bool = False, n_frames: int | None = None, times: Times = None
-) -> Tensor:
-    """Times of the frames of :func:`subdivide`, even within each interval of key-frames. Arguments as there.
-
-    Returns:
-        *Shape:* ``(T,)``, float64.
-    """
-    when = check_times(times, n_keyframes, cyclic)
-    places = keyframe_places(n_keyframes, levels, cyclic=cyclic, n_frames=n_frames, times=times)
-    at = fill_times(when, places)
-    return at[:-1] if cyclic else at
-
-
-def linear_sequence(keyframes: Tensor, places: Sequence[int]) -> Tensor:
-    """Linear interpolation of all vertices, to compare :func:`subdivide` with.
-
-    Args:
-        keyframes: *Shape:* ``(K, V, 3)``.
-        places: From :func:`keyframe_places`; one more than key-frames closes the cycle.
-    """
-    cyclic, n = len(places) > len(keyframes), len(keyframes)
-    at = fill_times(torch.arange(len(places)).to(keyframes), places)[: places[-1] + (not cyclic)]
-    left, t = at.long(), at.frac().to(keyframes)
-    return torch.lerp(keyframes[left % n], keyframes[(left + 1) % n], t[:, None, None])
 
 
 def _report_contacts(keyframes: Tensor, faces: Tensor, left: int, total: int) -> None:

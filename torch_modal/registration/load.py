@@ -68,7 +68,7 @@ def load_keyframes(
     if not paths:
         raise MeshError("paths is empty; pass one file per key-frame")
     if (landmarks is not None or not same_subject) and not register:
-        raise MeshError("landmarks and different subjects are for registration; pass register=True (--register) too")
+        raise MeshError("landmarks and different subjects are for registration: ask for it too (--register)")
     meshes, posed = [], []
     for asset in map(open_asset, paths):
         meshes.append((asset.positions, asset.faces))

@@ -113,51 +113,60 @@ class Variation:
 
     # ----------------------------------------------------------------------------------------------------- new members
     def draw(
-        self, n: int, concentration: float, locality: float, generator: torch.Generator | None
-    ) -> tuple[Tensor, Tensor]:
-        """Random weights, and factors of the fields over which their logarithms vary.
+        self,
+        n: int,
+        concentration: float,
+        locality: float,
+        beyond: tuple[float, float],
+        generator: torch.Generator | None,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Random weights, factors of the fields over which their logarithms vary, and how far beyond they go.
 
-        *Shape:* ``(n, K), (n, K, n_fields - 1)``.
+        *Shape:* ``(n, K), (n, K, n_fields - 1), (n,)``.
 
         Raises:
             ValueError: An argument is out of range.
         """
         if n < 0:
             raise ValueError(f"n is 0 or more, got {n}")
-        check_density(concentration, locality)
+        check_density(concentration, locality, beyond)
         device = "cpu" if generator is None else generator.device
         densities = torch.full((n, len(self)), concentration, dtype=torch.float64, device=device)
         weights = torch._sample_dirichlet(densities, generator)
         shape = n, len(self), len(self.fields) - 1
         factors = torch.randn(shape, dtype=torch.float64, generator=generator, device=device)
-        return weights.cpu(), locality * factors.cpu()
+        low, high = beyond
+        far = torch.rand(n if high else 0, dtype=torch.float64, generator=generator, device=device)
+        far = low + (high - low) * far if high else torch.zeros(n, dtype=torch.float64)
+        return weights.cpu(), locality * factors.cpu(), far.cpu()
 
-    def members(self, weights: Tensor, factors: Tensor, on_shapes: bool = True) -> Tensor:
-        r"""Members of the set. *Shape:* ``(n, K), (n, K, n_fields - 1) -> (n, V, 3)``.
+    def members(self, weights: Tensor, factors: Tensor, beyond: Tensor, on_shapes: bool = True) -> Tensor:
+        r"""Members of the set. *Shape:* ``(n, K), (n, K, n_fields - 1), (n,) -> (n, V, 3)``.
 
         On the given shapes, at the rigid motion of least :math:`\sum_k w_k \int |x - x_k|^2` with the means of the
         local weights over the surface; otherwise in the pose of the mean.
         """
         shapes, means = self.shapes.new_empty(len(weights), *self.shapes.shape[1:]), torch.empty_like(weights)
         areas = self.coordinates.reconstruction.areas
-        for i, each in enumerate(zip(weights, factors, strict=True)):
+        for i, each in enumerate(zip(weights, factors, beyond.tolist(), strict=True)):
             shapes[i], local = self.member(*each)
             means[i] = local @ areas / areas.sum()
         if not on_shapes:
             return self.coordinates.align(shapes)
         return best_fit(shapes, torch.einsum("nk,kvi->nvi", means, self.placed), areas).apply(shapes)
 
-    def member(self, weights: Tensor, factors: Tensor) -> tuple[Tensor, Tensor]:
-        """A member of the set and its local weights; less local, if it would fold.
+    def member(self, weights: Tensor, factors: Tensor, beyond: float) -> tuple[Tensor, Tensor]:
+        """A member of the set and its local weights; less local and less far beyond, if it would fold.
 
-        If it folds even then, it is the given shape of the largest weight. None of the local weights is below zero, and
-        they add up to one. *Shape:* ``(K,), (K, n_fields - 1) -> (V, 3), (K, V)``, with weights and factors of
-        :meth:`draw`.
+        If it folds even then, it is the given shape of the largest weight. The local weights add up to one, and none is
+        below zero within the given shapes. *Shape:* ``(K,), (K, n_fields - 1) -> (V, 3), (K, V)``, with weights and
+        factors of :meth:`draw`.
         """
         logarithms = weights.clamp_min(torch.finfo(weights.dtype).tiny).log()[:, None]
         for i in range(ROUNDS + 1):
             locality = 0 if i == ROUNDS else SMOOTHER**i
             local = torch.softmax(logarithms + locality * factors @ self.fields[1:], 0)
+            local = local + beyond * locality * (local - 1 / len(self))
             x = self.relax(self.assemble(local), local, PRODUCTS)
             if self.folds(x) <= self.most_folds:
                 return x, local
@@ -233,7 +242,9 @@ def bound_weights(weights: Tensor) -> Tensor:
     return 1 / len(weights) + ratio * (weights - 1 / len(weights))
 
 
-def check_density(concentration: float, locality: float) -> None:
+def check_density(concentration: float, locality: float, beyond: tuple[float, float]) -> None:
     """Raise a ValueError if what new members are drawn with is out of range."""
     if not 0 < concentration < torch.inf or not 0 <= locality < torch.inf:
         raise ValueError(f"concentration is above 0, locality 0 or more; got {concentration} and {locality}")
+    if not 0 <= beyond[0] <= beyond[1] <= 1:
+        raise ValueError(f"beyond is a range (low, high) within [0, 1]; got {beyond}")

@@ -28,7 +28,6 @@ def save_animation(
     fps: float | None = None,
     keyframe_indices: Sequence[int] | None = None,
     cyclic: bool = False,
-    overwrite: bool = False,
     *,
     duration: float | None = None,
     ping_pong: bool = False,
@@ -55,18 +54,17 @@ def save_animation(
         frames: Vertex positions, in the caller's coordinates. *Shape:* ``(N, V, 3)``. One shape gives a file that
             stands still.
         faces: Vertex indices. *Shape:* ``(F, 3)``.
-        out: File to write.
+        out: File to write; replaced if it exists.
         fps: Frames a second; with a ``duration``, pictures or samples a second of videos and point caches
             (default: 24), while GLB and USD show every frame.
         keyframe_indices: Which frames are key-frames. They are kept when frames are left out (unless they are
             too many themselves), named in the GLB's ``extras``, and their number gives the default duration.
         cyclic: Add the step from the last frame back to the first, unless the two are equal already.
-        overwrite: Replace the file if it exists.
         duration: Of the sequence once, in seconds. Default: from ``fps`` where that is given; otherwise 1 s for a
             cycle, 2 s for two key-frames, and 1 s for each interval of more.
         ping_pong: Play forwards and then backwards, which takes twice the duration.
         ease: Slow at both ends, by half a period of a cosine.
-        times: Times of the frames, in any unit (:func:`torch_modal.frame_times`); of a cycle, also the time when it
+        times: Times of the frames, in any unit; of a cycle, also the time when it
             begins again. Default: evenly spaced. The duration does not change.
         asset: The mesh file that the frames come from (:func:`torch_modal.open_asset`). GLB gets its materials,
             textures, texture coordinates, colours and normals, USD its polygons, texture coordinates and colours.
@@ -79,7 +77,7 @@ def save_animation(
 
     Raises:
         ValueError: An argument cannot be used; the message says why.
-        FileExistsError: The file exists and ``overwrite`` is off.
+        IsADirectoryError: ``out`` is a folder.
         MissingPackageError: The format needs a package that is not installed; the message says which.
 
     Warns:
@@ -94,7 +92,7 @@ def save_animation(
     if asset is not None:
         asset.check(shapes, path, ANIMATION_FORMATS[suffix].holds)
     ANIMATION_FORMATS[suffix].check_installed(path.name)
-    refuse_existing(path, overwrite)
+    refuse_existing(path)
     keyframes = [] if keyframe_indices is None else check_indices(keyframe_indices, len(shapes), "keyframe_indices")
     if cyclic and len(shapes) > 1 and np.array_equal(shapes[0], shapes[-1]):
         shapes = shapes[:-1]

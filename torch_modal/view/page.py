@@ -55,16 +55,16 @@ class Page:
             f'srcdoc="{html.escape(self.html)}"></iframe>'
         )
 
-    def save(self, out: str | Path, overwrite: bool = False) -> Path:
-        """Write the page as one HTML file, ``*.html``; returns its path.
+    def save(self, out: str | Path) -> Path:
+        """Write the page as one HTML file, ``*.html``, which is replaced if it exists; returns its path.
 
         Raises:
             ValueError: ``out`` does not end in .html.
-            FileExistsError: The file exists and ``overwrite`` is off.
+            IsADirectoryError: ``out`` is a folder.
         """
         path = Path(out)
         check_suffix(path, PAGES)
-        refuse_existing(path, overwrite)
+        refuse_existing(path)
         write_files([(path, self.html.encode("utf-8"))])
         return path
 

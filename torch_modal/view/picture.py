@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
 
@@ -105,7 +106,6 @@ def render_sequence(
     colors: Mapping[str, Array] | None = None,
     color_label: str = "",
     points: Mapping[str, Sequence[Array]] | None = None,
-    overwrite: bool = False,
 ) -> Path:
     """Draw rows of shapes side by side, all seen by the same camera at the same scale.
 
@@ -113,9 +113,10 @@ def render_sequence(
         frames_by_row: For each row its label and its shapes, for example ``{"torch_modal": x, "linear": y}``.
             *Shape of each:* ``(N, V, 3)``, the same for all.
         faces: Vertex indices. *Shape:* ``(F, 3)``.
-        out: File to write, ``*.png`` or ``*.pdf``.
+        out: File to write, ``*.png`` or ``*.pdf``; replaced if it exists.
         columns: How many frames to show, evenly chosen with the first and the last, or their numbers. By
-            default all up to seven, and of more a number from four to seven that gives equal steps.
+            default all up to seven, and of more a number from four to seven that gives equal steps; where most of
+            these were key-frames, shapes half-way between key-frames instead.
         titles: Text above the columns. Default: their times, from 0 to 1.
         keyframe_indices: Frames that are key-frames, drawn in the other colour; an empty list is none. The first
             and the last by default.
@@ -126,35 +127,25 @@ def render_sequence(
             percentile of what is shown, with an arrow if there is more. *Shape of each:* ``(N, V)``.
         color_label: Name of the numbers in ``colors``, with their unit.
         points: Rows of clouds, drawn above the shapes as dots: a cloud for each frame. *Shape of each:* ``(n, 3)``.
-        overwrite: Replace the file if it exists.
 
     Returns:
         The file.
 
     Raises:
         ValueError: An argument cannot be used; the message says why.
-        FileExistsError: The file exists and ``overwrite`` is off.
+        IsADirectoryError: ``out`` is a folder.
     """
     path = Path(out)
     fmt = check_suffix(path, PICTURES)[1:]
     check_view(view, up)
-    refuse_existing(path, overwrite)
+    refuse_existing(path)
 
     checked, triangles = check_sequences(frames_by_row, faces, "frames_by_row")
     rows, shapes = list(checked), list(checked.values())
     n_frames = len(shapes[0])
-    if columns is None:
-        # Equal steps if at all possible: 5 of 9 or 17 frames, 7 of 25.
-        columns = next((c for c in (7, 6, 5, 4) if n_frames > c and (n_frames - 1) % (c - 1) == 0), 7)
-    if isinstance(columns, (int, np.integer)):
-        count = min(columns, n_frames)
-        if count < 1:
-            raise ValueError(f"columns must be at least 1, got {columns}")
-        chosen = np.unique(np.linspace(0, n_frames - 1, count).round().astype(int)).tolist()
-    else:
-        chosen = check_indices(columns, n_frames, "columns")
-        if not chosen:
-            raise ValueError("columns are the frames to show, one or more; got none")
+    ends = [0, n_frames - 1]
+    keyframes = check_indices(ends if keyframe_indices is None else keyframe_indices, n_frames, "keyframe_indices")
+    chosen = choose_columns(columns, n_frames, keyframes)
     titles = [f"t = {n / max(n_frames - 1, 1):.3g}" for n in chosen] if titles is None else titles
     if len(titles) != len(chosen):
         raise ValueError(f"titles stand above {len(chosen)} columns, got {len(titles)}")
@@ -162,8 +153,6 @@ def render_sequence(
     for label, row in clouds.items():
         if len(row) != n_frames or any(cloud.shape != (len(cloud), 3) for cloud in row):
             raise ValueError(f"points[{label!r}] must be {n_frames} clouds (n, 3), got {[c.shape for c in row]}")
-    ends = [0, n_frames - 1]
-    keyframes = check_indices(ends if keyframe_indices is None else keyframe_indices, n_frames, "keyframe_indices")
 
     values = {row: to_numpy(numbers).astype(np.float64) for row, numbers in (colors or {}).items()}
     for label, numbers in values.items():
@@ -204,6 +193,26 @@ def render_sequence(
     figure.savefig(stream, format=fmt, dpi=DPI, bbox_inches="tight", pad_inches=0.2)
     write_files([(path, stream.getvalue())])
     return path
+
+
+def choose_columns(columns: int | Sequence[int] | None, n_frames: int, keyframes: Sequence[int]) -> list[int]:
+    """Numbers of the frames that are drawn; by default at least half of them are between the key-frames."""
+    by_default = columns is None
+    if columns is None:
+        # Equal steps if at all possible: 5 of 9 or 17 frames, 7 of 25.
+        columns = next((c for c in (7, 6, 5, 4) if n_frames > c and (n_frames - 1) % (c - 1) == 0), 7)
+    if not isinstance(columns, (int, np.integer)):
+        if not (chosen := check_indices(columns, n_frames, "columns")):
+            raise ValueError("columns are the frames to show, one or more; got none")
+        return chosen
+    if columns < 1:
+        raise ValueError(f"columns must be at least 1, got {columns}")
+    chosen = np.unique(np.linspace(0, n_frames - 1, min(columns, n_frames)).round().astype(int)).tolist()
+    middles = [(a + b) // 2 for a, b in pairwise([*keyframes, n_frames]) if b - a > 1]
+    if by_default and middles and 2 * len(set(chosen) & set(keyframes)) > len(chosen):
+        picked = np.linspace(0, len(middles) - 1, min(5, len(middles))).round().astype(int)
+        return sorted({chosen[0], *(middles[i] for i in picked), chosen[-1]})
+    return chosen
 
 
 def _color_scale(numbers: FloatArray) -> Any:

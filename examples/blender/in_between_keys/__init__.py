@@ -63,8 +63,28 @@ def in_betweens(
         for file, points in zip(files, shapes, strict=True):
             write_mesh(file, points, triangles)
         options = ["--levels", str(levels), *["--cyclic"] * cyclic, *["--contact"] * contact]
-        run_program(program, "subdivide", *map(str, files), *options, "--out", str(folder / "out"))
+        run_program(program, "interpolate", *map(str, files), *options, "--out", str(folder / "out"))
         return [read_points(file) for file in sorted((folder / "out").glob("frame-*.obj"))]
+
+
+def dress(baked: Any, surface: Any) -> None:
+    """Give a skinned object the polygons, materials and texture coordinates of a mesh of the same vertices."""
+    skinned = baked.data
+    if len(skinned.vertices) != len(surface.vertices):
+        return  # vertices that no polygon has are not in the file
+    surface.name = skinned.name
+    for target, source in zip(surface.vertices, skinned.vertices, strict=True):
+        target.co = source.co
+    weights = [[(each.group, each.weight) for each in vertex.groups] for vertex in skinned.vertices]
+    names = [group.name for group in baked.vertex_groups]  # the mesh has them
+    baked.data = surface
+    baked.vertex_groups.clear()
+    for name in names:
+        baked.vertex_groups.new(name=name)
+    for number, groups in enumerate(weights):
+        for group, weight in groups:
+            baked.vertex_groups[group].add([number], weight, "REPLACE")
+    bpy.data.meshes.remove(skinned)
 
 
 class Preferences(bpy.types.AddonPreferences):  # type: ignore[misc]
@@ -152,15 +172,25 @@ class BakeToBones(bpy.types.Operator):  # type: ignore[misc]
         """Write each frame, fit bones, import them."""
         own, scene, before = context.active_object, context.scene, context.scene.frame_current
         program = context.preferences.addons[__name__].preferences.program
+        surface: Any = None
+        triangles: list[tuple[int, int, int]] = []
         with tempfile.TemporaryDirectory(prefix="torch_modal-") as name:
             for frame in range(scene.frame_start, scene.frame_end + 1):
                 scene.frame_set(frame)
                 posed = own.evaluated_get(context.evaluated_depsgraph_get())
                 mesh = posed.to_mesh()
-                mesh.calc_loop_triangles()
+                if surface is None:  # quads that deform would be cut along other diagonals in other frames
+                    mesh.calc_loop_triangles()
+                    triangles = [(*part.vertices,) for part in mesh.loop_triangles]
+                    depsgraph = context.evaluated_depsgraph_get()
+                    surface = bpy.data.meshes.new_from_object(posed, preserve_all_data_layers=True, depsgraph=depsgraph)
+                if len(mesh.vertices) != len(surface.vertices):
+                    self.report({"ERROR"}, f"frame {frame} has {len(mesh.vertices)} vertices, the first has others")
+                    scene.frame_set(before)
+                    return {"CANCELLED"}
                 places = [posed.matrix_world @ vertex.co for vertex in mesh.vertices]
                 points = [(x, z, -y) for x, y, z in places]  # glTF's Y is up
-                write_mesh(Path(name, f"frame-{frame:06d}.obj"), points, [(*t.vertices,) for t in mesh.loop_triangles])
+                write_mesh(Path(name, f"frame-{frame:06d}.obj"), points, triangles)
                 posed.to_mesh_clear()
             scene.frame_set(before)
             rate, out = (
@@ -172,7 +202,9 @@ class BakeToBones(bpy.types.Operator):  # type: ignore[misc]
             except RuntimeError as error:
                 self.report({"ERROR"}, str(error))
                 return {"CANCELLED"}
-            bpy.ops.import_scene.gltf(filepath=str(out))
+            bpy.ops.import_scene.gltf(filepath=str(out), disable_bone_shape=True)
+        for baked in [each for each in context.selected_objects if each.type == "MESH"]:
+            dress(baked, surface)
         for moved in [each for each in context.selected_objects if each.animation_data and each.animation_data.action]:
             data = moved.animation_data  # its keys begin at 0: a strip puts them where the frames were
             data.nla_tracks.new().strips.new("baked", scene.frame_start, data.action)

@@ -9,6 +9,7 @@ const LOOKS = [
   { tint: [0.8, 0.77, 0.56], line: "#8b7d1f" },
 ];
 const GIVEN = [0.91, 0.6, 0.36]; // key-frames, as in the pictures
+const PRESS = matchMedia("(pointer: coarse)").matches ? "Tap" : "Click"; // as a finger or a mouse does
 const CLICK_PIXELS = 4; // a press that moves further turns the camera
 const SNAP_PIXELS = 3; // the slider meets frames that are as near
 const ENOUGH_LANDMARKS = 5;
@@ -109,11 +110,11 @@ class Viewer {
   }
 
   #hint() {
-    if (!this.picksLandmarks) return this.rows.length ? "" : "Click on a shape to pick a vertex";
+    if (!this.picksLandmarks) return this.rows.length ? "" : `${PRESS} on a shape to pick a vertex`;
     const incomplete = this.rows.find((row) => row.includes(null));
     const where = incomplete ? this.actors[incomplete.indexOf(null)].name : "any mesh";
     const enough = this.complete.length < ENOUGH_LANDMARKS ? `; ${ENOUGH_LANDMARKS} make a map safe` : "";
-    return `Landmark ${this.complete.length + 1}: click on ${where}${enough}`;
+    return `Landmark ${this.complete.length + 1}: ${PRESS.toLowerCase()} on ${where}${enough}`;
   }
 
   /** The name of a row on its chip, and beside its vertices. */
