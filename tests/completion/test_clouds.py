@@ -88,7 +88,7 @@ def test_normals_that_point_inward_are_turned_over(animal: Body) -> None:
     assert error(found.shapes, tm.complete(x[0], faces, [seen]).shapes, diagonal) < 1e-6
 
 
-@pytest.mark.parametrize("turn", [(30, 0, 0), (0, 90, 0), (0, 0, 180), (0, 180, 0)])
+@pytest.mark.parametrize("turn", [(0, 90, 0), (0, 180, 0)])
 def test_a_turned_template_is_turned_back(animal: Body, turn: tuple[int, int, int]) -> None:
     x, faces, diagonal = animal
     rotation = torch.from_numpy(Rotation.from_euler("xyz", turn, degrees=True).as_matrix())

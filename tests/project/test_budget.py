@@ -22,14 +22,14 @@ import torch
 import torch_modal as tm
 
 BOUNDS = {
-    "lines of code": 16920,
-    "functions": 1520,
+    "lines of code": 17210,
+    "functions": 1538,
     "docstrings that begin with no noun": 0,
     "functions of in-between": 89,
     "files of in-between": 23,
     "functions of in-between, forward and backward": 114,
     "files of in-between, forward and backward": 24,
-    "functions of subdivide": 162,
+    "functions of subdivide": 159,
     "files of subdivide": 35,
     "functions of making a layer": 107,
     "files of making a layer": 33,
