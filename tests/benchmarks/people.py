@@ -160,16 +160,26 @@ def landmark_vertices() -> list[int]:
 
 
 # ------------------------------------------------------------------------------------------------------------ measures
+def lengths(target: MeshSurface, places: FloatArray, truths: FloatArray) -> FloatArray:
+    """Distances along a surface from places to true places, in per cent of the root of its area.
+
+    *Shape:* ``(n, 3), (k, n, 3) -> (k, n)``.
+    """
+    solver, tree = potpourri3d.MeshHeatMethodDistanceSolver(target.vertices, target.faces), cKDTree(target.vertices)
+    found: FloatArray = np.linalg.norm(places - truths, axis=-1)
+    near, true = tree.query(places)[1], tree.query(truths)[1]
+    far = found > 0.05 * np.sqrt(target.area)  # nearer, vertices are too coarse
+    for i in np.flatnonzero(far.any(0)):
+        along = solver.compute_distance(int(near[i]))[true[:, i]]
+        found[:, i] = np.where(far[:, i], np.maximum(along, found[:, i]), found[:, i])
+    return 100 / np.sqrt(target.area) * found
+
+
 def error(found: Registration, pair: Pair) -> float:
     """Mean distance along the target from the true places, in per cent of the root of its area."""
-    target, sample = pair.target, np.random.default_rng(0).permutation(len(pair.truth))[:N_MEASURED]
-    solver = potpourri3d.MeshHeatMethodDistanceSolver(target.vertices, target.faces)
-    tree, places = cKDTree(target.vertices), target.closest(found.positions.numpy()[sample]).points
-    straight = np.linalg.norm(places - pair.truth[sample], axis=1)
-    near, true = tree.query(places)[1], tree.query(pair.truth[sample])[1]
-    along = [solver.compute_distance(int(a))[b] for a, b in zip(near, true, strict=True)]
-    far = straight > 0.05 * np.sqrt(target.area)  # nearer, vertices are too coarse
-    return float(100 * np.where(far, np.maximum(along, straight), straight).mean() / np.sqrt(target.area))
+    sample = np.random.default_rng(0).permutation(len(pair.truth))[:N_MEASURED]
+    places = pair.target.closest(found.positions.numpy()[sample]).points
+    return float(lengths(pair.target, places, pair.truth[None, sample]).mean())
 
 
 class Result(NamedTuple):
