@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from torch_modal.completion.bending import ModalBending, ModalPose
+from torch_modal.completion.follow import follow
 from torch_modal.completion.frames import CompletionProblem
 from torch_modal.completion.search import AFTER_FIRST, FIRST, N_KEPT, N_SOFT, REST, PoseSearch
 from torch_modal.geometry.rigid import align, best_fit
@@ -32,6 +33,8 @@ N_TURNED, DISTINCT, CERTAIN = 3, 0.8, 0.7
 """Turned poses of the template that a search starts from; the largest cosine of the angle between two; score over that
 of the template as it is below which it is turned.
 """
+N_FOLLOWED, FOLLOWED = 8, (6.0, 1.5)
+"""As-rigid-as-possible steps after a search, and the largest distance of a pair in the first and in the last."""
 TRUSTED, N_ALIKE = 0.34, 2
 """Part of the frames, those that explain most, from which the others are searched again; starts from their shapes."""
 TIME_ROUNDS, LATEST, UNCHANGED = 6, 0.5, 10.0
@@ -42,6 +45,7 @@ class ModalFit(NamedTuple):
     """A frame by modes."""
 
     x: Tensor
+    """The shape, which also follows its clouds."""
     base: Tensor
     pose: ModalPose
     score: float
@@ -178,7 +182,9 @@ class FramePoses:
             fits.append((base, pose, poses.score(coarse, pose, frame)))
         base, pose, score = min(fits, key=lambda one: one[2])
         pose, score = poses.move_limbs(self._coarsen(base), pose, frame, score)
-        return ModalFit(self.bending.shape(base, pose), base, pose, score)
+        # What modes cannot express would add up from frame to frame.
+        x = follow(self.problem.frames[i], self.bending.shape(base, pose), self.problem.mesh, N_FOLLOWED, FOLLOWED)
+        return ModalFit(x, base, pose, score)
 
     def _coarsen(self, x: Tensor) -> Tensor:
         return torch.from_numpy(self.coarse.restrict(x.numpy()))

@@ -2,11 +2,11 @@
 
 import numpy as np
 import torch
-from scipy import sparse
 from scipy.optimize import NoConvergence, anderson
 from torch import Tensor
 
 from torch_modal.completion.energy import PointEnergy
+from torch_modal.completion.follow import follow
 from torch_modal.completion.frames import CompletionProblem, Frame
 from torch_modal.completion.gradient import LastSolve
 from torch_modal.completion.pairs import OUTLIERS, SampledSurface, robust_weights
@@ -19,17 +19,12 @@ from torch_modal.elastic.term import Mesh
 from torch_modal.elastic.volume import encloses
 from torch_modal.inbetween.settings import Objective, stiffnesses
 from torch_modal.progress import ProgressReport
-from torch_modal.registration.fit import ElasticSurface
 
 OWN_OF_CLOUDS, OWN, WHOLE = 0.4, 0.1, 0.1
 """Weights of the shape by modes, where there are clouds and without, and of whole shapes, in Eq. 5; neighbours in
 time have the rest."""
 STIFFNESS, OF_KNOWN, STIFFNESSES = 6.0, 2.0, (0.5, 15.0)
 """Of a point with a noise of 1, at a size of 100, in a cloud and at a known place; bounds within which that is adapted.
-"""
-FOLLOWS, WEIGHTS, REACH = 20, (0.02, 0.5), (15.0, 1.5)
-"""Steps in which a shape follows clouds; weights of points next to a vertex's, and the largest distance of a pair, in
-the first and in the last.
 """
 ROUNDS, STEPS, PRODUCTS = 12, 2, 20
 """Rounds of new pairs, in each of which all vertices take steps, each with iterations of conjugate gradients."""
@@ -39,10 +34,6 @@ MOST_MARKERS = 0.5
 """Part of the vertices below which these are markers: noisy meshes also need their shapes by modes."""
 STILL, MOST_ROUNDS = 1e-5, 40
 """Largest move of a vertex in a round, at a size of 100, where markers are at rest; rounds until then."""
-
-
-ANCHOR = 1e-4
-"""Weight of each vertex's place by modes, as :data:`WEIGHTS`."""
 
 
 class Refinement:
@@ -74,7 +65,9 @@ class Refinement:
         for i, pose in enumerate(poses):
             surface = SampledSurface(pose.numpy(), self.problem.mesh)
             frames[i] = frames[i]._replace(seen=[one.with_noise(surface) for one in frames[i].seen])
-        followed = torch.stack([self._follow(frame, pose) for frame, pose in zip(frames, poses, strict=True)])
+        followed = torch.stack(
+            [follow(frame, pose, self.problem.mesh) for frame, pose in zip(frames, poses, strict=True)]
+        )
         (numbers, weights), x, of_known = self._rests(0.0 if smooth else OWN), followed, OF_KNOWN
 
         def rests_of(x: Tensor) -> list[RestShapes]:
@@ -114,23 +107,6 @@ class Refinement:
             x = torch.from_numpy(moved)
         solve = relax(x, LAST)
         return self._separate(solve) if self.contact else solve.x, solve
-
-    def _follow(self, frame: Frame, pose: Tensor) -> Tensor:
-        """The shape after as-rigid-as-possible steps towards the clouds of a frame. *Shape:* ``(V, 3)``."""
-        x, n = pose.numpy(), sum(len(one.points) for one in frame.seen if one.places is None)
-        if not n:
-            return pose
-        elastic = ElasticSurface(SampledSurface(x, self.problem.mesh))
-        unit = elastic.stiffness * min(n, len(x) / 2)
-        # Every part is anchored, also one that no point is near.
-        anchor = sparse.identity(len(x), format="csr"), x, np.full(len(x), ANCHOR * elastic.stiffness)
-        for weight, reach in zip(np.geomspace(*WEIGHTS, FOLLOWS), np.geomspace(*REACH, FOLLOWS), strict=True):
-            current, pulls = SampledSurface(x, self.problem.mesh), [anchor]
-            for pairs in [one.pair(current) for one in frame.seen]:
-                trust = robust_weights(pairs.distances(x), reach / OUTLIERS)
-                pulls.append((pairs.places, pairs.points, weight * unit * pairs.weights * trust))
-            x = elastic.follow(x, pulls)
-        return torch.from_numpy(x)
 
     def _relax(
         self, frame: Frame, x: Tensor, rests: RestShapes, products: list[int], of_known: float
