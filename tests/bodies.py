@@ -11,6 +11,7 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
+import trimesh
 from numpy.typing import NDArray
 from solids import as_mesh, box
 
@@ -144,6 +145,16 @@ def twisted_plate(thickness: float) -> tuple[FloatArray, FloatArray, IntArray]:
     angle = -np.pi / 6 * x
     turned = np.stack([x, np.cos(angle) * y - np.sin(angle) * z, np.sin(angle) * y + np.cos(angle) * z], 1)
     return flat, turned, np.concatenate([top, bottom, *rim])
+
+
+def limbs(level: int) -> tuple[FloatArray, IntArray]:
+    """A ball with five bumps of different length and place: nothing about it is symmetric."""
+    ball = trimesh.creation.icosphere(subdivisions=level)
+    points = np.array(ball.vertices)
+    bumps = np.array([[1, 0.2, 0.1], [-0.3, 1, 0.2], [-0.2, -1, 0.5], [0.1, 0.3, 1], [-1, 0, -0.6]])
+    bumps /= np.linalg.norm(bumps, axis=1, keepdims=True)
+    radius = 1 + np.exp(14 * (points @ bumps.T - 1)) @ np.array([2.4, 1.9, 1.5, 1.1, 2.0])
+    return points * radius[:, None], np.array(ball.faces, dtype=np.int64)
 
 
 # -------------------------------------------------------------------------------------------------------------- bodies

@@ -468,3 +468,32 @@ def test_draws_of_bars(bars: Shapes) -> None:
 def test_many_draws(name: str, n: int, request: pytest.FixtureRequest) -> None:
     """More of each mesh."""
     check_draws(request.getfixturevalue(name), n)
+
+
+class Graph:
+    """A ``Data`` of PyTorch Geometric as far as a transform is concerned: attributes, and a copy of all of them."""
+
+    def __init__(self, **values: torch.Tensor) -> None:
+        self.__dict__.update(values)
+
+    def clone(self) -> "Graph":
+        return Graph(**{name: value.clone() for name, value in self.__dict__.items()})
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+def test_a_graph_gives_a_graph(bars: Shapes, space: tm.ShapeSpace, dtype: torch.dtype) -> None:
+    """As a ``transform`` of torch_geometric, which takes and returns its ``Data``."""
+    augment = tm.AugmentationSequential(
+        tm.RandomModalDeformation(p=1.0), tm.RandomRigidMotion(p=1.0), generator=seeded(), space=space
+    )
+    data = Graph(pos=bars.keyframes[1].to(dtype), face=bars.faces.T, y=torch.tensor([3]))
+    out = augment(data)
+    assert type(out) is type(data) and out is not data and out.pos.dtype == dtype
+    assert torch.equal(out.face, data.face) and torch.equal(out.y, data.y)
+    assert torch.equal(data.pos, bars.keyframes[1].to(dtype))  # the data set's own stays
+    assert torch.equal(out.pos, augment(data.pos, params=augment.params)[0]) and not torch.equal(out.pos, data.pos)
+    assert torch.equal(augment(data, params=augment.params).pos, out.pos)
+    with pytest.raises(ValueError, match=r"a graph takes other positions alone; of .*vertex_labels.*, pass tensors"):
+        tm.RandomRigidMotion(data_keys=["shapes", "vertex_labels"])(data)
+    with pytest.raises(ValueError, match="shapes"):
+        augment(Graph(pos=data.pos[:-1]))

@@ -60,6 +60,21 @@ class TestValues:
             assert torch.equal(x[0], x_a)
             assert torch.equal(x[2], x_b)
 
+    @pytest.mark.parametrize("dtype", [DOUBLE, torch.float32])
+    def test_times_beside_the_ends_are_the_ends(self, layer: InBetween, bars: Shapes, dtype: torch.dtype) -> None:
+        """Ten steps of a tenth, summed in float32, end at 1.0000001."""
+        keyframes = bars.keyframes[:2].to(dtype)
+        summed = float(sum(torch.full((10,), 0.1)))
+        assert 1 < summed < 1 + 1e-6
+        t = torch.tensor([-9e-7, summed, 1 + 9e-7], dtype=dtype, requires_grad=True)
+        x = layer(*keyframes, t)
+        assert torch.equal(x, keyframes[[0, 1, 1]])
+        (slopes,) = torch.autograd.grad(x.square().sum(), t)
+        assert bool((slopes != 0).all())  # a clamp would cut them
+        for beyond in (-1.2e-6, 1 + 1.2e-6):
+            with pytest.raises(ValueError, match=r"t lies in \[0, 1\]"):
+                layer(*keyframes, beyond)
+
     def test_faces_may_be_a_reversed_view_of_an_array(self, bars: Shapes) -> None:
         x, turned = bars.keyframes, bars.faces.numpy()[:, ::-1]  # torch.from_numpy refuses negative strides
         assert InBetween(bars.bases[:2], turned)(x[0], x[1], 0.5).isfinite().all()

@@ -46,6 +46,14 @@ def test_rigid_modes_are_the_rigid_motions(basis: ModalBasis) -> None:
     torch.testing.assert_close(basis.rigid_modes[:3], expected)
 
 
+def test_a_basis_is_printed_in_one_line(basis: ModalBasis) -> None:
+    assert repr(basis) == "<ModalBasis of 5 modes, 20 vertices>"
+    assert (
+        repr([basis.truncate(2), basis])
+        == "[<ModalBasis of 2 modes, 20 vertices>, <ModalBasis of 5 modes, 20 vertices>]"
+    )
+
+
 def test_a_truncated_basis_has_the_first_modes(basis: ModalBasis) -> None:
     first = basis.truncate(2)
     assert torch.equal(first.modes, basis.modes[:2])

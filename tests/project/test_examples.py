@@ -7,9 +7,12 @@ from types import ModuleType
 
 import pytest
 import torch
-from shapes import edge_lengths
+import trimesh
+from bodies import limbs, twist
+from shapes import apart, edge_lengths
 
 from torch_modal.data.samples import load_sample
+from torch_modal.geometry.rigid import align
 from torch_modal.io.write import save_mesh
 from torch_modal.registration.landmarks import read_landmarks
 from torch_modal.registration.load import load_keyframes
@@ -164,3 +167,28 @@ def test_small_examples_run(tmp_path: Path) -> None:
     assert (tmp_path / "path.glb").stat().st_size > 1e5 and 0.2 < float(speeds.min()) < float(speeds.max()) < 20
     plain, stiffer = load_example("own_term").main()
     assert 1e-4 < float((stiffer - plain).norm(dim=-1).mean()) < 0.1
+
+
+@pytest.mark.slow
+def test_register_folder_leaves_out_a_mesh_that_is_nothing_alike(tmp_path: Path) -> None:
+    """Two bent bodies of other vertices, whose true places are known, and a torus."""
+    for library in ("robust_laplacian", "potpourri3d", "igl"):
+        pytest.importorskip(library, reason=f"{library} is not installed; it is part of the extra 'register'")
+    rest, faces = limbs(3)
+    poses = [twist(rest, 1.0, angle, -3.0, 3.0) for angle in (0.4, 0.9)]
+    order = torch.randperm(len(rest), generator=torch.Generator().manual_seed(0)).numpy()
+    for number, pose in enumerate(poses):
+        save_mesh(pose[order], order.argsort()[faces], tmp_path / "scans" / f"pose-{number}.ply")
+    torus = trimesh.creation.torus(major_radius=2, minor_radius=0.5)
+    save_mesh(torus.vertices, torus.faces, tmp_path / "scans" / "torus.ply")
+    (template,) = save_mesh(rest, faces, tmp_path / "template.obj")
+    space = load_example("register_folder").main(template, tmp_path / "scans", tmp_path / "out")
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["pose-0.obj", "pose-1.obj", "report.csv"]
+    head, *rows = (tmp_path / "out" / "report.csv").read_text(encoding="utf-8").splitlines()
+    assert head.startswith("target,confidence,") and [row.split(",")[0] for row in rows] == [
+        "pose-0.ply",
+        "pose-1.ply",
+        "torus.ply",
+    ]
+    truth = [torch.from_numpy(rest), *(align(torch.from_numpy(pose), torch.from_numpy(rest)) for pose in poses)]
+    assert len(space) == 3 and max(apart(x, y) for x, y in zip(space.keyframes(), truth, strict=True)) < 0.03

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from bodies import limbs
 from scipy.spatial.transform import Rotation
-from test_registration import limbs
 
 import torch_modal as tm
 from torch_modal.registration.fit import sliding_freedom

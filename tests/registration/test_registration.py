@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from bodies import limbs
 from scipy.spatial import cKDTree
 
 import torch_modal as tm
@@ -27,16 +28,6 @@ for library in ("robust_laplacian", "potpourri3d", "igl"):
     pytest.importorskip(library, reason=f"{library} is not installed; it is part of the extra 'register'")
 
 Mesh = tuple[np.ndarray, np.ndarray]
-
-
-def limbs(level: int) -> Mesh:
-    """A ball with five bumps of different length and place: nothing about it is symmetric."""
-    ball = trimesh.creation.icosphere(subdivisions=level)
-    points = np.array(ball.vertices)
-    bumps = np.array([[1, 0.2, 0.1], [-0.3, 1, 0.2], [-0.2, -1, 0.5], [0.1, 0.3, 1], [-1, 0, -0.6]])
-    bumps /= np.linalg.norm(bumps, axis=1, keepdims=True)
-    radius = 1 + np.exp(14 * (points @ bumps.T - 1)) @ np.array([2.4, 1.9, 1.5, 1.1, 2.0])
-    return points * radius[:, None], np.array(ball.faces, dtype=np.int64)
 
 
 def bent(points: np.ndarray, angle: float = 0.5) -> np.ndarray:
