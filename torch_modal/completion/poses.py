@@ -45,7 +45,7 @@ class ModalFit(NamedTuple):
     """A frame by modes."""
 
     x: Tensor
-    """The shape, which also follows its clouds."""
+    """The shape; from a template alone, it also follows its clouds."""
     base: Tensor
     pose: ModalPose
     score: float
@@ -182,8 +182,9 @@ class FramePoses:
             fits.append((base, pose, poses.score(coarse, pose, frame)))
         base, pose, score = min(fits, key=lambda one: one[2])
         pose, score = poses.move_limbs(self._coarsen(base), pose, frame, score)
-        # What modes cannot express would add up from frame to frame.
-        x = follow(self.problem.frames[i], self.bending.shape(base, pose), self.problem.mesh, N_FOLLOWED, FOLLOWED)
+        x = self.bending.shape(base, pose)
+        if alone:  # what modes cannot express would add up from frame to frame
+            x = follow(self.problem.frames[i], x, self.problem.mesh, N_FOLLOWED, FOLLOWED)
         return ModalFit(x, base, pose, score)
 
     def _coarsen(self, x: Tensor) -> Tensor:
