@@ -103,3 +103,13 @@ def test_a_quiet_command_leaves_the_level_of_the_log(tmp_path: Path) -> None:
     level = logger.level
     assert cli.main(["check", str(tmp_path / "missing.obj"), "--quiet"]) == 1
     assert logger.level == level
+
+
+def test_advice_on_a_flat_surface_is_no_python(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    points = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0.4, 0.6, 0]])
+    faces = np.array([[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]])
+    tm.save_mesh(points, faces, tmp_path / "flat.obj")
+    argv = ["modes", str(tmp_path / "flat.obj"), "--modes", "2", "--out", str(tmp_path / "a.safetensors"), "--no-cache"]
+    assert cli.main([*argv, "--method", "solid", "--quiet"]) == 1
+    said = capsys.readouterr().err
+    assert "the surface is flat" in said and "(method shell)" in said and "=" not in said

@@ -1,20 +1,18 @@
-"""Commands ``register``, ``check``, ``carry``, ``modes``, ``precompute`` and ``demo`` of ``torch-modal``."""
+"""Commands ``register``, ``carry``, ``modes``, ``precompute`` and ``demo`` of ``torch-modal``."""
 
 import argparse
-import time
 import warnings
 from pathlib import Path
 
 from torch_modal.cli import arguments, subdivide
 from torch_modal.cli.arguments import check_output, pick_options
 from torch_modal.io.files import write_files
-from torch_modal.io.formats import MESH_FORMATS, PICTURES
+from torch_modal.io.formats import MESH_FORMATS
 from torch_modal.io.write import check_suffix
 
 DEMO_SAMPLES = ("creature", "hand")
 INCOMPLETE = 3  # exit status of `precompute` when some sets have no bases, of `register` when some are doubtful
 TABLE = "target,confidence,to target (%),from target (%),stretch,warnings"
-CROSSES = 3  # exit status of `check` when parts newly pass through each other
 
 
 def add_register(sub: argparse.ArgumentParser) -> None:
@@ -96,89 +94,6 @@ def register(args: argparse.Namespace) -> int:
         write_files([(table, ("\n".join(lines) + "\n").encode("utf-8"))])
         args.report(f"report:  {table}, {doubtful} of {len(targets)} doubtful")
     return INCOMPLETE if several and doubtful else 0
-
-
-def add_check(sub: argparse.ArgumentParser) -> None:
-    """Add the arguments of ``check``."""
-    add = sub.add_argument
-    add("meshes", nargs="+", type=Path, metavar="MESH", help="meshes of one connectivity")
-    add("--keyframes", nargs="+", type=Path, default=[], metavar="FILE", help="meshes whose own crossings are known")
-    text = "check the motion through the meshes: seven shapes between any two, with its shell energy and seconds"
-    add("--between", action="store_true", help=text)
-    add("--contact", action="store_true", help="with --between: keep parts from passing through each other")
-    text = "draw the meshes with crossings in colour, as .png or .pdf"
-    add("--picture", type=Path, metavar="FILE", help=text)
-
-
-def check(args: argparse.Namespace) -> int:
-    """Find parts that pass through each other, in key-frames and results.
-
-    Count for each mesh the triangles that pass through others, and colour them in a
-    picture. All meshes have the same faces.
-
-    With --keyframes, crossings of the key-frames are not counted as new; far ones are of
-    two parts that went through each other, not crossings that grew or folds. Without, all
-    are new.
-
-    With --between, shapes between the meshes are computed and checked too; crossings of the
-    meshes themselves are then known. The shell energy of the motion, of n steps, is n times
-    the sum of ShellLoss from each shape to the next: free of units, and less is better.
-
-    exit status: 0 nothing passes through anything far, 3 something does
-
-    Examples:
-      torch-modal check open.obj fist.obj
-      torch-modal check open.obj fist.obj --between --contact
-      torch-modal check out/frame-*.obj --keyframes open.obj fist.obj --picture crossings.png
-    """
-    if args.contact and not args.between:
-        args.fail("--contact is for the shapes that --between computes")
-    if args.picture:
-        check_suffix(args.picture, PICTURES)
-        check_output(args, [args.picture], [*args.meshes, *args.keyframes])
-
-    import torch_modal as tm
-    from torch_modal.times import fill_linear
-
-    shapes, faces = tm.load_keyframes([*args.keyframes, *args.meshes])
-    welded = tm.weld_seams(shapes, faces)
-    keyframes, shapes = welded.keyframes.split([len(args.keyframes), len(args.meshes)])
-    names = [str(mesh) for mesh in args.meshes]
-    if args.between:
-        keyframes, started = welded.keyframes, time.perf_counter()
-        frames = tm.interpolate(shapes, welded.faces, 3, **pick_options(args, "contact", "progress"))
-        seconds, shell = time.perf_counter() - started, tm.losses.ShellLoss(welded.faces)
-        motions = frames, fill_linear(shapes, range(0, 8 * len(names), 8))
-        ours, linear = (float((len(x) - 1) * shell(x[1:], x[:-1]).sum()) for x in motions)
-        args.report(f"shell energy of the motion: {ours:.4g}, of linear interpolation: {linear:.4g}; {seconds:.1f} s")
-        names, shapes = [f"t = {i / 8:g}" for i in range(len(frames))], frames
-    contacts = tm.self_contacts(shapes, welded.faces, keyframes if len(keyframes) else None)
-    used = shapes[0][welded.faces.unique()]
-    depths = 100 * contacts.depth.amax(1) / (used.amax(0) - used.amin(0)).norm()
-    columns = {"pairs": contacts.number, "new": contacts.n_new, "far": contacts.n_far}
-    width = max(map(len, names))
-    args.report(" " * width + "".join(f"{name:>9s}" for name in (*columns, "depth")))
-    for name, depth, *numbers in zip(names, depths.tolist(), *columns.values(), strict=True):
-        args.report(f"{name:{width}s}" + "".join(f"{int(n):9d}" for n in numbers) + f"{depth:7.2f} %")
-    args.report(
-        "pairs of triangles that cross; new: in no key-frame; far: new, and of two parts that went through each other; "
-        "depth: of the deepest vertex there, in % of the diagonal"
-    )
-    if args.picture:
-        marks = shapes.new_zeros(shapes.shape[:2])  # of each vertex: 0, 1 for a crossing, 2 for a new one
-        for value, chosen in ((1.0, slice(None)), (2.0, contacts.new)):
-            marks[contacts.shape[chosen].repeat_interleave(6), welded.faces[contacts.pairs[chosen]].flatten()] = value
-        tm.render_sequence(
-            {"crossings": shapes},
-            welded.faces,
-            args.picture,
-            columns=min(len(names), 8),
-            keyframe_indices=[0],
-            colors={"crossings": marks},
-            color_label="1: crosses, 2: new",
-        )
-        args.report(f"picture: {args.picture}")
-    return CROSSES if bool(contacts.n_far.any()) else 0
 
 
 def add_carry(sub: argparse.ArgumentParser) -> None:

@@ -12,7 +12,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
-from torch_modal.cli import bake, commands, complete, subdivide, transfer, view
+from torch_modal.cli import bake, check, commands, complete, subdivide, transfer, view
 from torch_modal.version import __version__
 
 PROGRAM = "torch-modal"
@@ -38,7 +38,7 @@ COMMANDS: dict[str, tuple[Callable[[Any], None], Callable[[Any], int | None]]] =
     "complete": (complete.add_arguments, complete.run),
     "transfer": (transfer.add_arguments, transfer.run),
     "register": (commands.add_register, commands.register),
-    "check": (commands.add_check, commands.check),
+    "check": (check.add_arguments, check.run),
     "carry": (commands.add_carry, commands.carry),
     "modes": (commands.add_modes, commands.modes),
     "precompute": (commands.add_precompute, commands.precompute),

@@ -225,6 +225,16 @@ def mirror_sides(centre: Frames, other: Frames) -> Sides:
     return turn_back(*first), turn_back(*second)
 
 
+def principal_stretches(reference: Frames, other: Frames) -> tuple[Tensor, Tensor]:
+    """Least and largest ratio of lengths in each triangle: the singular values of the map of its plane to another's.
+
+    A batch of one reference is broadcast. *Shape of each:* ``(B, F)``.
+    """
+    xx, xy, yx, yy = _product(other[3:], _inverse(reference))
+    total, difference = torch.hypot(xx + yy, yx - xy), torch.hypot(xx - yy, xy + yx)
+    return 0.5 * (total - difference), 0.5 * (total + difference)
+
+
 def _dot(a: Tensor, b: Tensor) -> Tensor:
     """*Shape:* ``(3, B, F), (3, B, F) -> (B, F)``."""
     return (a * b).sum(0)

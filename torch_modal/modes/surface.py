@@ -78,7 +78,7 @@ class CanonicalSurface(Surface):
             lengths = "{:.3g}, {:.3g} and {:.3g}".format(*extents / self.scale)
             raise MeshError(
                 f"the surface is flat: its extents are {lengths}, so it encloses nothing that could be filled with "
-                'tetrahedra; take the modes of the surface (method="shell"), or give it a thickness'
+                "tetrahedra; take the modes of the surface (method shell), or give it a thickness"
             )
 
 

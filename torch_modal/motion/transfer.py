@@ -169,7 +169,7 @@ def _places(registration: Registration | Tensor, n: int, keep_doubtful: bool) ->
     if registration.doubtful:
         why = f"the map between the bodies is doubtful: {registration.summary()}; {'; '.join(registration.warnings)}"
         if not keep_doubtful:
-            raise MeshError(f"{why}. To help it, {ADVICE}; keep_doubtful=True (--keep-doubtful) uses it all the same")
+            raise MeshError(f"{why}. To help it, {ADVICE}; keep_doubtful (--keep-doubtful) uses it all the same")
         warnings.warn(why, MeshWarning, stacklevel=3)
     confidence = registration.vertex_confidence.cpu().numpy()
     return places, confidence >= TRUSTED * confidence.max()

@@ -16,7 +16,7 @@ from torch_modal.registration.landmarks import landmark_table
 
 ADVICE = (
     "give landmarks, five or more: a text file with a line for each, which names one vertex of each mesh, counted from "
-    "0 (--landmarks FILE, landmarks=...); `torch-modal view MESH MESH --landmarks` opens a page to pick them on"
+    "0 (--landmarks FILE); `torch-modal view MESH MESH --landmarks` opens a page to pick them on"
 )
 
 
