@@ -20,6 +20,7 @@ from torch_modal.modes.extract import extract_modes
 from torch_modal.modes.lattice import Lattice
 from torch_modal.modes.surface import CanonicalSurface
 from torch_modal.modes.tetrahedra import (
+    MesherError,
     Tetrahedra,
     edge_lengths,
     orient,
@@ -139,7 +140,7 @@ def test_auto_takes_the_lattice_unless_parts_touch(monkeypatch: pytest.MonkeyPat
 
     def fails(self: TetWild, surface: Surface, stop: threading.Event) -> Tetrahedra:
         asked.append(surface)
-        raise ModalAnalysisError("it failed")
+        raise MesherError("it failed")
 
     monkeypatch.setattr(TetWild, "fill", fails)
     keyframes, faces, *_ = load_sample("hand")

@@ -183,7 +183,7 @@ def test_linear_between_key_frames(scattered: Shapes) -> None:
     ("options", "message"),
     [
         *(({"levels": n}, f"levels is a whole number from 0 to 12 .*got {n}") for n in (-1, 13, 1.5)),
-        ({"n_frames": 2}, "n_frames=2 leaves no room for 3 key-frames"),
+        ({"n_frames": 2}, "2 frames leave no room for 3 key-frames"),
         ({"bases": []}, "got 0 bases for 3 key-frames"),
         ({"mu": 0.5}, "mu weighs the similarity of the two shapes"),
         ({"regions": 2}, "which only preset='paper' has"),
