@@ -52,7 +52,7 @@ def clouds(x: Tensor, generator: torch.Generator, turns: float = TURNS) -> tuple
 
 def pool_of(arm: str, space: tm.ShapeSpace, seed: int = 0) -> Tensor:
     """The shapes that an arm learns from: one of five is a key-frame. *Shape:* ``(N, V, 3)``."""
-    generator, keyframes = torch.Generator().manual_seed(seed), space.keyframes()
+    generator, keyframes = torch.Generator().manual_seed(seed), space.keyframes().float()
     transform = tm.RandomInBetween(p=1.0, space=space, generator=generator)
     i, j = torch.stack([torch.randperm(len(keyframes), generator=generator)[:2] for _ in range(N_MORE)]).T
     if arm == "none":

@@ -58,7 +58,7 @@ class RandomInBetween(ShapeAugmentation):
         t = params["t"]
         nearer = (t.detach() > 0.5).cpu()
         return batch._replace(
-            shapes=space.in_betweens(batch.shapes, partners.shapes, t, batch.nearest, partners.nearest),
+            shapes=self.shapes(batch, partners, t, space),
             nearest=torch.where(nearer, partners.nearest, batch.nearest),
             vertex_labels=self._labels(batch.vertex_labels, partners.vertex_labels, t),
             shape_labels=self._labels(batch.shape_labels, partners.shape_labels, t),
@@ -73,6 +73,11 @@ class RandomInBetween(ShapeAugmentation):
         if not labels.is_floating_point():
             raise ValueError(f"blended labels must be floating-point, one-hot for classes; got {labels.dtype}")
         return torch.lerp(labels, others, t.clamp(0, 1).to(labels.dtype))
+
+    def shapes(self, batch: ShapeBatch, partners: ShapeBatch, t: Tensor, space: Any) -> Tensor:
+        """The shapes at the times ``t``, for a subclass to replace. *Shape:* ``(B,) -> (B, V, 3)``."""
+        found: Tensor = space.in_betweens(batch.shapes, partners.shapes, t, batch.nearest, partners.nearest)
+        return found
 
 
 class RandomBlend(ShapeAugmentation):
