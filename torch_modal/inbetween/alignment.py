@@ -1,5 +1,6 @@
 """Between the caller's coordinates and the frame of a layer: key-frames centred, scaled and turned on to each other."""
 
+import threading
 import warnings
 from typing import NamedTuple
 
@@ -18,6 +19,8 @@ SMALLEST_SIZE = 1e-6
 
 # A key-frame that is larger or smaller than the reference by this factor is in other units, or another body.
 OTHER_SIZE = 3.0
+
+_WARNING = threading.Lock()
 
 
 class Pose(NamedTuple):
@@ -151,7 +154,10 @@ class KeyframeAlignment(nn.Module):
         other = (ratios > SMALLEST_SIZE) & ratios.isfinite() & ((ratios > OTHER_SIZE) | (ratios < 1 / OTHER_SIZE))
         if not bool(other.any()):
             return
-        self.size_warned = True
+        with _WARNING:  # chunks of a batch come here in threads
+            told, self.size_warned = self.size_warned, True
+        if told:
+            return
         warnings.warn(
             f"key-frames are {float(ratios[other][0]):.3g} times as large as the shapes that the bases were made from; "
             "Eq. 5 depends on the size, so that the in-betweens differ from in-betweens of bases in the same units: "
