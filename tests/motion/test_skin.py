@@ -160,7 +160,7 @@ def test_fewest_bones_of_a_tolerance() -> None:
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_dtype_gradients_and_determinism(dtype: torch.dtype) -> None:
-    given = BENT.to(dtype).requires_grad_()
+    given = BENT.to(dtype, copy=True).requires_grad_()
     skin, again = tm.bake(given, FACES, 4), tm.bake(given.detach().numpy(), FACES, 4)
     for one, other in zip(*((x.weights, x.transforms, x.shapes()) for x in (skin, again)), strict=True):
         assert one.dtype == dtype and not one.requires_grad and torch.equal(one, other)
