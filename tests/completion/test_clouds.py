@@ -30,12 +30,10 @@ def animal() -> Body:
 
 def cloud(x: Tensor, faces: Tensor, camera: Camera | None = None, n: int = 1500, **given: Any) -> tm.Observation:
     """Points of a surface, all or what a camera sees, with normals."""
-    surface = SampledSurface(x.numpy(), faces.numpy())
     scale = 100 / np.ptp(x.numpy(), axis=0).max()  # cells and depths of the visible are those of this size
-    whole = SampledSurface(scale * x.numpy(), faces.numpy())
-    some = np.arange(len(surface.samples)) if camera is None else whole.visible(camera)
-    areas = np.linalg.norm(np.cross(*np.diff(x.numpy()[faces.numpy()], axis=1).transpose(1, 0, 2)), axis=1)
-    weights = areas[surface.sample_faces[some]]
+    surface = SampledSurface(scale * x.numpy(), faces.numpy())
+    some = np.arange(len(surface.samples)) if camera is None else surface.visible(camera)
+    weights = surface.face_areas[surface.sample_faces[some]]
     some = np.random.default_rng(0).choice(some, n, p=weights / weights.sum())
     corners = x.numpy()[faces.numpy()][surface.sample_faces[some]]
     points = (np.random.default_rng(1).dirichlet([1, 1, 1], n)[..., None] * corners).sum(1)

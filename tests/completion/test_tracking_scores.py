@@ -2,12 +2,12 @@
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 import tracking
 import trimesh
 from test_completion import bending_tube
+from test_read import write_cloud
 
 import torch_modal as tm
 
@@ -21,11 +21,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for i, one in enumerate(x[:3].numpy()):
         mesh = trimesh.Trimesh(one, faces.numpy(), process=False)
         points, face = trimesh.sample.sample_surface(mesh, 1500, seed=i)
-        rows = np.hstack([points, mesh.face_normals[face]])
-        head = ["ply", "format ascii 1.0", f"element vertex {len(rows)}"]
-        head += [f"property float {name}" for name in ("x", "y", "z", "nx", "ny", "nz")]
-        lines = [*head, "end_header", *(" ".join(f"{v:.7g}" for v in row) for row in rows)]
-        (folder / f"tube{i:02d}.ply").write_text("\n".join(lines) + "\n")
+        write_cloud(folder / f"tube{i:02d}.ply", points, mesh.face_normals[face])
     return folder
 
 

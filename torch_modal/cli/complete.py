@@ -71,7 +71,6 @@ def run(args: argparse.Namespace) -> None:
     keyframes, faces = tm.load_keyframes(whole)
     given = {name: getattr(args, name) for name in ("view", "camera") if getattr(args, name)}
     cameras = {name: torch.tensor(numbers, dtype=torch.float64).view(-1, 3) for name, numbers in given.items()}
-    cameras = {name: rows[0] if len(rows) == 1 else rows for name, rows in cameras.items()}
     seen = tm.load_observations(args.observations, keyframes.shape[1], args.times, noise=args.noise, **cameras)
     args.report(f"{len(seen)} observations of {sum(len(one.points) for one in seen)} points")
     welded = tm.weld_seams(keyframes, faces)

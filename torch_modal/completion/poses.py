@@ -14,6 +14,7 @@ from torch import Tensor
 from torch_modal.completion.bending import ModalBending, ModalPose
 from torch_modal.completion.follow import follow
 from torch_modal.completion.frames import CompletionProblem
+from torch_modal.completion.pairs import SampledSurface
 from torch_modal.completion.search import AFTER_FIRST, FIRST, N_KEPT, N_SOFT, REST, PoseSearch
 from torch_modal.geometry.rigid import align, best_fit
 from torch_modal.geometry.triangle_frames import frames_of, mirror_sides
@@ -101,16 +102,18 @@ class FramePoses:
         It may be turned: then a quarter turn about its principal axes is a better start, by far, as symmetric bodies
         fit as well after some turns.
         """
-        base, turns = self._coarsen(template), torch.from_numpy(Rotation.create_group("O").as_matrix())
-        placed = [self.poses.place(base, frame) for frame in self.frames]
+        body, turns = self._surface(template), torch.from_numpy(Rotation.create_group("O").as_matrix())
+        placed = [self.poses.place(body, frame) for frame in self.frames]
         first = int(np.argmin([score for _, score in placed]))
         fit = self._search(first, [(template, placed[first][0])])
-        turned = sorted((self.poses.place(base, self.frames[first], turn) for turn in turns), key=lambda one: one[1])
+        turned = sorted((self.poses.place(body, self.frames[first], turn) for turn in turns), key=lambda one: one[1])
         distinct = [placed[first][0]]
         for pose, _ in turned:
             # The trace of a rotation by an angle is 1 + 2 cos.
             if all(float((pose.rotation * other.rotation).sum()) < 1 + 2 * DISTINCT for other in distinct):
                 distinct.append(pose)
+        if len(distinct) == 1:  # markers come from anywhere to the same pose
+            return {first: fit}
         other = self._search(first, [(template, pose) for pose in distinct[1 : 1 + N_TURNED]])
         return {first: other if other.score < CERTAIN * fit.score else fit}
 
@@ -134,7 +137,7 @@ class FramePoses:
 
     def _alike(self, i: int, shapes: Sequence[Tensor]) -> list[tuple[Tensor, ModalPose]]:
         """The shapes that explain most of a frame after a rigid motion: motions repeat."""
-        placed = [(x, *self.poses.place(self._coarsen(x), self.frames[i])) for x in shapes]
+        placed = [(x, *self.poses.place(self._surface(x), self.frames[i])) for x in shapes]
         return [(x, pose) for x, pose, _ in sorted(placed, key=lambda one: one[2])[:N_ALIKE]]
 
     def _starts(self, t: float, known: list[tuple[float, Tensor]]) -> list[tuple[Tensor, ModalPose]]:
@@ -189,6 +192,9 @@ class FramePoses:
 
     def _coarsen(self, x: Tensor) -> Tensor:
         return torch.from_numpy(self.coarse.restrict(x.numpy()))
+
+    def _surface(self, x: Tensor) -> SampledSurface:
+        return SampledSurface(self.coarse.restrict(x.numpy()), self.poses.mesh)
 
 
 def times_between(problem: CompletionProblem, shapes: list[Tensor]) -> list[float]:

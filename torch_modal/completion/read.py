@@ -36,9 +36,8 @@ def load_observations(
         raise ValueError(f"{what}: give one for each cloud or mesh, in their order; CSV files hold their own times")
     places = {name: options.pop(name) for name in ("view", "camera") if options.get(name) is not None}
     for name, rows in places.items():
-        if rows.dim() == 1:
-            places[name] = rows.expand(len(clouds), -1)
-        elif len(rows) != len(clouds):
+        places[name] = rows.expand(len(clouds), 3) if rows.numel() == 3 else rows
+        if len(places[name]) != len(clouds):
             raise ValueError(f"{name} has {len(rows)} rows for {len(clouds)} clouds: give one, or one for each")
     for file in files:
         if file in clouds:

@@ -40,8 +40,6 @@ ISOLATED = 15.0
 N_TRIED, N_TIPS, MOST_AWAY, WEIGHT, ROUNDS, GAIN = 3, 12, 40.0, 3.0, 3, 1e-3
 # Smallest and largest length of a limb that is tried.
 LIMBS = 8.0, 30.0
-
-
 UNTURNED = torch.eye(3, dtype=torch.float64)
 
 
@@ -71,29 +69,29 @@ class PoseSearch:
         total = PRIOR * float(self.stiffness[:-6] @ pose.amplitudes**2)
         return total + frame.score(self.surface(base, pose))
 
-    def place(self, base: Tensor, frame: Frame, turn: Tensor = UNTURNED) -> tuple[ModalPose, float]:
+    def place(self, body: SampledSurface, frame: Frame, turn: Tensor = UNTURNED) -> tuple[ModalPose, float]:
         """The best of rigid poses from a turn about the centroid of what was seen on, with and without stray clusters.
 
         And its score. *Shape of a turn:* ``(3, 3)``.
         """
+        base = torch.from_numpy(body.vertices)
         main, starts = frame._replace(seen=[one.main_part(ISOLATED) for one in frame.seen]), []
         parted = sum(len(one.points) for one in main.seen) < sum(len(one.points) for one in frame.seen)
-        surface = SampledSurface(base.numpy(), self.mesh)
         for every in (main, frame)[: 1 + parted]:
             centre = np.median(np.concatenate([seen.points for seen in every.seen]), 0)
             move = torch.from_numpy(centre) - turn @ base.median(0).values
-            starts.append(self._move(surface, self.bending.still()._replace(rotation=turn, move=move), every))
-        pose = min(starts, key=lambda pose: main.seen_from(pose).score(surface))
-        return pose, frame.seen_from(pose).score(surface)
+            starts.append(self._move(body, self.bending.still()._replace(rotation=turn, move=move), every))
+        pose = min(starts, key=lambda pose: main.seen_from(pose).score(body))
+        return pose, frame.seen_from(pose).score(body)
 
-    def _move(self, surface: SampledSurface, pose: ModalPose, frame: Frame) -> ModalPose:
+    def _move(self, body: SampledSurface, pose: ModalPose, frame: Frame) -> ModalPose:
         """The pose after rigid steps from far to near: the body stays, and what was seen moves towards it."""
-        base = torch.from_numpy(surface.vertices)
+        base = torch.from_numpy(body.vertices)
         centre = base.mean(0)
         fields = infinitesimal_motions(base - centre).movedim(0, -1)
         frame = frame._replace(seen=[one.thin(N_RIGID) for one in frame.seen], soft=1.0)
         for far in np.geomspace(2 * FAR, FAR, STEPS):
-            rows = self._rows(surface, fields, frame.seen_from(pose).seen, float(far), None)
+            rows = self._rows(body, fields, frame.seen_from(pose).seen, float(far), None)
             step = pose.rotation @ self._step(rows, fields, pose, 1.0).view(2, 3, 1)
             pose = self.bending.step(pose, step.flatten(), pose.rotation @ centre + pose.move)
         return pose
