@@ -93,7 +93,7 @@ def _names_of_kernels() -> dict[str, Any]:
     names = {name: getattr(wp, name) for name in ("dot", "cross", "sqrt", "sin", "cos", "atan2", "where")}
     names |= {name: getattr(own, name) for name in ("real", "vanishes", "underflows", "root", "inverse")}
     names |= {"maximum": wp.max, "minimum": wp.min, "absolute": wp.abs, "rows": wp.matrix_from_rows}
-    kinds = {"Scalar": own.real, "Flag": bool, "Vector": own.vec3}
+    kinds = {"Scalar": own.real, "Flag": bool, "Vector": own.vec3, "Any": Any}
     kinds |= {name.title(): kind for name, kind in made.items()}
     return {**names, **made, **kinds, "above_rounding": own.above_rounding}
 

@@ -6,6 +6,8 @@ Elements are given by the vectors ``x`` from their first vertex to the others; a
 
 from __future__ import annotations
 
+from typing import Any
+
 from torch_modal.elastic.bind import (
     Five,
     Flag,
@@ -57,13 +59,8 @@ LARGEST_WEIGHT = 8.0
 ZERO, ONE, TWO, HALF, THIRD, SIXTH = 0.0, 1.0, 2.0, 1 / 2, 1 / 3, 1 / 6
 
 
-def unit_weight(x: Vectors, measure: Scalar, mean: Scalar) -> Scalar:
-    """One, for terms without weights."""
-    return real(1.0)
-
-
-def unit_weight_of_angle(x: Vectors, measure: Pair, mean: Scalar) -> Scalar:
-    """:func:`unit_weight` of an angle, which kernels have as cosine and sine."""
+def unit_weight(x: Vectors, measure: Any, mean: Scalar) -> Scalar:
+    """One, for terms without weights, whose measure is a number or an angle."""
     return real(1.0)
 
 

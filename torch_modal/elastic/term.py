@@ -218,9 +218,8 @@ class Term(nn.Module):
             return None
         name = f"{type(self).__module__}.{type(self).__qualname__}"
         merged = ("weights", "at_rest", "merge_rests", "softening")
-        weight = None
-        if all(getattr(type(self), each) is getattr(kind, each) for each in merged):
-            weight = formulas.unit_weight_of_angle if periodic else formulas.unit_weight
+        plain = all(getattr(type(self), each) is getattr(kind, each) for each in merged)
+        weight = formulas.unit_weight if plain else None
         return Formulas(name, n, self.formula, self.linearised, weight, periodic=periodic)
 
     def softening(self, start: Tensor, rest: Tensor, weights: Tensor | None) -> Tensor | None:
