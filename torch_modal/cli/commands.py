@@ -6,13 +6,13 @@ from pathlib import Path
 
 from torch_modal.cli import arguments, subdivide
 from torch_modal.cli.arguments import check_output, pick_options
-from torch_modal.io.files import write_files
+from torch_modal.io.files import csv_bytes, write_files
 from torch_modal.io.formats import MESH_FORMATS
 from torch_modal.io.write import check_suffix
 
 DEMO_SAMPLES = ("creature", "hand")
 INCOMPLETE = 3  # exit status of `precompute` when some sets have no bases, of `register` when some are doubtful
-TABLE = "target,confidence,to target (%),from target (%),stretch,warnings"
+TABLE = ["target", "confidence", "to target (%)", "from target (%)", "stretch", "warnings"]
 
 
 def add_register(sub: argparse.ArgumentParser) -> None:
@@ -70,7 +70,7 @@ def register(args: argparse.Namespace) -> int:
     from torch_modal.registration.load import ADVICE
 
     template, *assets = map(tm.open_asset, [first, *targets])
-    options, lines, doubtful = pick_options(args, *arguments.REGISTRATION), [TABLE], 0
+    options, rows, doubtful = pick_options(args, *arguments.REGISTRATION), [TABLE], 0
     if marks := options.pop("landmarks"):
         marks = landmark_vertices(marks, [each.positions for each in (template, *assets)])
     for i, (path, target, out) in enumerate(zip(targets, assets, files, strict=True), 1):
@@ -78,8 +78,8 @@ def register(args: argparse.Namespace) -> int:
         result = tm.register(template.positions, template.faces, target.positions, target.faces, **pair, **options)
         args.report(f"{path.name}: {result.summary()}" if several else result.summary())
         if several:
-            distances = f"{result.to_target.mean:.3f},{result.from_target.mean:.3f},{result.stretch:.4f}"
-            lines.append(f'{path.name},{result.confidence:.3f},{distances},"{"; ".join(result.warnings)}"')
+            distances = f"{result.to_target.mean:.3f}", f"{result.from_target.mean:.3f}", f"{result.stretch:.4f}"
+            rows.append([path.name, f"{result.confidence:.3f}", *distances, "; ".join(result.warnings)])
         if result.doubtful:
             doubtful += 1
             why = f"the result is doubtful: {'; '.join(result.warnings)}"
@@ -91,7 +91,7 @@ def register(args: argparse.Namespace) -> int:
         tm.save_mesh(result.positions, template.faces, out, overwrite=args.overwrite, asset=template)
         args.report(f"written: {out}")
     if several:
-        write_files([(table, ("\n".join(lines) + "\n").encode("utf-8"))])
+        write_files([(table, csv_bytes(rows))])
         args.report(f"report:  {table}, {doubtful} of {len(targets)} doubtful")
     return INCOMPLETE if several and doubtful else 0
 
@@ -121,7 +121,6 @@ def carry(args: argparse.Namespace) -> None:
     import torch
 
     import torch_modal as tm
-    from torch_modal.io.files import write_files
     from torch_modal.io.points import PointFile
 
     cloud = PointFile(args.points)

@@ -1,7 +1,5 @@
 """Strains of faces of a motion; strains that vibration modes cause, and scales of modes that give a strain of one."""
 
-import csv
-import io
 from collections.abc import Sequence
 
 import torch
@@ -14,6 +12,7 @@ from torch_modal.geometry.canonical import size
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.triangle_frames import FLAT, frames_of, principal_stretches
 from torch_modal.geometry.vectors import pick
+from torch_modal.io.files import csv_bytes
 from torch_modal.modes.basis import ModalBasis
 from torch_modal.modes.sheet import THICKNESS
 
@@ -48,16 +47,14 @@ def strain_table(names: Sequence[str], shapes: Tensor, faces: Tensor) -> bytes:
     """
     rest, volumes = frames_of(shapes[:1], faces), ShellEnergy(faces).measure(shapes).volume.tolist()
     flat = rest.slenderness[0] <= FLAT
-    stream = io.StringIO()
-    table = csv.writer(stream, lineterminator="\n")
-    table.writerow(["shape", "volume", "face", "area", "least strain", "largest strain"])
+    table: list[list[object]] = [["shape", "volume", "face", "area", "least strain", "largest strain"]]
     for name, volume, shape in zip(names, volumes, shapes, strict=True):
         now = frames_of(shape[None], faces)
         strains = [(value[0] - 1).masked_fill(flat, torch.nan).tolist() for value in principal_stretches(rest, now)]
         for face, (area, *both) in enumerate(zip((0.5 * now.twice_areas[0]).tolist(), *strains, strict=True)):
             shown = ["" if value != value else f"{value:.6f}" for value in both]
-            table.writerow([name, f"{volume:.8g}", face, f"{area:.6g}", *shown])
-    return stream.getvalue().encode("utf-8")
+            table.append([name, f"{volume:.8g}", face, f"{area:.6g}", *shown])
+    return csv_bytes(table)
 
 
 def edge_strains(displacement: Tensor, x: Tensor, edges: Tensor) -> Tensor:

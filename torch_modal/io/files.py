@@ -1,10 +1,12 @@
 """Atomic writes, after which a file is whole or absent, and reads of the files that a mesh file names."""
 
 import contextlib
+import csv
+import io
 import os
 import uuid
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 from torch_modal.errors import MeshWarning
@@ -59,6 +61,13 @@ def try_companion(document: Path, name: str, what: str, most: int = LARGEST_COMP
     except ValueError as error:
         warnings.warn(f"{document.name} is without {what}: {error}", MeshWarning, stacklevel=6)
     return None
+
+
+def csv_bytes(rows: Iterable[Sequence[object]]) -> bytes:
+    """A table as a CSV file, of which the first row names the columns."""
+    stream = io.StringIO()
+    csv.writer(stream, lineterminator="\n").writerows(rows)
+    return stream.getvalue().encode("utf-8")
 
 
 def write_files(files: Iterable[tuple[Path, bytes]]) -> None:
