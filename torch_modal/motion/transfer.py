@@ -7,12 +7,12 @@ cotangent weights of the target.
 
 import math
 import warnings
-from itertools import permutations, product
 from typing import Any
 
 import numpy as np
 import torch
 from scipy import sparse
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from torch_modal.arrays import Array, BoolArray, FloatArray
@@ -178,9 +178,7 @@ def _places(registration: Registration | Tensor, n: int, keep_doubtful: bool) ->
 def _axes(places: Tensor, target: Tensor, weights: Tensor) -> Tensor:
     """Rotation from the source's axes to the target's; between coordinate axes if nearly so. *Shape:* ``(3, 3)``."""
     turn = best_fit(places, target, weights).rotation
-    signed = [(order, signs) for order in permutations(range(3)) for signs in product((1.0, -1.0), repeat=3)]
-    between = torch.stack([torch.diag(torch.tensor(signs))[list(order)] for order, signs in signed]).to(turn)
-    between = between[torch.linalg.det(between) > 0]
+    between = torch.from_numpy(Rotation.create_group("O").as_matrix().round()).to(turn)
     traces = (between * turn).sum((1, 2))
     return between[traces.argmax()] if float(traces.max()) > 1 + 2 * _AXES else turn
 
