@@ -110,6 +110,9 @@ def test_usd_read_back(tmp_path, suffix):
 
     asset = tm.open_asset(textured_obj(tmp_path, "bar.obj"))
     frames = np.stack([bend(asset.positions, turn) for turn in (0.01, 0.5, 0.9)])
+    others = [tmp_path / f"a-{i}.png" for i in range(3)]
+    for other in others:
+        other.write_bytes(b"of another file")
     with pytest.warns(MeshWarning, match="without the groups"):
         path = tm.save_animation(frames, asset.faces, tmp_path / f"a.{suffix}", duration=3, fps=24, asset=asset)
     stage = usd.Stage.Open(str(path))
@@ -136,6 +139,7 @@ def test_usd_read_back(tmp_path, suffix):
         if source := surface.GetInput("diffuseColor").GetConnectedSources()[0]:
             textures.append(UsdShade.Shader(source[0].source.GetPrim()).GetInput("file").Get().path)
     assert textures and all((tmp_path / name).read_bytes().startswith(b"\x89PNG") for name in textures)
+    assert all(other.read_bytes() == b"of another file" for other in others)
     assert [p.name for p in tmp_path.iterdir() if p.name.startswith(".")] == []
 
 

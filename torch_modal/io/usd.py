@@ -1,6 +1,7 @@
 """A sequence as USD: one mesh whose points and normals change over time, with materials."""
 
 import errno
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -102,7 +103,8 @@ def _write_materials(stage: Any, mesh: Any, asset: Asset, sizes: IntArray, corne
             surface.CreateInput(name, Sdf.ValueTypeNames.Float).Set(float(value))
         if material.texture is not None and texcoords is not None:
             kind = "png" if material.texture.startswith(b"\x89PNG") else "jpg"
-            picture = path.with_name(f"{path.stem}-{i}.{kind}")
+            # Named by its content: nothing else of the folder is replaced.
+            picture = path.with_name(f"{path.stem}-{sha256(material.texture).hexdigest()[:8]}.{kind}")
             write_files([(picture, material.texture)])
             reader = UsdShade.Shader.Define(stage, made.GetPath().AppendChild("coordinates"))
             reader.CreateIdAttr("UsdPrimvarReader_float2")
