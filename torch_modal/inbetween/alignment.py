@@ -155,8 +155,9 @@ class KeyframeAlignment(nn.Module):
         if not bool(other.any()):
             return
         with _WARNING:  # chunks of a batch come here in threads
-            told, self.size_warned = self.size_warned, True
-        if told:
+            warned = self.size_warned
+            self.size_warned = True
+        if warned:
             return
         warnings.warn(
             f"key-frames are {float(ratios[other][0]):.3g} times as large as the shapes that the bases were made from; "
