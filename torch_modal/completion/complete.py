@@ -158,7 +158,7 @@ def _complete(
     problem = CompletionProblem(shapes, torch.from_numpy(indices), exact, observations)
     shape_at, solve = dict(zip(exact.tolist(), problem.whole, strict=False)), None
     if problem.frames:
-        with ProgressReport(len(problem.frames) * (4 + ROUNDS), "completing", progress) as report:
+        with ProgressReport(len(problem.frames) * (3 + ROUNDS), "completing", progress) as report:
             poses = FramePoses(problem).search(report)
             if estimate_times:
                 when = times_between(problem, poses)

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from hashlib import sha256
 from typing import NamedTuple
 
 import numpy as np
@@ -34,10 +35,32 @@ N_TURNED, DISTINCT, CERTAIN = 3, 0.8, 0.7
 """Turned poses of the template that a search starts from; the largest cosine of the angle between two; score over that
 of the template as it is below which it is turned.
 """
-N_FOLLOWED, FOLLOWED = 8, (6.0, 1.5)
-"""As-rigid-as-possible steps after a search, and the largest distance of a pair in the first and in the last."""
-TRUSTED, N_ALIKE = 0.34, 2
-"""Part of the frames, those that explain most, from which the others are searched again; starts from their shapes."""
+N_COMPARED, N_FOLLOWED, FOLLOWED = 2, 8, (6.0, 1.5)
+"""Poses of a search that are compared after as-rigid-as-possible steps, these, and the largest distance of a pair in
+the first and in the last.
+"""
+TRUSTED, SETTLED, EXPLAINED = 0.34, 1.2, 0.2
+"""Part of the frames, those that explain most, that are settled; score over the least one below which others are, too;
+and score of a cloud below which turns of the template are not tried.
+"""
+N_OUTWARD, N_BETWEEN, N_ALIKE = 2, 3, 2
+"""Rounds in which frames that are not settled are searched again, outward from settled ones, then between their
+neighbours; starts of the former from shapes of any time.
+"""
+N_COMPARED, N_FOLLOWED, FOLLOWED = 2, 8, (6.0, 1.5)
+"""Poses of a search that are compared after as-rigid-as-possible steps, these, and the largest distance of a pair in
+the first and in the last.
+"""
+TRUSTED, SETTLED, EXPLAINED = 0.34, 1.2, 0.2
+"""Part of the frames, those that explain most, that are settled; score over the least one below which others are, too;
+and score of a cloud below which turns of the template are not tried.
+"""
+N_OUTWARD, N_BETWEEN, N_ALIKE = 2, 3, 2
+"""Rounds in which frames that are not settled are searched again, outward from settled ones, then between their
+neighbours; starts of the former from shapes of any time.
+"""
+STAGES = 2 + N_OUTWARD + N_BETWEEN
+"""Visits to each frame, for a progress bar."""
 TIME_ROUNDS, LATEST, UNCHANGED = 6, 0.5, 10.0
 """Rounds in which times are estimated; the largest change, in parts of the gap between neighbours, and its weight."""
 
@@ -71,30 +94,40 @@ class FramePoses:
         select = sparse.identity(self.coarse.n_vertices, format="csr")[np.maximum(self.coarse.clusters, 0)]
         #: With known places on the coarse mesh.
         self.frames = [one._replace(seen=[each.restrict(select) for each in one.seen]) for one in problem.frames]
+        #: Frames, and the shapes from which they were searched.
+        self.searched = set[tuple[int, bytes]]()
 
     def search(self, report: ProgressReport) -> list[Tensor]:
         """Shapes of all frames. *Shape of each:* ``(V, 3)``."""
-        frames, fits, template = self.frames, dict[int, ModalFit](), self.problem.template
-        if not self.whole:
-            fits = self._first(template)
+        fits, alone = dict[int, ModalFit](), not self.whole
+        if alone:
+            report.expect((N_OUTWARD + N_BETWEEN - 1) * len(self.frames))
+            fits = self._first(self.problem.template)
             report.update()
         self._outward(fits, {}, report)
-        if not self.whole:
-            before, bound = fits, float(np.quantile([one.score for one in fits.values()], TRUSTED))
-            fits = {i: one for i, one in before.items() if one.score <= bound}
+        for _ in range(N_OUTWARD if alone else 0):
+            before, fits = fits, self._settled(fits)
             report.update(len(fits))
             self._outward(fits, before, report)
-        for i in sorted(fits, key=lambda i: -fits[i].score):
-            if known := self._knots({j: one for j, one in fits.items() if j != i}):
-                again = self._search(i, self._starts(frames[i].time, known))
-                fits[i] = min(fits[i], again, key=lambda one: one.score)
-            report.update()
+        for _ in range(N_BETWEEN if alone else 1):
+            settled = self._settled(fits) if alone else {}
+            for i in sorted(fits, key=lambda i: -fits[i].score):
+                known = self._knots({j: one for j, one in fits.items() if j != i})
+                if known and i not in settled:
+                    fits[i] = self._again(i, self._starts(self.frames[i].time, known), fits[i])
+                report.update()
         shapes = []
-        for i, frame in enumerate(frames):
+        for i, frame in enumerate(self.frames):
             pose = self.poses.stiffen(self._coarsen(fits[i].base), fits[i].pose, frame)
             shapes.append(self.bending.shape(fits[i].base, pose))
             report.update()
         return shapes
+
+    def _settled(self, fits: dict[int, ModalFit]) -> dict[int, ModalFit]:
+        """The fits that explain about as much as the best one, or the best third of all."""
+        scores = {i: one.score / len(self.frames[i].seen) for i, one in fits.items()}
+        bound = max(float(np.quantile(list(scores.values()), TRUSTED)), SETTLED * min(scores.values()))
+        return {i: one for i, one in fits.items() if scores[i] <= bound}
 
     def _first(self, template: Tensor) -> dict[int, ModalFit]:
         """The frame that the template fits best after a rigid motion.
@@ -106,6 +139,8 @@ class FramePoses:
         placed = [self.poses.place(body, frame) for frame in self.frames]
         first = int(np.argmin([score for _, score in placed]))
         fit = self._search(first, [(template, placed[first][0])])
+        if fit.score < EXPLAINED * len(self.frames[first].seen):
+            return {first: fit}
         turned = sorted((self.poses.place(body, self.frames[first], turn) for turn in turns), key=lambda one: one[1])
         distinct = [placed[first][0]]
         for pose, _ in turned:
@@ -125,10 +160,16 @@ class FramePoses:
             starts = self._starts(self.frames[i].time, known)
             if before:
                 starts += self._alike(i, [x for _, x in known])
-            fits[i] = self._search(i, starts)
-            if i in before:
-                fits[i] = min(fits[i], before[i], key=lambda one: one.score)
+            fits[i] = self._again(i, starts, before.get(i))
             report.update()
+
+    def _again(self, i: int, starts: Sequence[tuple[Tensor, ModalPose]], before: ModalFit | None) -> ModalFit:
+        """The fit before, or a better one from the starts that no search of the frame had."""
+        keys = [(i, sha256(base.numpy().tobytes()).digest()) for base, _ in starts]
+        new = [start for key, start in zip(keys, starts, strict=True) if key not in self.searched]
+        self.searched.update(keys)
+        found = [self._search(i, new)] if new else []
+        return min([*([before] if before else []), *found], key=lambda one: one.score)
 
     def _knots(self, fits: dict[int, ModalFit]) -> list[tuple[float, Tensor]]:
         """Times and shapes of frames, and of whole ones, in the order of time."""
@@ -183,12 +224,20 @@ class FramePoses:
             coarse = self._coarsen(base)
             pose = poses.descend(coarse, pose, way, part=REST)
             fits.append((base, pose, poses.score(coarse, pose, frame)))
-        base, pose, score = min(fits, key=lambda one: one[2])
-        pose, score = poses.move_limbs(self._coarsen(base), pose, frame, score)
-        x = self.bending.shape(base, pose)
-        if alone:  # what modes cannot express would add up from frame to frame
-            x = follow(self.problem.frames[i], x, self.problem.mesh, N_FOLLOWED, FOLLOWED)
-        return ModalFit(x, base, pose, score)
+        fits.sort(key=lambda one: one[2])
+        base, pose, score = fits[0]
+        fits[0] = base, *poses.move_limbs(self._coarsen(base), pose, frame, score)
+        if alone:
+            return min((self._follow(i, *one) for one in fits[:N_COMPARED]), key=lambda one: one.score)
+        base, pose, score = fits[0]
+        return ModalFit(self.bending.shape(base, pose), base, pose, score)
+
+    def _follow(self, i: int, base: Tensor, pose: ModalPose, score: float) -> ModalFit:
+        """A fit whose shape follows the clouds: what modes cannot express would add up from frame to frame."""
+        frame, x = self.frames[i], self.bending.shape(base, pose)
+        followed = follow(self.problem.frames[i], x, self.problem.mesh, N_FOLLOWED, FOLLOWED)
+        score += frame.score(self._surface(followed)) - frame.score(self._surface(x))
+        return ModalFit(followed, base, pose, score)
 
     def _coarsen(self, x: Tensor) -> Tensor:
         return torch.from_numpy(self.coarse.restrict(x.numpy()))
