@@ -6,7 +6,7 @@ the mesh, and the anchors of the terms.
 
 from collections.abc import Sequence
 from functools import cached_property, reduce
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -161,7 +161,7 @@ class Energy(nn.Module):
             no centre.
     """
 
-    parts: Any
+    parts: Sequence[AssembledTerm]
     used: Tensor
     vertices: Tensor
 
@@ -193,7 +193,7 @@ class Energy(nn.Module):
             anchors = torch.arange(self.n_extended, self.n_extended + more)
             parts.append(AssembledTerm(term, torch.cat([numbers, anchors])[corners]))
             self.n_extended += more
-        self.parts = nn.ModuleList(parts)
+        self.parts = nn.ModuleList(parts)  # type: ignore[assignment]
         self.sampled = sampled
         self.register_buffer("vertices", vertices, persistent=False)
         used = torch.arange(self.n_vertices) if sampled else torch.tensor(mesh.connectivity.used)
@@ -269,7 +269,7 @@ class Energy(nn.Module):
     # --------------------------------------------------------------------------------------------------------- values
     def value(self, extended: Tensor, reference: Reference) -> Tensor:
         """The energy of shapes. *Shape:* ``(3, ..., V) -> (...)``."""
-        total: Any = reference.constant
+        total = reference.constant
         for summand, record in zip(self.parts, reference.records, strict=True):
             total = total + summand.term.energies(summand.measures(summand.edge_vectors(extended)), record).sum(-1)
         return total

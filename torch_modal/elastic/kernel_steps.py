@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -17,12 +16,15 @@ from torch_modal.elastic.kernels.launch import kernels, launch
 from torch_modal.elastic.steps import (
     FineEnergy,
     FreeEnergy,
+    Step,
     SumOfEnergies,
     TermsTowards,
     descend,
     step_length,
 )
 from torch_modal.elastic.term import Mesh, Term
+
+KernelStep = Step[KernelPoint]
 
 
 class KernelFineEnergy(FineEnergy):
@@ -122,18 +124,20 @@ class KernelProblem:
 
 
 @dataclass(frozen=True, eq=False)
-class _Relaxation(Operation):
+class _Relaxation(Operation[KernelStep]):
     """Steps of all vertices from shapes, towards the records of a reference."""
 
     kernels: KernelEnergy
     products: Sequence[int]
 
-    def run(self, kept: list[Any] | None, x: Tensor, *records: Tensor) -> tuple[Tensor, ...]:
+    def run(self, kept: list[KernelStep] | None, x: Tensor, *records: Tensor) -> tuple[Tensor, ...]:
         problem = KernelProblem(self.kernels, Reference.of_records(records))
         with torch.no_grad():
             return (descend(problem, x, self.products, kept),)
 
-    def back(self, kept: list[Any], grads: Sequence[Tensor], x: Tensor, *records: Tensor) -> tuple[Tensor | None, ...]:
+    def back(
+        self, kept: list[KernelStep], grads: Sequence[Tensor], x: Tensor, *records: Tensor
+    ) -> tuple[Tensor | None, ...]:
         if not kept:
             self.run(kept, x, *records)
         to_x, to, to_records = grads[0], Reference.of_records(records), [torch.zeros_like(record) for record in records]
@@ -145,7 +149,7 @@ class _Relaxation(Operation):
         terms = TermsTowards(self.kernels.energy, Reference.of_records(records).transpose())
         return (descend(SumOfEnergies([terms]), x, self.products),)
 
-    def _step_back(self, step: Any, to: Reference, to_reached: Tensor, to_records: Sequence[Tensor]) -> Tensor:
+    def _step_back(self, step: KernelStep, to: Reference, to_reached: Tensor, to_records: Sequence[Tensor]) -> Tensor:
         """Gradient at the start of a step from the gradient at its end; gradients of the records are added.
 
         Args:
@@ -155,7 +159,7 @@ class _Relaxation(Operation):
             to_reached: Gradient at the end. *Shape:* ``(B, V, 3)``.
             to_records: Are added to.
         """
-        x, at, solution, length, fields, scalars, inverse = step
+        x, at, solution, length, (fields, scalars, inverse) = step
         to_x, to_solution, to_energy, to_slope = to_reached.clone(), to_reached, None, None
         if bool((length < 1).any()):
             to_solution, to_energy, to_slope = self._length_back(x, at, solution, to, to_x, to_records)
@@ -174,9 +178,9 @@ class _Relaxation(Operation):
             launch(module.advance, (b, n), moved, to_moved)
             first, out = ((kind * n_products + k) * b * n for kind in (1, 2))
             for one, factors, to_own in zip(self.kernels.passes, at.factors, to_factors, strict=True):
-                values = n, fields, first, *factors, fields, out, scalars, k * b
+                multiplied = n, fields, first, *factors, fields, out, scalars, k * b
                 adjoints = None, to_fields, None, *to_own, to_fields, None, to_scalars
-                one.launch("product", b, *values, adjoints=adjoints)
+                one.launch("product", b, *multiplied, adjoints=adjoints)
         to_gradient = torch.zeros_like(x) if to_slope is None else to_slope[:, None, None] * solution
         to_diagonal = torch.zeros_like(at.diagonal)
         begun = at.gradient, at.normal, at.diagonal, b, n_products, n, inverse, fields, scalars

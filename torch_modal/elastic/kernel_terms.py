@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
@@ -10,9 +10,12 @@ from torch import Tensor, nn
 from torch_modal.autograd import is_eager
 from torch_modal.elastic.energy import AssembledTerm, Energy
 from torch_modal.elastic.kernels.launch import kernels, launch, of_elements
-from torch_modal.elastic.term import Mesh
+from torch_modal.elastic.term import Formulas, Mesh, Term
 from torch_modal.elastic.volume import Volume
 from torch_modal.geometry.rigid import volumes_of
+
+if TYPE_CHECKING:
+    import warp as wp
 
 
 class KernelTerm(nn.Module):
@@ -24,8 +27,8 @@ class KernelTerm(nn.Module):
     """
 
     elements: Tensor
-    term: Any
-    bound: dict[Any, Any]
+    term: Term
+    bound: dict[tuple[str, bool], "wp.Kernel"]
     """Kernels by kind and name, from their first launch on."""
 
     def __init__(self, part: AssembledTerm, elements: Tensor | None = None) -> None:
@@ -36,16 +39,16 @@ class KernelTerm(nn.Module):
         self.register_buffer("elements", elements.int().contiguous(), persistent=False)
         self.n_elements = len(elements)
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> dict[str, object]:
         """Without formulas and kernels, which are no data."""
         return {name: value for name, value in self.__dict__.items() if name != "formulas"} | {"bound": {}}
 
     @cached_property
-    def formulas(self) -> Any:
+    def formulas(self) -> Formulas:
         """The formulas that kernels are made from."""
-        return self.term.kernel_formulas(self.n)
+        return self.term.kernel_formulas(self.n)  # type: ignore[return-value]  # :func:`by_kernels` has seen them
 
-    def launch(self, name: str, dim: int, *arguments: Any, adjoints: Sequence[Tensor | None] = ()) -> None:
+    def launch(self, name: str, dim: int, *arguments: object, adjoints: Sequence[object] = ()) -> None:
         """Run a kernel over the elements of so many samples, or its adjoint."""
         key = name, bool(adjoints)
         if key not in self.bound:
@@ -164,12 +167,16 @@ class Pass(nn.Module):
     own: Tensor | None
 
     def __init__(
-        self, term: tuple[int, KernelTerm], rider: tuple[Any, Any] = (None, None), own: Tensor | None = None
+        self,
+        term: tuple[int, KernelTerm],
+        rider: tuple[int, KernelTerm] | tuple[None, None] = (None, None),
+        own: Tensor | None = None,
     ) -> None:
         super().__init__()
         self.number, self.term = term
-        self.other, self.rider = rider
-        self.bound: dict[Any, Any] = {}
+        self.other: int | None = rider[0]
+        self.rider: KernelTerm | None = rider[1]
+        self.bound: dict[tuple[str, bool], wp.Kernel] = {}
         elements = self.term.elements
         if self.rider is not None and own is not None:
             # Where there is no element, all further vertices are the first.
@@ -182,7 +189,7 @@ class Pass(nn.Module):
         self.register_buffer("elements", elements, persistent=False)
         self.register_buffer("own", None if own is None else own.int(), persistent=False)
 
-    def launch(self, name: str, dim: int, *arguments: Any, adjoints: Sequence[Tensor | None] = ()) -> None:
+    def launch(self, name: str, dim: int, *arguments: object, adjoints: Sequence[object] = ()) -> None:
         """Run a kernel over the elements of so many samples, or its adjoint."""
         key = name, bool(adjoints)
         if key not in self.bound:
@@ -191,7 +198,7 @@ class Pass(nn.Module):
         arguments = self.elements, self.own, self.n_own, *arguments
         launch(self.bound[key], (dim, self.n_elements), arguments, adjoints and [None] * 3 + [*adjoints])
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> dict[str, object]:
         """Without kernels, which are no data."""
         return {**self.__dict__, "bound": {}}
 

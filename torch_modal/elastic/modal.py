@@ -5,7 +5,7 @@ columns of the space, which are the same for a whole batch.
 """
 
 from functools import reduce
-from typing import Any, NamedTuple
+from typing import NamedTuple, Protocol, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -14,6 +14,8 @@ from torch.func import vjp
 from torch_modal.elastic.energy import ENERGY_ROUNDING, Energy, Linearised, Reference
 from torch_modal.elastic.shell import ShellEnergy
 from torch_modal.elastic.term import Term
+
+Placed = TypeVar("Placed", contravariant=True)
 
 # The second-order term of a batch passes through an array of this many bytes at a time.
 MOST_BYTES = 2**26
@@ -49,6 +51,19 @@ class Derivatives(NamedTuple):
         stiffest = self.gauss_newton.diagonal(dim1=-2, dim2=-1).amax(-1).clamp_min(torch.finfo(self.value.dtype).tiny)
         of_positions = self.resolution * (self.value.clamp_min(0) / stiffest).sqrt()
         return ENERGY_ROUNDING * torch.finfo(self.value.dtype).eps * self.value.abs() + of_positions
+
+
+class AmplitudeEnergy(Protocol[Placed]):
+    """An energy in amplitudes that depends on a placement of each sample: nested tuples of tensors."""
+
+    def value(self, a: Tensor, placement: Placed) -> Tensor:
+        """*Shape:* ``(..., B, n) -> (..., B)``."""
+
+    def value_and_gradient(self, a: Tensor, placement: Placed) -> tuple[Tensor, Tensor]:
+        """*Shape:* ``(B, n) -> (B,), (B, n)``."""
+
+    def derivatives(self, a: Tensor, placement: Placed, second_order: bool = True) -> Derivatives:
+        """*Shape:* ``(B, n)``."""
 
 
 class Placement(NamedTuple):
@@ -135,7 +150,7 @@ class ModalEnergy(nn.Module):
         return Derivatives(placement.reference.constant + value, gradient, inner, beyond, resolution)
 
 
-def value_and_gradient(energy: Any, a: Tensor, placement: Any) -> tuple[Tensor, Tensor]:
+def value_and_gradient(energy: AmplitudeEnergy[Placed], a: Tensor, placement: Placed) -> tuple[Tensor, Tensor]:
     """Value of an energy and its gradient in the amplitudes. *Shape:* ``(B, n) -> (B,), (B, n)``."""
     value, back = vjp(lambda a: energy.value(a, placement), a)[:2]
     return value, back(torch.ones_like(value))[0]
