@@ -48,7 +48,7 @@ class JointSpace(nn.Module):
             sampled = terms[numbers[0]].sampled
             energy = Energy(fine.mesh if sampled else coarse.mesh, [terms[i] for i in numbers], sampled)
             parts.append(ModalEnergy(energy, self.basis[:, energy.vertices] if sampled else self.coarse_basis))
-        self.parts: Any = nn.ModuleList(parts)
+        self.parts: Sequence[ModalEnergy] = nn.ModuleList(parts)  # type: ignore[assignment]
         self.coarse, self.anchor = coarse, anchor
         self.__dict__["fine"] = fine  # not registered here: it belongs to the solver
 

@@ -1,6 +1,6 @@
 """The paired space of the paper (Eq. 4): one shape near each key-frame, pulled together."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -93,7 +93,9 @@ class PairedSpace(nn.Module):
         value, gradient = first.value + second.value + similarity, torch.cat([first.gradient, second.gradient], -1)
         similar = 2 * placement.mu[:, None, None] * self.gap_gram.to(a)
         gauss_newton = _block_diagonal(first.gauss_newton, second.gauss_newton) + similar
-        curved = _block_diagonal(first.second_order, second.second_order) if second_order else None
+        curved = None
+        if first.second_order is not None and second.second_order is not None:
+            curved = _block_diagonal(first.second_order, second.second_order)
         return Derivatives(value, gradient + slope, gauss_newton, curved, first.resolution + second.resolution)
 
     def value_and_gradient(self, a: Tensor, placement: PairedPlacement) -> tuple[Tensor, Tensor]:
@@ -107,7 +109,7 @@ class PairedSpace(nn.Module):
         return placement.mu * value, 2 * placement.mu[:, None] * (grown + placement.linear)
 
 
-def _block_diagonal(first: Any, second: Any) -> Tensor:
+def _block_diagonal(first: Tensor, second: Tensor) -> Tensor:
     """*Shape:* ``(B, m, m), (B, n, n) -> (B, m + n, m + n)``."""
     m, n = first.shape[-1], second.shape[-1]
     return torch.cat([nn.functional.pad(first, (0, n)), nn.functional.pad(second, (m, 0))], -2)
