@@ -59,16 +59,15 @@ class KernelEnergy(nn.Module):
         super().__init__()
         self.energy = energy
         self.parts: Any = nn.ModuleList(parts)
-        #: Numbers of the volume, and of the other terms.
+        #: The number of the volume, if there is one.
         self.volumes = [i for i, term in enumerate(parts) if isinstance(term, KernelVolume)]
-        self.terms = [i for i in range(len(parts)) if i not in self.volumes]
         #: Numbers of the terms whose rest shapes are merged by kernels, and by torch.
         self.weighed = [i for i, term in enumerate(parts) if term.formulas.weight is not None]
         self.unweighed = [i for i in range(len(parts)) if i not in self.weighed]
         #: The terms in passes over elements, each alone or with another that rides on it.
         self.passes: Sequence[Pass] = nn.ModuleList(passes_of(parts, energy.n_vertices))  # type: ignore[assignment]
         #: True if kernels know the adjoints of all terms.
-        self.exact = all(parts[i].formulas.exact for i in self.terms)
+        self.exact = all(part.formulas.exact for part in parts if not isinstance(part, KernelVolume))
 
     def reference(self, rests: RestShapes, start: Tensor | None = None, relative: bool = False) -> Reference:
         """Merge rest shapes into one reference (Eq. 8); arguments as :meth:`RestShapes.reference`."""
@@ -108,17 +107,6 @@ class KernelEnergy(nn.Module):
             normal = torch.zeros_like(x)
             moment = stiffness = torch.zeros_like(energy)
         return KernelPoint(energy, gradient, diagonal, factors, normal, moment, stiffness)  # type: ignore[arg-type]
-
-    def product(
-        self, factors: Factors, dim: tuple[int, int], fields: Tensor, start: int, out: Tensor, out_start: int,
-        scalars: Tensor | None = None, first: int = 0,
-    ) -> None:  # fmt: skip
-        """The convex Hessian but for the volume's part times fields of so many samples and vertices.
-
-        Fields, results and scalars begin at the given places of their arrays.
-        """
-        for one, pass_factors in zip(self.passes, factors, strict=True):
-            one.launch("product", *dim, fields, start, *pass_factors, out, out_start, scalars, first)
 
     def back(
         self,
@@ -187,11 +175,6 @@ class _MergeRests(Operation[Seen]):
     def n_differentiable(self) -> int:  # type: ignore[override]
         """Number of records."""
         return len(self.parts)
-
-    @property
-    def n_results(self) -> int:  # type: ignore[override]
-        """Records, and the constant."""
-        return len(self.parts) + 1
 
     def _arguments(self, i: int, seen: Seen, tensors: Sequence[Tensor]) -> list[Tensor | float | None]:
         """Arguments of the kernel before its results, or their gradients."""

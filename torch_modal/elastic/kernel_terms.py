@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
@@ -13,9 +12,6 @@ from torch_modal.elastic.kernels.launch import kernels, launch, of_elements
 from torch_modal.elastic.term import Formulas, Mesh, Term
 from torch_modal.elastic.volume import Volume
 from torch_modal.geometry.rigid import volumes_of
-
-if TYPE_CHECKING:
-    import warp as wp
 
 
 class KernelTerm(nn.Module):
@@ -28,20 +24,18 @@ class KernelTerm(nn.Module):
 
     elements: Tensor
     term: Term
-    bound: dict[tuple[str, bool], "wp.Kernel"]
-    """Kernels by kind and name, from their first launch on."""
 
     def __init__(self, part: AssembledTerm, elements: Tensor | None = None) -> None:
         super().__init__()
-        self.part, self.n, self.bound = part, len(part.corners) - 1, {}
+        self.part, self.n = part, len(part.corners) - 1
         self.__dict__["term"] = part.term  # not registered here: the layer owns it
         elements = part.corners.T if elements is None else elements
         self.register_buffer("elements", elements.int().contiguous(), persistent=False)
         self.n_elements = len(elements)
 
     def __getstate__(self) -> dict[str, object]:
-        """Without formulas and kernels, which are no data."""
-        return {name: value for name, value in self.__dict__.items() if name != "formulas"} | {"bound": {}}
+        """Without formulas, which are no data."""
+        return {name: value for name, value in self.__dict__.items() if name != "formulas"}
 
     @cached_property
     def formulas(self) -> Formulas:
@@ -50,10 +44,8 @@ class KernelTerm(nn.Module):
 
     def launch(self, name: str, dim: int, *arguments: object, adjoints: Sequence[object] = ()) -> None:
         """Run a kernel over the elements of so many samples, or its adjoint."""
-        key = name, bool(adjoints)
-        if key not in self.bound:
-            self.bound[key] = getattr(of_elements("backward" if adjoints else "forward", self.formulas), name)
-        launch(self.bound[key], (dim, self.n_elements), [self.elements, *arguments], adjoints and [None, *adjoints])
+        kernel = of_elements("merging", name, self.formulas)
+        launch(kernel, (dim, self.n_elements), [self.elements, *arguments], adjoints and [None, *adjoints])
 
     def shapes_to_merge(self, shapes: Tensor) -> tuple[Tensor, Tensor | None]:
         """The shapes that elements are merged of, and all measures together, where their mean counts.
@@ -167,16 +159,12 @@ class Pass(nn.Module):
     own: Tensor | None
 
     def __init__(
-        self,
-        term: tuple[int, KernelTerm],
-        rider: tuple[int, KernelTerm] | tuple[None, None] = (None, None),
-        own: Tensor | None = None,
+        self, term: tuple[int, KernelTerm], rider: tuple[int, KernelTerm] | None = None, own: Tensor | None = None
     ) -> None:
         super().__init__()
         self.number, self.term = term
-        self.other: int | None = rider[0]
-        self.rider: KernelTerm | None = rider[1]
-        self.bound: dict[tuple[str, bool], wp.Kernel] = {}
+        self.other = rider and rider[0]
+        self.rider = rider and rider[1]
         elements = self.term.elements
         if self.rider is not None and own is not None:
             # Where there is no element, all further vertices are the first.
@@ -191,16 +179,9 @@ class Pass(nn.Module):
 
     def launch(self, name: str, dim: int, *arguments: object, adjoints: Sequence[object] = ()) -> None:
         """Run a kernel over the elements of so many samples, or its adjoint."""
-        key = name, bool(adjoints)
-        if key not in self.bound:
-            given = self.term.formulas, self.rider and self.rider.formulas
-            self.bound[key] = getattr(of_elements("convex_adjoint" if adjoints else "convex", *given), name)
+        kernel = of_elements("elements", name, self.term.formulas, self.rider and self.rider.formulas)
         arguments = self.elements, self.own, self.n_own, *arguments
-        launch(self.bound[key], (dim, self.n_elements), arguments, adjoints and [None] * 3 + [*adjoints])
-
-    def __getstate__(self) -> dict[str, object]:
-        """Without kernels, which are no data."""
-        return {**self.__dict__, "bound": {}}
+        launch(kernel, (dim, self.n_elements), arguments, adjoints and [None] * 3 + [*adjoints])
 
 
 def passes_of(parts: Sequence[KernelTerm], n_vertices: int) -> list[Pass]:

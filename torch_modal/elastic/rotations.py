@@ -97,7 +97,7 @@ class _RightHandSide(Operation[Tensor]):
         return (right,)
 
     def back(self, kept: list[Tensor], grads: Sequence[Tensor], shapes: Tensor, weights: Tensor) -> tuple[Tensor, ...]:
-        rotations, module, dim = self.rotations, kernels("rotations_adjoint"), (len(shapes), len(self.rotations.faces))
+        rotations, module, dim = self.rotations, kernels("rotations"), (len(shapes), len(self.rotations.faces))
         quaternions, sign, frames = kept or rotations.signed_quaternions(shapes)
         to_shapes, to_weights, to_quaternions, to_frames = map(torch.zeros_like, (shapes, weights, quaternions, frames))
         sizes = rotations.triangles, shapes.shape[2]
@@ -144,7 +144,7 @@ class _OnTrajectory(Operation[Tensor]):
         to_packed, to_t = torch.zeros_like(packed), torch.zeros_like(t)
         values = [*self._tables(), packed, self._index(packed, which), t, torch.empty_like(to_total)]
         adjoints = [None, None, None, to_packed, None, to_t, to_total]
-        launch(kernels("rotations_adjoint").trajectory_edges, (len(t), packed.shape[1]), values, adjoints)
+        launch(kernels("rotations").trajectory_edges, (len(t), packed.shape[1]), values, adjoints)
         return to_packed, None, to_t
 
     def by_torch(self, packed: Tensor, which: Tensor, t: Tensor) -> tuple[Tensor, ...]:
@@ -170,7 +170,7 @@ def mean_pose(to_reference: Tensor, among: Tensor, weights: Tensor) -> tuple[Ten
 class _MeanPose(Operation[Tensor]):
     """*Shape:* ``(B, 2, 3, 3), (B, 2, 2, 3, 3), (B, 2) -> (B, 2, 3, 3), (B, 3, 3)``."""
 
-    n_results = n_differentiable = 2
+    n_differentiable = 2
     by_torch = staticmethod(procrustes.mean_pose)
 
     @staticmethod
@@ -183,5 +183,5 @@ class _MeanPose(Operation[Tensor]):
     def back(kept: list[Tensor], grads: Sequence[Tensor], *tensors: Tensor) -> tuple[Tensor | None, ...]:
         gradients = [torch.zeros_like(x) for x in tensors]
         scratch = [torch.empty_like(x) for x in grads]
-        launch(kernels("rotations_adjoint").mean_pose, (len(tensors[0]),), [*tensors, *scratch], [*gradients, *grads])
+        launch(kernels("procrustes").mean_pose, (len(tensors[0]),), [*tensors, *scratch], [*gradients, *grads])
         return tuple(gradients)

@@ -22,7 +22,6 @@ Kept = TypeVar("Kept")
 class Operation(Generic[Kept]):
     """A function of float64 tensors by kernels. The first dimension of all tensors counts the samples."""
 
-    n_results = 1
     n_differentiable = 1
     """Number of results with gradients; they come first."""
     run: Callable[..., tuple[Tensor, ...]]
@@ -51,6 +50,7 @@ class _Fused(torch.autograd.Function):
     @staticmethod
     def setup_context(ctx: Context, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
         ctx.operation, ctx.kept, *tensors = inputs
+        ctx.n_results = len(output)
         ctx.mark_non_differentiable(*output[ctx.operation.n_differentiable :])
         ctx.save_for_backward(*tensors)
         ctx.save_for_forward(*tensors)
@@ -60,7 +60,7 @@ class _Fused(torch.autograd.Function):
         n, by_torch = ctx.operation.n_differentiable, ctx.operation.by_torch
         results, back = torch.func.vjp(lambda *tensors: by_torch(*tensors)[:n], *ctx.saved_tensors)[:2]
         moved = apply_transpose(back, tuple(map(torch.zeros_like, results)), ctx.saved_tensors, tangents[2:])
-        return *moved, *[None] * (ctx.operation.n_results - n)
+        return *moved, *[None] * (ctx.n_results - n)
 
     @staticmethod
     def backward(ctx: Context, *grads: Tensor) -> tuple[Tensor | None, ...]:

@@ -4,15 +4,16 @@ import importlib
 import inspect
 import os
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
-from types import ModuleType, SimpleNamespace
-from typing import TYPE_CHECKING, Any, Literal
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
+from torch_modal.elastic.term import Formulas
 from torch_modal.progress import ProgressReport
 
 if TYPE_CHECKING:
@@ -30,19 +31,24 @@ def kernels(name: str) -> ModuleType:
     return importlib.import_module(f"{PACKAGE}.{name}")
 
 
-def of_elements(
-    kind: Literal["convex", "convex_adjoint", "forward", "backward"], *arguments: object
-) -> SimpleNamespace:
-    """Kernels of a module that one or two terms have: of the energy, or of the merging of rest shapes."""
+@cache
+def of_elements(file: str, name: str, *formulas: Formulas | None) -> "wp.Kernel":
+    """A kernel that a file, ``"elements"`` or ``"merging"``, makes of the formulas of one or two terms."""
     with _LOADING:
-        return getattr(kernels("elements" if kind.startswith("convex") else "merging"), kind)(*arguments)
+        return getattr(kernels(file).kernels_of(*formulas), name)
 
 
-def load_kernels(files: Iterable[str], make: Callable[[], None]) -> None:
-    """Load kernels for the CPU: of files, and those that a function makes."""
+@cache
+def _adjoint(kernel: "wp.Kernel") -> "wp.Kernel":
+    """A kernel once more, with the adjoint that Warp generates, in another module."""
+    import warp as wp
+
+    return wp.kernel(kernel.func, module=wp.get_module(f"{kernel.module.name}_adjoint"))
+
+
+def load_kernels(make: Callable[[], None]) -> None:
+    """Load the kernels that a function makes, for the CPU."""
     with _LOADING:
-        for name in files:
-            kernels(name)
         make()
         _load(PACKAGE, torch.device("cpu"))
 
@@ -142,6 +148,9 @@ class _Command:
     def __init__(self, kernel: "wp.Kernel", device: torch.device, back: bool, arguments: Sequence[object]) -> None:
         import warp as wp
 
+        if back:
+            with _LOADING:  # of the whole module, as Warp compiles no kernel for itself
+                kernel, *_ = [_adjoint(one) for one in (kernel, *kernel.module.kernels.values())]
         _load(kernel.module, device)
         self.device, self.n_threads, entries = device, 1, _entries(kernel)
         values = [x if entry is None else None for entry, x in zip(entries, arguments, strict=True)]
