@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from torch_modal.elastic.energy import RestShapes
-from torch_modal.elastic.modal import Derivatives, Placement, value_and_gradient
+from torch_modal.elastic.modal import AmplitudeEnergy, Derivatives, Placement
 from torch_modal.inbetween.joint import JointSpace
 
 
@@ -23,7 +23,7 @@ class PairedPlacement(NamedTuple):
     """Weight of the similarity. *Shape:* ``(B,)``."""
 
 
-class PairedSpace(nn.Module):
+class PairedSpace(AmplitudeEnergy[PairedPlacement]):
     r"""Mid-shapes as the mean of ``x_1 = x_a + Phi_a a_1`` and ``x_2 = x_b + Phi_b a_2`` that minimise Eq. 4.
 
     .. math:: d(\bar x_1, x_1) + \mu \|x_1 - x_2\|^2 + d(\bar x_2, x_2)
@@ -97,10 +97,6 @@ class PairedSpace(nn.Module):
         if first.second_order is not None and second.second_order is not None:
             curved = _block_diagonal(first.second_order, second.second_order)
         return Derivatives(value, gradient + slope, gauss_newton, curved, first.resolution + second.resolution)
-
-    def value_and_gradient(self, a: Tensor, placement: PairedPlacement) -> tuple[Tensor, Tensor]:
-        """Energy and gradient at ``a``. *Shape:* ``(B, n) -> (B,), (B, n)``."""
-        return value_and_gradient(self, a, placement)
 
     def _similarity(self, a: Tensor, placement: PairedPlacement) -> tuple[Tensor, Tensor]:
         """The energy of the similarity and its gradient. *Shape:* ``(..., B, n) -> (..., B), (..., B, n)``."""
