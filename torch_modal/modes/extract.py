@@ -121,8 +121,12 @@ def bases_of_checked(
     mesher: Mesher | str = "auto",
     cache: Cache | None = None,
     progress: Progress = None,
+    stacklevel: int = 3,
 ) -> list[ModalBasis]:
-    """`extract_bases` for the output of :func:`~torch_modal.keyframes.check.check_keyframes`."""
+    """`extract_bases` for the output of :func:`~torch_modal.keyframes.check.check_keyframes`.
+
+    Its warning names the line that is so many calls above.
+    """
     for what, choice, choices in (("method", method, METHODS), ("Hessian form", form, HESSIAN_FORMS)):
         if choice not in choices:
             raise ValueError(f"the {what} is {choice!r}; give one of {choices}")
@@ -151,7 +155,7 @@ def bases_of_checked(
             "how they move against each other is left to the interpolation of the key-frames; join them if they "
             "belong together",
             MeshWarning,
-            stacklevel=3,
+            stacklevel=stacklevel,
         )
     bases = []
     for shape, surface, result in zip(shapes, extraction.surfaces, results, strict=True):
