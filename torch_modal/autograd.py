@@ -29,6 +29,10 @@ Made = TypeVar("Made")
 Given = ParamSpec("Given")
 Linear = Callable[[Tensor], Tensor]
 Tensors = TypeVar("Tensors", Tensor, tuple[Tensor, ...])
+InDims = tuple[int | None, ...]
+"""Dimension of each argument that ``vmap`` maps, None for one that it does not map."""
+Vmapped = tuple[tuple[Tensor, ...], tuple[int, ...]]
+"""Results under ``vmap`` and their mapped dimensions."""
 Context = Any
 """What an autograd function keeps from its forward to its backward pass: an object that takes any attribute."""
 
@@ -242,7 +246,7 @@ class _Outside(torch.autograd.Function):
 
     @staticmethod
     def vmap(
-        info: VmapInfo, in_dims: tuple[int | None, ...], work: Callable[..., None], nothing: Tensor, *seen: Tensor
+        info: VmapInfo, in_dims: InDims, work: Callable[..., None], nothing: Tensor, *seen: Tensor
     ) -> tuple[Tensor, int | None]:
         first = [x if dim is None else x.movedim(dim, 0) for x, dim in zip(seen, in_dims[2:], strict=True)]
         return _Outside.apply(work, nothing, *first), in_dims[1]
@@ -320,10 +324,25 @@ def apply_transpose(
     return torch.func.vjp(lambda to: tuple(linear(to)), zeros)[1](tuple(known))[0]
 
 
-def merge_vmapped(n: int, in_dims: Sequence[int | None], tensors: Sequence[Tensor]) -> list[Tensor]:
-    """Tensors under ``vmap`` as one larger batch: the mapped dimension is merged with the first."""
-    flat = []
-    for tensor, dim in zip(tensors, in_dims, strict=True):
+def apply_merged(
+    function: type[torch.autograd.Function],
+    fixed: tuple[object, ...],
+    info: VmapInfo,
+    in_dims: InDims,
+    tensors: Sequence[Tensor],
+) -> Vmapped:
+    """Rule for ``vmap`` of a function of samples: the mapped dimension of all tensors is merged with the first.
+
+    Args:
+        function: Its arguments are the fixed ones, then the tensors.
+        fixed: Arguments that are not mapped.
+        info: As ``vmap`` gives it.
+        in_dims: Mapped dimensions of all arguments.
+        tensors: *Shape of each:* ``(B, ...)`` and the mapped dimension.
+    """
+    n, flat = info.batch_size, []
+    for tensor, dim in zip(tensors, in_dims[len(fixed) :], strict=True):
         batched = tensor.expand(n, *tensor.shape) if dim is None else tensor.movedim(dim, 0)
         flat.append(batched.flatten(0, 1).contiguous())  # as kernels want them
-    return flat
+    results = function.apply(*fixed, *flat)
+    return tuple(x.unflatten(0, (n, -1)) for x in results), (0,) * len(results)

@@ -10,11 +10,13 @@ from torch import Tensor
 from torch_modal import trees
 from torch_modal.autograd import (
     Context,
+    InDims,
     VmapInfo,
+    Vmapped,
     apply_function,
+    apply_merged,
     apply_transpose,
     is_double_backward,
-    merge_vmapped,
 )
 from torch_modal.elastic.gauss_newton import add_ridge
 from torch_modal.elastic.minimise import Solution, Status, minimise
@@ -72,38 +74,26 @@ class _ArgMin(torch.autograd.Function):
     @staticmethod
     def jvp(ctx: Context, *tangents: Tensor | None) -> tuple[Tensor | None, ...]:
         amplitudes, _, *tensors = ctx.saved_tensors
-        pull_back = _adjoint(ctx.energy, ctx.inverse, ctx.tree, *ctx.saved_tensors)
+        pull_back = _adjoint(ctx)
         moved = apply_transpose(pull_back, torch.zeros_like(amplitudes), tensors, tangents[4:])
         return moved, *(None,) * ctx.n_diagnostics
 
     @staticmethod
     def backward(ctx: Context, to_amplitudes: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:
-        pull_back = _adjoint(ctx.energy, ctx.inverse, ctx.tree, *ctx.saved_tensors)
+        pull_back = _adjoint(ctx)
         return (None,) * 4 + pull_back(to_amplitudes)
 
     @staticmethod
     def vmap(
-        info: VmapInfo,
-        in_dims: tuple[int | None, ...],
-        energy: ImplicitEnergy[Placed],
-        limits: Limits,
-        tree: object,
-        *tensors: Tensor,
-    ) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
-        output = _ArgMin.apply(energy, limits, tree, *merge_vmapped(info.batch_size, in_dims[3:], tensors))
-        return tuple(value.unflatten(0, (info.batch_size, -1)) for value in output), (0,) * len(output)
+        info: VmapInfo, in_dims: InDims, energy: ImplicitEnergy[Placed], limits: Limits, tree: object, *x: Tensor
+    ) -> Vmapped:
+        return apply_merged(_ArgMin, (energy, limits, tree), info, in_dims, x)
 
 
-def _adjoint(
-    energy: ImplicitEnergy[Placed],
-    inverse: Inverse,
-    tree: object,
-    amplitudes: Tensor,
-    status: Tensor,
-    *tensors: Tensor,
-) -> Callable[[Tensor], tuple[Tensor, ...]]:
+def _adjoint(ctx: Context) -> Callable[[Tensor], tuple[Tensor, ...]]:
     """From gradients in the amplitudes, ``(B, n)``, to gradients in the tensors of the placement: linear."""
-    solve = inverse(energy, amplitudes, trees.fill(tree, tensors), status == Status.CONVERGED)
+    energy, tree, (amplitudes, status, *tensors) = ctx.energy, ctx.tree, ctx.saved_tensors
+    solve = ctx.inverse(energy, amplitudes, trees.fill(tree, tensors), status == Status.CONVERGED)
 
     def slope(*tensors: Tensor) -> Tensor:
         return energy.value_and_gradient(amplitudes, trees.fill(tree, tensors))[1]

@@ -78,7 +78,8 @@ class KernelEnergy(nn.Module):
                 tensors = [rests.shapes, rests.weights, *(rests.stiffness[i] for i in numbers)]
                 tensors += [] if start is None else [start]
                 parts = [self.parts[i] for i in numbers]
-                *merged, left = _MergeRests(self, parts, relative)(*tensors, kernels=by_kernels)
+                merge = _MergeRests(self, parts, relative)
+                *merged, left = merge(*tensors) if by_kernels else merge.by_torch(*(x.double() for x in tensors))
                 records.update(zip(numbers, merged, strict=True))
                 constant = constant + left
         return Reference(tuple(records[i] for i in range(len(self.parts))), constant)

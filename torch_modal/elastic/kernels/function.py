@@ -8,11 +8,13 @@ from torch import Tensor
 
 from torch_modal.autograd import (
     Context,
+    InDims,
     VmapInfo,
+    Vmapped,
+    apply_merged,
     apply_transpose,
     is_double_backward,
     is_traced,
-    merge_vmapped,
     needs_function,
 )
 
@@ -31,13 +33,13 @@ class Operation(Generic[Kept]):
     by_torch: Callable[..., tuple[Tensor, ...]]
     """Results by torch instead of kernels: for forward mode, second derivatives, and tensors without data."""
 
-    def __call__(self, *tensors: Tensor, kernels: bool = True) -> tuple[Tensor, ...]:
-        """The results for tensors of any dtype, by kernels or torch."""
-        if kernels and not needs_function(*tensors):
+    def __call__(self, *tensors: Tensor) -> tuple[Tensor, ...]:
+        """The results for tensors of any dtype."""
+        if not needs_function(*tensors):
             with torch.no_grad():
                 return self.run(None, *(x.detach().double().contiguous() for x in tensors))
         tensors = tuple(x.double() for x in tensors)
-        if not kernels or any(map(is_traced, tensors)):
+        if any(map(is_traced, tensors)):
             return self.by_torch(*tensors)
         return tuple(_Fused.apply(self, [] if any(x.requires_grad for x in tensors) else None, *tensors))
 
@@ -74,12 +76,6 @@ class _Fused(torch.autograd.Function):
 
     @staticmethod
     def vmap(
-        info: VmapInfo,
-        in_dims: tuple[int | None, ...],
-        operation: Operation[Kept],
-        kept: list[Kept] | None,
-        *tensors: Tensor,
-    ) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
-        flat = merge_vmapped(info.batch_size, in_dims[2:], tensors)
-        results = _Fused.apply(operation, None if kept is None else [], *flat)
-        return tuple(x.unflatten(0, (info.batch_size, -1)) for x in results), (0,) * len(results)
+        info: VmapInfo, in_dims: InDims, operation: Operation[Kept], kept: list[Kept] | None, *x: Tensor
+    ) -> Vmapped:
+        return apply_merged(_Fused, (operation, None if kept is None else []), info, in_dims, x)
