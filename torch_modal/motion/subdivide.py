@@ -273,4 +273,4 @@ def _report_contacts(keyframes: Tensor, faces: Tensor, left: int, total: int) ->
             "them may help"
         )
     for message in messages:
-        warnings.warn(message, MeshWarning, stacklevel=6)
+        warnings.warn(message, MeshWarning, stacklevel=5)
