@@ -16,7 +16,7 @@ Torch's private names are used here alone, and only where no public one exists:
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Sequence
 from functools import partial, wraps
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, ParamSpec, Protocol, TypeVar
 
 import torch
 from torch import Tensor
@@ -28,9 +28,24 @@ from torch_modal import trees
 Made = TypeVar("Made")
 Given = ParamSpec("Given")
 Linear = Callable[[Tensor], Tensor]
+Tensors = TypeVar("Tensors", Tensor, tuple[Tensor, ...])
+InDims = tuple[int | None, ...]
+"""Dimension of each argument that ``vmap`` maps, None for one that it does not map."""
+Vmapped = tuple[tuple[Tensor, ...], tuple[int, ...]]
+"""Results under ``vmap`` and their mapped dimensions."""
+Context = Any
+"""What an autograd function keeps from its forward to its backward pass: an object that takes any attribute."""
+
+
+class VmapInfo(Protocol):
+    """First argument of the rule that an autograd function has for ``vmap``."""
+
+    batch_size: int
+    """Size of the dimension that is mapped."""
+
 
 #: The dispatch mode of this thread, or None.
-current_dispatch_mode: Callable[[], Any] = _get_current_dispatch_mode
+current_dispatch_mode: Callable[[], object] = _get_current_dispatch_mode
 
 
 def is_traced(x: Tensor) -> bool:
@@ -171,9 +186,9 @@ class Recent:
 
     def __init__(self, limit: int) -> None:
         self.limit = limit
-        self._kept: OrderedDict[Hashable, Any] = OrderedDict()
+        self._kept: OrderedDict[Hashable, object] = OrderedDict()
 
-    def __reduce__(self) -> tuple[Any, ...]:
+    def __reduce__(self) -> tuple[type["Recent"], tuple[int]]:
         return Recent, (self.limit,)  # copies and pickles are empty
 
     def get(self, key: Hashable, make: Callable[[], Made]) -> Made:
@@ -183,7 +198,7 @@ class Recent:
                 self._kept.popitem(last=False)
             self._kept[key] = run_outside_transforms(make)
         self._kept.move_to_end(key)
-        return self._kept[key]  # type: ignore[no-any-return]
+        return self._kept[key]  # type: ignore[return-value]
 
 
 def as_normal_tensor(x: Tensor) -> Tensor:
@@ -218,26 +233,26 @@ class _Outside(torch.autograd.Function):
         return nothing.clone()
 
     @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+    def setup_context(ctx: Context, inputs: tuple[object, ...], output: Tensor) -> None:
         """Saves nothing."""
 
     @staticmethod
-    def jvp(ctx: Any, *tangents: Tensor | None) -> Tensor:
+    def jvp(ctx: Context, *tangents: Tensor | None) -> Tensor:
         return torch.empty(0)
 
     @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple[None, ...]:
+    def backward(ctx: Context, *grads: Tensor) -> tuple[None, ...]:
         return (None,) * len(ctx.needs_input_grad)
 
     @staticmethod
     def vmap(
-        info: Any, in_dims: tuple[Any, ...], work: Callable[..., None], nothing: Tensor, *seen: Tensor
+        info: VmapInfo, in_dims: InDims, work: Callable[..., None], nothing: Tensor, *seen: Tensor
     ) -> tuple[Tensor, int | None]:
         first = [x if dim is None else x.movedim(dim, 0) for x, dim in zip(seen, in_dims[2:], strict=True)]
         return _Outside.apply(work, nothing, *first), in_dims[1]
 
 
-def apply_function(function: Any, *arguments: Any) -> Any:
+def apply_function(function: type[torch.autograd.Function], *arguments: object) -> Any:
     """``function.apply`` of a :class:`torch.autograd.Function` with ``setup_context``.
 
     Without a gradient to record it calls ``forward`` directly: torch inspects the signature at every call, which takes
@@ -260,19 +275,21 @@ class _LinearMap(torch.autograd.Function):
         return apply(x.detach())
 
     @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+    def setup_context(ctx: Context, inputs: tuple[object, ...], output: Tensor) -> None:
         ctx.forwards, ctx.backwards, _ = inputs
 
     @staticmethod
-    def jvp(ctx: Any, _: None, __: None, tangent: Tensor) -> Tensor:
+    def jvp(ctx: Context, _: None, __: None, tangent: Tensor) -> Tensor:
         return linear_map(ctx.forwards, ctx.backwards, tangent)
 
     @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple[None, None, Tensor]:
+    def backward(ctx: Context, *grads: Tensor) -> tuple[None, None, Tensor]:
         return None, None, linear_map(ctx.backwards, ctx.forwards, grads[0])
 
     @staticmethod
-    def vmap(info: Any, in_dims: tuple[Any, ...], apply: Linear, transpose: Linear, x: Tensor) -> tuple[Tensor, int]:
+    def vmap(
+        info: VmapInfo, in_dims: tuple[None, None, int], apply: Linear, transpose: Linear, x: Tensor
+    ) -> tuple[Tensor, int]:
         return linear_map(apply, transpose, x.movedim(in_dims[2], 0)), 0
 
 
@@ -282,8 +299,8 @@ linear_map: Callable[[Linear, Linear, Tensor], Tensor] = partial(apply_function,
 
 
 def apply_transpose(
-    linear: Callable[..., Sequence[Tensor]], zeros: Any, inputs: Sequence[Tensor], tangents: Sequence[Tensor | None]
-) -> Any:
+    linear: Callable[..., Sequence[Tensor]], zeros: Tensors, inputs: Sequence[Tensor], tangents: Sequence[Tensor | None]
+) -> Tensors:
     """The transpose of a linear function, times tangents of what it gives, None for zero.
 
     Of the gradient of a function, it is the Jacobian of the function times the tangents. Within
@@ -307,10 +324,25 @@ def apply_transpose(
     return torch.func.vjp(lambda to: tuple(linear(to)), zeros)[1](tuple(known))[0]
 
 
-def merge_vmapped(n: int, in_dims: Sequence[int | None], tensors: Sequence[Any]) -> list[Tensor]:
-    """Tensors under ``vmap`` as one larger batch: the mapped dimension is merged with the first."""
-    flat = []
-    for tensor, dim in zip(tensors, in_dims, strict=True):
+def apply_merged(
+    function: type[torch.autograd.Function],
+    fixed: tuple[object, ...],
+    info: VmapInfo,
+    in_dims: InDims,
+    tensors: Sequence[Tensor],
+) -> Vmapped:
+    """Rule for ``vmap`` of a function of samples: the mapped dimension of all tensors is merged with the first.
+
+    Args:
+        function: Its arguments are the fixed ones, then the tensors.
+        fixed: Arguments that are not mapped.
+        info: As ``vmap`` gives it.
+        in_dims: Mapped dimensions of all arguments.
+        tensors: *Shape of each:* ``(B, ...)`` and the mapped dimension.
+    """
+    n, flat = info.batch_size, []
+    for tensor, dim in zip(tensors, in_dims[len(fixed) :], strict=True):
         batched = tensor.expand(n, *tensor.shape) if dim is None else tensor.movedim(dim, 0)
         flat.append(batched.flatten(0, 1).contiguous())  # as kernels want them
-    return flat
+    results = function.apply(*fixed, *flat)
+    return tuple(x.unflatten(0, (n, -1)) for x in results), (0,) * len(results)

@@ -1,12 +1,12 @@
 """Lazy imports of optional packages."""
 
 import importlib
-from typing import Any
+from types import ModuleType
 
 from torch_modal.errors import MissingPackageError
 
 
-def require(module: str, extra: str, what: str) -> Any:
+def require(module: str, extra: str, what: str) -> ModuleType:
     """Import an optional package.
 
     Args:

@@ -10,18 +10,19 @@ import threading
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from functools import lru_cache, partial
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import torch
 from threadpoolctl import OpenBLASController, ThreadpoolController
 from torch import Tensor
 
 from torch_modal import trees
-from torch_modal.autograd import current_dispatch_mode, is_eager, within_transforms
+from torch_modal.autograd import Context, current_dispatch_mode, is_eager, within_transforms
 
 Result = TypeVar("Result")
+Given = TypeVar("Given")
 
 # Vertices of a chunk: at most, but for rounding; and at least, as each takes some milliseconds whatever its size.
 MOST_VERTICES = 40_000
@@ -86,7 +87,7 @@ class _OneBlasThread:
 
     lock = threading.Lock()
     count = 0
-    limits: Any = None
+    limits: AbstractContextManager[object]
 
 
 @contextmanager
@@ -134,12 +135,12 @@ def run(
             return [compute() for compute in work]
     recording, inference = torch.is_grad_enabled(), torch.is_inference_mode_enabled()
 
-    def within(compute: Callable[[], Result]) -> tuple[Result, dict[Any, int]]:
+    def within(compute: Callable[[], Result]) -> tuple[Result, dict[tuple[str, type[Warning]], int]]:
         _HERE.warned = {}
         with torch.inference_mode(inference), torch.set_grad_enabled(recording):  # in this order
             return compute(), _HERE.warned
 
-    futures: list[Future[Any]] = []
+    futures: list[Future[tuple[Result, dict[tuple[str, type[Warning]], int]]]] = []
     try:
         futures.extend(_pool(n).submit(within, compute) for compute in work)
         pending = set(futures)
@@ -176,7 +177,7 @@ def chunk_sizes(n: int, n_vertices: int) -> list[int]:
     return [n // parts + (i < n % parts) for i in range(parts)]
 
 
-def by_chunks(compute: Callable[[Any], Any], samples: Any, n_vertices: int, closed: bool) -> Any:
+def by_chunks(compute: Callable[[Given], Result], samples: Given, n_vertices: int, closed: bool) -> Result:
     """A function of a batch, which on a CPU is computed chunk by chunk, and so are its gradients.
 
     Args:
@@ -216,12 +217,12 @@ class _Chunks(torch.autograd.Function):
     """Each chunk has a graph of its own, from views of what is given: second derivatives go on into that."""
 
     @staticmethod
-    def forward(ctx: Any, results: Callable[..., Any], sizes: list[int], *tensors: Tensor) -> tuple[Tensor, ...]:
+    def forward(ctx: Context, results: Callable[..., object], sizes: list[int], *tensors: Tensor) -> tuple[Tensor, ...]:
         ctx.set_materialize_grads(False)
         ctx.results, ctx.sizes = torch.enable_grad()(results), sizes
-        holder: Any = torch.empty(0)
+        holder = torch.empty(0)
         # Kept by a tensor that is saved, graphs are freed as soon as torch frees what is saved.
-        holder.graphs = graphs = ctx.results(*tensors)
+        holder.graphs = graphs = ctx.results(*tensors)  # type: ignore[attr-defined]
         ctx.save_for_backward(holder, *tensors)
         each = list(zip(*(results for _, results in graphs), strict=True))
         joined = [torch.cat([x.detach() for x in parts]) for parts in each]
@@ -231,7 +232,7 @@ class _Chunks(torch.autograd.Function):
 
     @staticmethod
     @alone()
-    def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Context, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
         (holder, *saved), sizes, needed = ctx.saved_tensors, ctx.sizes, ctx.needs_input_grad[2:]
         graphs, again = getattr(holder, "graphs", None), torch.is_grad_enabled()
         # Second derivatives end the graph that they go through. A hook may have replaced what is saved.

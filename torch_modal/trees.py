@@ -1,16 +1,18 @@
 """Nested tuples and lists of tensors of one batch."""
 
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
+
+Tree = TypeVar("Tree")
 
 HERE = "here"
 """Stands in a skeleton where a tensor was."""
 
 
-def leaves(tree: Any) -> list[Tensor]:
+def leaves(tree: object) -> list[Tensor]:
     """The tensors, in order."""
     if isinstance(tree, Tensor):
         return [tree]
@@ -27,18 +29,18 @@ def map_leaves(tree: Any, function: Callable[[Any], Any]) -> Any:
     return tree
 
 
-def skeleton(tree: Any) -> Any:
+def skeleton(tree: object) -> object:
     """The tree with :data:`HERE` in the places of its tensors."""
     return map_leaves(tree, lambda _: HERE)
 
 
-def fill(tree: Any, tensors: Iterable[Tensor]) -> Any:
+def fill(tree: object, tensors: Iterable[Tensor]) -> Any:
     """Replace the tensors of a tree or skeleton, in order."""
     each = iter(tensors)
     return map_leaves(tree, lambda _: next(each))
 
 
-def rows(tree: Any, samples: Tensor | slice) -> Any:
+def rows(tree: Tree, samples: Tensor | slice) -> Tree:
     """Pick some of the samples."""
     return map_leaves(tree, lambda tensor: tensor[samples])
 

@@ -460,8 +460,9 @@ def test_crossings_of_keyframes_are_said_and_stay(hand: Shapes) -> None:
     assert pairs > 10
     options = {"levels": 3, "bases": hand.bases, "progress": False}
     plain = tm.subdivide(crossed, hand.faces, **options)
-    with pytest.warns(tm.MeshWarning, match=f"key-frame 0 passes through itself: {pairs} pairs"):
+    with pytest.warns(tm.MeshWarning, match=f"key-frame 0 passes through itself: {pairs} pairs") as told:
         frames = tm.subdivide(crossed, hand.faces, contact=True, **options)
+    assert {one.filename for one in told} == {__file__}  # where it was called
     assert int(far(frames, both).sum()) <= int(far(plain, both).sum())
     assert peak_acceleration(frames) < 1.3 * peak_acceleration(plain)
     assert torch.equal(frames[[0, -1]], crossed)

@@ -144,7 +144,7 @@ def test_makes_bases_where_none_are_given(scattered: Shapes, monkeypatch: pytest
     asked: list[Any] = []
     loaded: list[bool] = []
 
-    def extract(keyframes: Tensor, faces: Tensor, n_modes: int, progress: bool | None) -> list[tm.ModalBasis]:
+    def extract(keyframes: Tensor, faces: Tensor, n_modes: int, **options: Any) -> list[tm.ModalBasis]:
         asked.append((len(keyframes), n_modes))
         return pair.bases
 

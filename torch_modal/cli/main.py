@@ -125,7 +125,7 @@ def _print_messages(quiet: bool) -> Iterator[None]:
     """Print the package's log, unless quiet, and each warning about input or result once, as lines."""
     seen = set()
 
-    def show(message: Warning | str, category: type[Warning], *_: Any) -> None:
+    def show(message: Warning | str, category: type[Warning], *_: object) -> None:
         if issubclass(category, UserWarning) and str(message) not in seen:
             seen.add(str(message))
             _print_error(f"warning: {message}")

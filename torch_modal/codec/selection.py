@@ -1,22 +1,22 @@
 """Choice of the frames of a motion that serve as its key-frames."""
 
 import functools
-from typing import Any
 
 import torch
 from torch import Tensor
 
+from torch_modal.arrays import ArrayLike
 from torch_modal.codec.fit import fit
 from torch_modal.keyframes.check import check_keyframes
 from torch_modal.motion.decoder import ModalDecoder
 from torch_modal.progress import Progress, ProgressReport
-from torch_modal.times import check_times
+from torch_modal.times import Times, check_times
 
 LARGEST_ERROR = 0.002  # default for the largest mean distance of a frame's vertices, over the diagonal
 FRAMES_TO_FIT = 3  # frames of an interval that are fitted to estimate its error
 
 
-def check_motion(frames: Any, faces: Any, times: Any, cyclic: bool) -> tuple[Tensor, Tensor, Tensor]:
+def check_motion(frames: ArrayLike, faces: ArrayLike, times: Times, cyclic: bool) -> tuple[Tensor, Tensor, Tensor]:
     """Checked frames (float64), faces and times; raises as :func:`torch_modal.encode`."""
     shapes, triangles = check_keyframes(frames, faces, min_keyframes=2, warn=False)
     return shapes.detach().cpu().double(), triangles.cpu(), check_times(times, len(shapes), cyclic)

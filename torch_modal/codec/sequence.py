@@ -5,11 +5,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
 
+from torch_modal.arrays import ArrayLike
 from torch_modal.codec.fit import FittedFrames, fit
 from torch_modal.codec.packing import BY_16_BITS, LEAST, SHARE, pack, reduce_modes, unpack
 from torch_modal.codec.selection import LARGEST_ERROR, check_motion, insert_keyframes
@@ -91,7 +91,7 @@ class ModalSequence:
         """True for the frames that are key-frames. *Shape:* ``(T,)``."""
         return torch.isin(self.times, self.keyframe_times[: len(self.keyframes)])
 
-    def decode(self, t: Any = None) -> Tensor:
+    def decode(self, t: "ArrayLike | None" = None) -> Tensor:
         """The frames, or the shapes at other times, by linear interpolation of the amplitudes.
 
         Args:
@@ -115,7 +115,7 @@ class ModalSequence:
                 out[times == time] = shape
         return out
 
-    def fit(self, frames: Any, times: Any) -> FittedFrames:
+    def fit(self, frames: ArrayLike, times: ArrayLike) -> FittedFrames:
         """Fit amplitudes of other frames along the same path, such as frames of another motion of the same mesh.
 
         Args:
@@ -185,8 +185,8 @@ class ModalSequence:
 
 
 def encode(
-    frames: Any,
-    faces: Any,
+    frames: ArrayLike,
+    faces: ArrayLike,
     keyframes: Sequence[int] | int | None = None,
     n_modes: int = 60,
     *,

@@ -11,6 +11,7 @@ import numpy as np
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from torch_modal.arrays import AnyArray
 from torch_modal.geometry.closest import closest_on_triangles, dot
 from torch_modal.geometry.crossings import BoolArray, Crossings, FloatArray, IntArray
 from torch_modal.geometry.surface import Surface
@@ -150,5 +151,5 @@ def _nearest_faces(v: IntArray, f: IntArray, distance: FloatArray, height: Float
     return order[np.flatnonzero(np.diff(v[order], prepend=-1))]
 
 
-def _select(keep: BoolArray, *arrays: Any) -> list[Any]:
+def _select(keep: BoolArray, *arrays: AnyArray) -> list[AnyArray]:
     return [array[keep] for array in arrays]

@@ -1,13 +1,12 @@
 """Public detection of self-intersections."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-from torch_modal.arrays import BoolArray
+from torch_modal.arrays import AnyArray, ArrayLike, BoolArray
 from torch_modal.contact.detect import Search
 from torch_modal.elastic.backend import choose
 from torch_modal.errors import MeshError
@@ -42,7 +41,7 @@ class SelfContacts(NamedTuple):
     """Number of far pairs. *Shape:* ``(...)``."""
 
 
-def self_contacts(x: Any, faces: Any, ignore: Any = None) -> SelfContacts:
+def self_contacts(x: ArrayLike, faces: ArrayLike, ignore: "ArrayLike | None" = None) -> SelfContacts:
     """Find self-intersections of shapes.
 
     Two triangles without a common vertex intersect if their interiors do, by exact predicates; touching and coplanar
@@ -83,7 +82,7 @@ def self_contacts(x: Any, faces: Any, ignore: Any = None) -> SelfContacts:
     every, are_far = np.concatenate(pairs), np.concatenate(far)
     are_new = search.is_new(every)
 
-    def tensor(array: NDArray[Any]) -> Tensor:
+    def tensor(array: AnyArray) -> Tensor:
         return torch.from_numpy(array).to(device)
 
     def count_by_shape(which: slice | BoolArray) -> Tensor:

@@ -75,7 +75,7 @@ class ShapeAugmentation(nn.Module):
         self.params: Any = {}
 
     # ------------------------------------------------------------------------------------------------ for subclasses
-    def generate_parameters(self, n: int, space: Any, generator: torch.Generator | None) -> Parameters:
+    def generate_parameters(self, n: int, space: ShapeSpace, generator: torch.Generator | None) -> Parameters:
         """Draw parameters for ``n`` shapes. *Shape of each:* ``(n, ...)``.
 
         A parameter ``partner`` in [0, 1) draws a second shape for each.
@@ -83,7 +83,7 @@ class ShapeAugmentation(nn.Module):
         raise NotImplementedError
 
     def apply_transform(
-        self, batch: ShapeBatch, params: Parameters, space: Any, partners: ShapeBatch | None
+        self, batch: ShapeBatch, params: Parameters, space: ShapeSpace, partners: ShapeBatch | None
     ) -> ShapeBatch:
         """Transform all shapes of a batch.
 
@@ -212,14 +212,14 @@ class ShapeAugmentation(nn.Module):
         data.pos = self(data.pos[None], params=params, space=space, pool=pool)[0]
         return data
 
-    def _space(self, space: ShapeSpace | None) -> Any:
+    def _space(self, space: ShapeSpace | None) -> ShapeSpace:
         space = self.space if space is None else space
         if space is None and self.uses_keyframes:
             raise ValueError(
                 f"{type(self).__name__} needs key-frames: pass space=ShapeSpace(keyframes, faces) when it is "
                 "made or called"
             )
-        return space
+        return space  # type: ignore[return-value]  # None for transforms that ignore it
 
 
 class AugmentationSequential(ShapeAugmentation):

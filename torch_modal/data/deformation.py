@@ -51,12 +51,12 @@ class RandomModalDeformation(ShapeAugmentation):
             raise ValueError(f"max_strain is above 0 and below 1, got {max_strain}")
         self.max_strain = max_strain
 
-    def generate_parameters(self, n: int, space: Any, generator: torch.Generator | None) -> Parameters:
+    def generate_parameters(self, n: int, space: ShapeSpace, generator: torch.Generator | None) -> Parameters:
         """``noise``, a standard normal number for each mode, and the ``strain``."""
         return {"strain": draw_uniform(n, generator, self.strain), "noise": draw_normal(n, generator, space.n_modes)}
 
     def apply_transform(
-        self, batch: ShapeBatch, params: Parameters, space: Any, partners: ShapeBatch | None
+        self, batch: ShapeBatch, params: Parameters, space: ShapeSpace, partners: ShapeBatch | None
     ) -> ShapeBatch:
         """Deform each shape along the modes of its nearest key-frame."""
         assert batch.nearest is not None

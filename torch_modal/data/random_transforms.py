@@ -10,6 +10,7 @@ from torch.nn.functional import normalize
 
 from torch_modal.data.augmentation import Parameters, ShapeAugmentation, check_range, draw_normal, draw_uniform
 from torch_modal.data.shape_batch import ShapeBatch
+from torch_modal.data.space import ShapeSpace
 from torch_modal.geometry.rigid import RigidMotion, best_fit
 from torch_modal.geometry.rotations import exp
 from torch_modal.statistics.variation import check_density
@@ -43,7 +44,7 @@ class RandomInBetween(ShapeAugmentation):
         self.t = check_range("t", t, 0, 1)
         self.blend_labels = blend_labels
 
-    def generate_parameters(self, n: int, space: Any, generator: torch.Generator | None) -> Parameters:
+    def generate_parameters(self, n: int, space: ShapeSpace, generator: torch.Generator | None) -> Parameters:
         """``partner`` in [0, 1), the partner's place among the other shapes of the pool, and the times ``t``.
 
         In a motion these are the key-frame before (below 0.5) and the one after.
@@ -51,7 +52,7 @@ class RandomInBetween(ShapeAugmentation):
         return {"partner": draw_uniform(n, generator), "t": draw_uniform(n, generator, self.t)}
 
     def apply_transform(
-        self, batch: ShapeBatch, params: Parameters, space: Any, partners: ShapeBatch | None
+        self, batch: ShapeBatch, params: Parameters, space: ShapeSpace, partners: ShapeBatch | None
     ) -> ShapeBatch:
         """Move each shape towards its partner."""
         assert partners is not None and batch.nearest is not None and partners.nearest is not None
@@ -74,10 +75,10 @@ class RandomInBetween(ShapeAugmentation):
             raise ValueError(f"blended labels must be floating-point, one-hot for classes; got {labels.dtype}")
         return torch.lerp(labels, others, t.clamp(0, 1).to(labels.dtype))
 
-    def shapes(self, batch: ShapeBatch, partners: ShapeBatch, t: Tensor, space: Any) -> Tensor:
+    def shapes(self, batch: ShapeBatch, partners: ShapeBatch, t: Tensor, space: ShapeSpace) -> Tensor:
         """The shapes at the times ``t``, for a subclass to replace. *Shape:* ``(B,) -> (B, V, 3)``."""
-        found: Tensor = space.in_betweens(batch.shapes, partners.shapes, t, batch.nearest, partners.nearest)
-        return found
+        nearest = batch.nearest, partners.nearest  # all shapes of a space have some
+        return space.in_betweens(batch.shapes, partners.shapes, t, *nearest)  # type: ignore[arg-type]
 
 
 class RandomBlend(ShapeAugmentation):
@@ -120,7 +121,7 @@ class RandomBlend(ShapeAugmentation):
         self.concentration, self.locality, self.members = concentration, locality, members
         self.on_keyframes, self.beyond = on_keyframes, beyond
 
-    def generate_parameters(self, n: int, space: Any, generator: torch.Generator | None) -> Parameters:
+    def generate_parameters(self, n: int, space: ShapeSpace, generator: torch.Generator | None) -> Parameters:
         """``weights`` of the key-frames, ``factors`` by which they vary over the surface, and how far ``beyond``.
 
         With a table, the place of the ``member`` in it, in [0, 1).
@@ -131,7 +132,7 @@ class RandomBlend(ShapeAugmentation):
         return dict(zip(("weights", "factors", "beyond"), drawn, strict=True))
 
     def apply_transform(
-        self, batch: ShapeBatch, params: Parameters, space: Any, partners: ShapeBatch | None
+        self, batch: ShapeBatch, params: Parameters, space: ShapeSpace, partners: ShapeBatch | None
     ) -> ShapeBatch:
         """Draw a member for each shape; gradients reach the shapes through the rigid alignment with them alone."""
         drawn = {name: value.detach().double().cpu() for name, value in params.items()}
@@ -184,7 +185,7 @@ class RandomRigidMotion(ShapeAugmentation):
             raise ValueError(f"translation must be 0 or more; got {translation}")
         self.translation = translation
 
-    def generate_parameters(self, n: int, space: Any, generator: torch.Generator | None) -> Parameters:
+    def generate_parameters(self, n: int, space: ShapeSpace, generator: torch.Generator | None) -> Parameters:
         """``rotation``, axis times angle in radians; and ``translation``, in diagonals."""
         low, high = (math.radians(degree) for degree in self.degrees or (0.0, 0.0))
         direction, angle = draw_normal(n, generator, 4), draw_uniform(n, generator, (low, high))
@@ -196,7 +197,7 @@ class RandomRigidMotion(ShapeAugmentation):
         return {"rotation": angle[:, None] * normalize(axis, dim=1), "translation": move}
 
     def apply_transform(
-        self, batch: ShapeBatch, params: Parameters, space: Any, partners: ShapeBatch | None
+        self, batch: ShapeBatch, params: Parameters, space: ShapeSpace, partners: ShapeBatch | None
     ) -> ShapeBatch:
         """Move each shape."""
         x = batch.shapes

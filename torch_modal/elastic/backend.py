@@ -6,17 +6,15 @@ knows which one it is.
 
 import importlib.util
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import cache
 
 import torch
-from torch import Tensor
 
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.elastic.bend import Bend
 from torch_modal.elastic.crossings import WarpPairs
 from torch_modal.elastic.distortion import Distortion, KernelDistortion
-from torch_modal.elastic.energy import Energy
 from torch_modal.elastic.kernel_steps import KernelFineEnergy
 from torch_modal.elastic.kernel_terms import volumes_by_kernel
 from torch_modal.elastic.kernels.launch import kernels, launch, load_kernels, of_elements
@@ -24,7 +22,6 @@ from torch_modal.elastic.rotations import WarpRotations
 from torch_modal.elastic.rotations import mean_pose as mean_pose_by_kernel
 from torch_modal.elastic.steps import FineEnergy
 from torch_modal.elastic.stretch import Stretch
-from torch_modal.elastic.term import Mesh, Term
 from torch_modal.elastic.volume import Volume
 from torch_modal.errors import MissingPackageError
 from torch_modal.geometry.connectivity import Connectivity
@@ -41,21 +38,15 @@ class TorchBackend:
     """
 
     mean_pose, volumes_of = staticmethod(mean_pose), staticmethod(volumes_of)
+    rotations = staticmethod(LocalRotations)
+    """Local rotations of triangles between shapes near references. *Shape:* ``(K, V, 3)``."""
+    fine_energy = staticmethod(FineEnergy)
+    """All terms on the caller's mesh, for steps of all vertices. The terms of Eq. 5 come first."""
+    distortion = staticmethod(Distortion)
+    """A bounded measure of shapes, with the terms beyond Eq. 5 where there are some."""
 
     def load(self) -> None:
         """Load what takes long, so that the first call does not wait for it."""
-
-    def rotations(self, mesh: Connectivity, references: Tensor) -> LocalRotations:
-        """Local rotations of triangles between shapes near references. *Shape:* ``(K, V, 3)``."""
-        return LocalRotations(mesh, references)
-
-    def fine_energy(self, mesh: Mesh, terms: Sequence[Term]) -> FineEnergy:
-        """All terms on the caller's mesh, for steps of all vertices. Those of Eq. 5 come first."""
-        return FineEnergy(mesh, terms)
-
-    def distortion(self, mesh: Mesh, further: Energy | None) -> Distortion:
-        """A bounded measure of shapes, with the terms beyond Eq. 5 where there are some."""
-        return Distortion(mesh, further)
 
     def crossings(self, mesh: Connectivity, shape: FloatArray) -> Callable[[FloatArray], IntArray] | None:
         """A search for pairs of triangles that may cross, near a shape; None for ``geometry/crossings.py``."""
@@ -63,10 +54,12 @@ class TorchBackend:
 
 
 def _make_kernels() -> None:
-    """Kernels of Eq. 5 without gradients."""
+    """Kernels of in-betweens without gradients."""
+    for name in ("distortion", "procrustes", "rotations", "steps", "volume"):
+        kernels(name)
     for term in (Stretch, Bend, Volume):
-        of_elements("forward", term.own_formulas)
-    of_elements("convex", Bend.own_formulas, Stretch.own_formulas)
+        of_elements("merging", "merge", term.own_formulas)
+    of_elements("elements", "linearise", Bend.own_formulas, Stretch.own_formulas)
 
 
 class WarpBackend(TorchBackend):
@@ -86,8 +79,8 @@ class WarpBackend(TorchBackend):
             raise MissingPackageError("backend='warp' needs warp-lang, which is not installed: pip install warp-lang")
 
     def load(self) -> None:
-        """Kernels of in-betweens without gradients."""
-        load_kernels(("distortion", "procrustes", "rotations", "steps", "volume"), _make_kernels)
+        """Overrides the base class."""
+        load_kernels(_make_kernels)
 
     @staticmethod
     @cache

@@ -7,7 +7,7 @@ arguments: without one, or with another, they are the edge vectors.
 """
 
 import types
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache
 from typing import Any
 
@@ -19,37 +19,42 @@ from torch_modal.geometry.vectors import inverse as inverse
 from torch_modal.geometry.vectors import root as root
 from torch_modal.geometry.vectors import tiny
 
-Scalar = Any
+Scalar = Tensor
 """A number of each element."""
-Flag = Any
+Flag = Tensor
 """True or false."""
-Vector = Any
+Vector = Tensor
 """Three components."""
-Vectors = Any
+Vectors = Tensor
 """The edge vectors of an element."""
-Pair = Any
+Number = Tensor | float
+"""A number of each element, or one of all."""
+Pair = Sequence[Tensor]
 """Two numbers, such as cosine and sine of an angle."""
-Triple = Any
-Five = Any
-Six = Any
+Triple = Sequence[Tensor]
+Five = Sequence[Tensor]
+Six = Sequence[Tensor]
+Measure = Tensor | Sequence[Tensor]
+"""A number, or cosine and sine of an angle."""
+Formula = Callable[..., Any]
+"""A function of edge vectors, measures or sums in these names."""
 
-_torch: Any = torch
-real = float
-cos, sin, sqrt, atan2 = _torch.cos, _torch.sin, _torch.sqrt, _torch.atan2
-absolute, where = _torch.abs, _torch.where
+real: Callable[[float], Scalar] = float  # type: ignore[assignment]  # torch takes it for a tensor
+cos, sin, sqrt, atan2 = torch.cos, torch.sin, torch.sqrt, torch.atan2
+absolute, where = torch.abs, torch.where
 
 
-def dot(a: Any, b: Any) -> Any:
+def dot(a: Vector, b: Vector) -> Scalar:
     """Sum of the products of components."""
     return (a * b).sum(0)
 
 
-def rows(*vectors: Any) -> Any:
+def rows(*vectors: Vector) -> Vectors:
     """A vector for each edge vector."""
     return torch.stack(vectors)
 
 
-def pair(*numbers: Any) -> Any:
+def pair(*numbers: Scalar) -> Pair:
     """Several numbers as one value: ``triple``, ``five`` and ``six`` likewise."""
     return numbers
 
@@ -57,33 +62,33 @@ def pair(*numbers: Any) -> Any:
 triple = five = six = pair
 
 
-def maximum(a: Any, b: Any) -> Any:
+def maximum(a: Scalar, b: Number) -> Scalar:
     """The larger number."""
     return torch.maximum(a, b) if isinstance(b, Tensor) else a.clamp_min(b)
 
 
-def minimum(a: Any, b: Any) -> Any:
+def minimum(a: Scalar, b: Number) -> Scalar:
     """The smaller number."""
     return torch.minimum(a, b) if isinstance(b, Tensor) else a.clamp_max(b)
 
 
-def vanishes(squared: Any) -> Any:
+def vanishes(squared: Scalar) -> Flag:
     """True for squared lengths without a direction."""
     return squared <= tiny(squared)
 
 
-def underflows(x: Any) -> Any:
+def underflows(x: Scalar) -> Flag:
     """True for numbers whose inverse is infinite."""
     return x <= torch.finfo(x.dtype).tiny
 
 
-def above_rounding(number: float, x: Any) -> Any:
+def above_rounding(number: float, x: Scalar) -> float:
     """A relative number, or more where the arithmetic does not resolve it."""
     return max(number, 100 * torch.finfo(x.dtype).eps)
 
 
 @cache
-def _names_of_kernels() -> dict[str, Any]:
+def _names_of_kernels() -> dict[str, object]:
     """The names above in Warp, and its types under the names of the types."""
     import warp as wp
 
@@ -93,13 +98,13 @@ def _names_of_kernels() -> dict[str, Any]:
     names = {name: getattr(wp, name) for name in ("dot", "cross", "sqrt", "sin", "cos", "atan2", "where")}
     names |= {name: getattr(own, name) for name in ("real", "vanishes", "underflows", "root", "inverse")}
     names |= {"maximum": wp.max, "minimum": wp.min, "absolute": wp.abs, "rows": wp.matrix_from_rows}
-    kinds = {"Scalar": own.real, "Flag": bool, "Vector": own.vec3, "Any": Any}
+    kinds = {"Scalar": own.real, "Number": own.real, "Flag": bool, "Vector": own.vec3, "Measure": Any}
     kinds |= {name.title(): kind for name, kind in made.items()}
     return {**names, **made, **kinds, "above_rounding": own.above_rounding}
 
 
 @cache
-def for_kernels(formula: Callable[..., Any], n: int = 1) -> Any:
+def for_kernels(formula: Formula, n: int = 1) -> Any:
     """The function of Warp with the text of a formula, of ``n`` edge vectors.
 
     Raises:
@@ -109,7 +114,8 @@ def for_kernels(formula: Callable[..., Any], n: int = 1) -> Any:
     import warp as wp
 
     known = _names_of_kernels() | {"Vectors": wp.types.matrix(shape=(n, 3), dtype=wp.float64)}
-    code, found = formula.__code__, {"__builtins__": __builtins__}
+    code = formula.__code__
+    found: dict[str, object] = {"__builtins__": __builtins__}
     for name in (*code.co_names, *code.co_freevars):
         value = formula.__globals__.get(name)
         if name in known and value is globals().get(name):
@@ -128,7 +134,7 @@ def for_kernels(formula: Callable[..., Any], n: int = 1) -> Any:
             f"the formula {formula.__qualname__} has a number of Python's, which kernels take for float32: write "
             "real(2.0), or give it a name at the top level of the file"
         )
-    bound = types.FunctionType(code, found, formula.__name__)
+    bound: Callable[..., object] = types.FunctionType(code, found, formula.__name__)
     arguments, given = code.co_varnames[: code.co_argcount], formula.__annotations__
     bound.__annotations__ = {name: known.get(given.get(name, ""), known["Vectors"]) for name in arguments}
     bound.__module__, bound.__qualname__ = formula.__module__, f"{formula.__qualname__}_{n}"

@@ -4,9 +4,9 @@ Components come first, ``(3, ..., V)``. Shapes are *extended* by further vertice
 the mesh, and the anchors of the terms.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import cached_property, reduce
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -16,7 +16,6 @@ from torch_modal.geometry.vectors import pick
 
 # Rows and columns of the upper triangle of a symmetric block.
 _ROWS, _COLUMNS = [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]
-
 
 # Relative difference of energies that is rounding, in units of the dtype.
 ENERGY_ROUNDING = 64.0
@@ -39,11 +38,6 @@ class Reference(NamedTuple):
     weight. *Shape of each:* ``(..., R, M)``; for kernels ``(B, M, R)``."""
     constant: Tensor
     """The energy that remains, whatever the shape. *Shape:* ``(...)``."""
-
-    @classmethod
-    def of_records(cls, records: Sequence[Tensor]) -> "Reference":
-        """Records alone, without the constant."""
-        return cls(tuple(records), records[0].new_zeros(len(records[0])))
 
     def transpose(self) -> "Reference":
         """Records in the layout of kernels from the layout of torch, or the other way round."""
@@ -161,7 +155,7 @@ class Energy(nn.Module):
             no centre.
     """
 
-    parts: Any
+    parts: Sequence[AssembledTerm]
     used: Tensor
     vertices: Tensor
 
@@ -193,7 +187,7 @@ class Energy(nn.Module):
             anchors = torch.arange(self.n_extended, self.n_extended + more)
             parts.append(AssembledTerm(term, torch.cat([numbers, anchors])[corners]))
             self.n_extended += more
-        self.parts = nn.ModuleList(parts)
+        self.parts = nn.ModuleList(parts)  # type: ignore[assignment]
         self.sampled = sampled
         self.register_buffer("vertices", vertices, persistent=False)
         used = torch.arange(self.n_vertices) if sampled else torch.tensor(mesh.connectivity.used)
@@ -234,24 +228,6 @@ class Energy(nn.Module):
             weights.append(summand.term.weights(edge_vectors, values))
         return Rest(tuple(measures), tuple(weights))
 
-    def mix_rests(self, rest: Rest, weights: Tensor) -> Rest:
-        """One rest shape whose measures are weighted sums of the measures of K shapes.
-
-        Where weights differ from vertex to vertex, or are far below zero, :meth:`merge_rests` asks for harmonic means.
-
-        Args:
-            rest: Of K shapes.
-            weights: They add up to one. *Shape:* ``(K, V)``.
-        """
-        measures, stiffness = [], []
-        for summand, values, rest_weights in zip(self.parts, rest.measures, rest.weights, strict=True):
-            total, rest_weights = summand.term.total, rest_weights.expand_as(values)
-            element_weights = weights.mean(1, keepdim=True) if total else weights[:, summand.corners].mean(1)
-            first = values[..., :1, :]  # differences of angles from it go the short way round
-            measures.append((element_weights * (first + summand.term.difference(values, first))).sum(-2))
-            stiffness.append((element_weights * rest_weights).sum(-2).clamp_min(0))
-        return Rest(tuple(measures), tuple(stiffness))
-
     def reference_of(self, rest: Rest, stiffness: Sequence[float | Tensor]) -> Reference:
         """One rest shape as the reference.
 
@@ -259,17 +235,16 @@ class Energy(nn.Module):
             rest: Its measures and weights.
             stiffness: Of each term: a number, or *shape* ``(..., M)`` or ``(..., 1)``.
         """
-        terms = [summand.term for summand in self.parts]
         merged = [
-            term.merge_rests(measures[..., None, :], weights.expand_as(measures)[..., None, :], factor)
-            for term, measures, weights, factor in zip(terms, *rest, stiffness, strict=True)
+            summand.term.merge_rests(measures[..., None, :], weights.expand_as(measures)[..., None, :], factor)
+            for summand, measures, weights, factor in zip(self.parts, *rest, stiffness, strict=True)
         ]
         return join_references(merged)
 
     # --------------------------------------------------------------------------------------------------------- values
     def value(self, extended: Tensor, reference: Reference) -> Tensor:
         """The energy of shapes. *Shape:* ``(3, ..., V) -> (...)``."""
-        total: Any = reference.constant
+        total = reference.constant
         for summand, record in zip(self.parts, reference.records, strict=True):
             total = total + summand.term.energies(summand.measures(summand.edge_vectors(extended)), record).sum(-1)
         return total
@@ -308,32 +283,25 @@ class EnergyAt:
             for summand, one in zip(self.energy.parts, self.terms, strict=True)
         ]
 
-    def _scatter(self, factors: Sequence[Tensor], others: Sequence[Tensor | None]) -> Tensor:
-        """Gradients of the measures with factors, and other values of edge vectors, at the vertices.
-
-        *Shape of each:* ``(B, M), (n-1, 3, B, M) -> (3, B, V)``, extended.
-        """
-        out = factors[0].new_zeros(*self.terms[0].gradients.shape[-3:-1], self.energy.n_extended)
-        for summand, one, factor, other in zip(self.energy.parts, self.terms, factors, others, strict=True):
-            values = factor * one.gradients
-            if summand.term.total:
-                out = out + values
-            else:
-                out = summand.scatter_vectors(out, values if other is None else values + other)
+    def _scatter(self, values: Iterable[Tensor]) -> Tensor:
+        """Values of edge vectors, of totals in the vertices, at the vertices. *Shape:* ``(3, B, V)``, extended."""
+        out = self.value.new_zeros(3, len(self.value), self.energy.n_extended)
+        for summand, value in zip(self.energy.parts, values, strict=True):
+            out = out + value if summand.term.total else summand.scatter_vectors(out, value)
         return out
 
     def gradient(self) -> Tensor:
         """Gradient of the energy. *Shape:* ``(3, B, V)``, extended."""
-        return self._scatter([one.slope for one in self.terms], [None] * len(self.terms))
+        return self._scatter(one.slope * one.gradients for one in self.terms)
 
     def product(self, field: Tensor) -> Tensor:
         """The convex Hessian times displacements. *Shape:* ``(3, B, V)``, extended."""
-        factors, across = [], []
+        values = []
         for summand, one, tension in zip(self.energy.parts, self.terms, self.tensions, strict=True):
             vectors, rate = summand.along(one, field)
-            factors.append(one.curvature * rate)
-            across.append(None if tension is None else tension * (vectors - rate * one.gradients))
-        return self._scatter(factors, across)
+            value = one.curvature * rate * one.gradients
+            values.append(value if tension is None else value + tension * (vectors - rate * one.gradients))
+        return self._scatter(values)
 
     def diagonal(self) -> Tensor:
         """The convex Hessian's blocks of all vertices, the upper triangle of each. *Shape:* ``(6, B, V)``, extended."""
@@ -373,9 +341,8 @@ class RestShapes(NamedTuple):
                 3)``.
             relative: Elements keep as much of their stiffness as the rest shapes have of it.
         """
-        rows, begin = energy.extend(self.shapes.movedim(-1, 0)), None
-        if start is not None:
-            begin = energy.extend(start.movedim(-1, 0))
+        rows = energy.extend(self.shapes.movedim(-1, 0))
+        begin = None if start is None else energy.extend(start.movedim(-1, 0))
         pairs = zip(energy.parts, self.stiffness, strict=True)
         merged = [summand.merge_rests(rows, self.weights, stiffness, begin, relative) for summand, stiffness in pairs]
         return join_references(merged)

@@ -6,11 +6,11 @@ Elements are given by the vectors ``x`` from their first vertex to the others; a
 
 from __future__ import annotations
 
-from typing import Any
-
 from torch_modal.elastic.bind import (
     Five,
     Flag,
+    Measure,
+    Number,
     Pair,
     Scalar,
     Six,
@@ -59,7 +59,7 @@ LARGEST_WEIGHT = 8.0
 ZERO, ONE, TWO, HALF, THIRD, SIXTH = 0.0, 1.0, 2.0, 1 / 2, 1 / 3, 1 / 6
 
 
-def unit_weight(x: Vectors, measure: Any, mean: Scalar) -> Scalar:
+def unit_weight(x: Vectors, measure: Measure, mean: Scalar) -> Scalar:
     """One, for terms without weights, whose measure is a number or an angle."""
     return real(1.0)
 
@@ -169,7 +169,7 @@ def angle_hessian_product(x: Vectors, d: Vectors) -> Vectors:
     return rows(of_length + of_parts, cross(to_n1, e) + to_part_a * e, cross(e, to_n2) + to_part_b * e)
 
 
-def hinge_weight(x: Vectors, measure: Pair, mean: Scalar) -> Scalar:
+def hinge_weight(x: Vectors, measure: Measure, mean: Scalar) -> Scalar:
     """Square of the edge over the area of both triangles, at rest."""
     e = x[0]
     n1 = cross(e, x[1])
@@ -181,7 +181,7 @@ def hinge_weight(x: Vectors, measure: Pair, mean: Scalar) -> Scalar:
 
 def bounded_hinge_weight(x: Vectors) -> Scalar:
     """:func:`hinge_weight`, at most :data:`LARGEST_WEIGHT`."""
-    return minimum(hinge_weight(x, pair(ONE, ZERO), ONE), LARGEST_WEIGHT)
+    return minimum(hinge_weight(x, real(1.0), real(1.0)), LARGEST_WEIGHT)
 
 
 def longest_side(e: Vector, tip: Vector) -> Scalar:
@@ -190,7 +190,7 @@ def longest_side(e: Vector, tip: Vector) -> Scalar:
     return maximum(dot(e, e), maximum(dot(tip, tip), dot(side, side)))
 
 
-def triangle_fullness(e: Vector, tip: Vector, altitude: Scalar) -> Scalar:
+def triangle_fullness(e: Vector, tip: Vector, altitude: Number) -> Scalar:
     """0 to 1 by how far a triangle is from a needle; a half at this squared altitude over the longest side."""
     longest = longest_side(e, tip)
     normal = cross(e, tip)
@@ -198,7 +198,7 @@ def triangle_fullness(e: Vector, tip: Vector, altitude: Scalar) -> Scalar:
     return squared * inverse(squared + altitude * longest * longest, longest <= ZERO)
 
 
-def hinge_fullness(x: Vectors, altitude: Scalar) -> Scalar:
+def hinge_fullness(x: Vectors, altitude: Number) -> Scalar:
     """:func:`triangle_fullness` of both triangles, multiplied."""
     return triangle_fullness(x[0], x[1], altitude) * triangle_fullness(x[0], x[2], altitude)
 
@@ -248,12 +248,12 @@ def square_moments(q: Scalar, w: Scalar) -> Triple:
     return triple(w, w * q, w * q * q)
 
 
-def square_record(m: Triple, factor: Scalar) -> Pair:
+def square_record(m: Triple, factor: Number) -> Pair:
     """Weight and value of the parabola that sums of parabolas are; without a weight there is no minimum."""
     return pair(factor * maximum(m[0], ZERO), m[1] * inverse(m[0], m[0] <= ZERO))
 
 
-def square_left(m: Triple, factor: Scalar, to: Pair) -> Scalar:
+def square_left(m: Triple, factor: Number, to: Pair) -> Scalar:
     """Energy that remains at the minimum."""
     return factor * where(m[0] > ZERO, m[2] - m[1] * to[1], ZERO)
 
@@ -280,7 +280,7 @@ def periodic_moments(q: Pair, w: Scalar) -> Five:
     return five(w, w * q[0], w * q[1], w * (q[0] * q[0] - q[1] * q[1]), TWO * w * q[0] * q[1])
 
 
-def periodic_record(m: Five, factor: Scalar) -> Six:
+def periodic_record(m: Five, factor: Number) -> Six:
     """Weight; cosine and sine of the mean; sums of the phases along it, of twice the angles along and across."""
     some = m[0] > ZERO
     x = where(some, m[1], ZERO)
@@ -300,7 +300,7 @@ def periodic_record(m: Five, factor: Scalar) -> Six:
     return six(factor * where(some, m[0], ZERO), c, s, once, along, across)
 
 
-def periodic_left(m: Five, factor: Scalar, to: Six) -> Scalar:
+def periodic_left(m: Five, factor: Number, to: Six) -> Scalar:
     """Energy that remains at the mean."""
     return real(2.5) * to[0] - THIRD * (real(8.0) * to[3] - HALF * to[4])
 

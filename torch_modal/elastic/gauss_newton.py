@@ -1,12 +1,12 @@
 """The damped Gauss-Newton step on modal amplitudes."""
 
-from typing import Any, NamedTuple
+from typing import Generic, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from torch_modal.autograd import disable_compile, full_precision, is_eager, without_saved_tensor_hooks
-from torch_modal.elastic.modal import Derivatives
+from torch_modal.elastic.modal import AmplitudeEnergy, Derivatives, Placed
 
 # Part of the decrease that Newton's step promises, from which on it is taken without a search.
 SUFFICIENT = 0.25
@@ -32,7 +32,7 @@ class Step(NamedTuple):
     """Decrease that Newton's step promised; infinite where the Hessian is not positive definite. *Shape:* ``(B,)``."""
 
 
-class GaussNewtonStep(nn.Module):
+class GaussNewtonStep(nn.Module, Generic[Placed]):
     """One damped step of every sample of a batch, never uphill beyond rounding.
 
     The residual at the optimum is large: Gauss-Newton alone gains a digit every six steps there, while the full Hessian
@@ -53,14 +53,14 @@ class GaussNewtonStep(nn.Module):
         energy: The energy of the amplitudes.
     """
 
-    def __init__(self, energy: Any) -> None:
+    def __init__(self, energy: AmplitudeEnergy[Placed]) -> None:
         super().__init__()
         self.energy = energy
 
     @disable_compile
     @full_precision
     @without_saved_tensor_hooks
-    def forward(self, a: Tensor, placement: Any, at: Derivatives | None = None) -> Step:
+    def forward(self, a: Tensor, placement: Placed, at: Derivatives | None = None) -> Step:
         """Take one step; where tensors are traced, without a branch that depends on data.
 
         Args:
@@ -93,7 +93,7 @@ class GaussNewtonStep(nn.Module):
         chosen = [torch.where(good.view(-1, *[1] * (x.dim() - 1)), x, y) for x, y in zip(found, other, strict=True)]
         return Step(*chosen)._replace(gradient_norm=norm, gain=gain)
 
-    def _search(self, a: Tensor, placement: Any, at: Derivatives, newton: Tensor) -> Step:
+    def _search(self, a: Tensor, placement: Placed, at: Derivatives, newton: Tensor) -> Step:
         """The lowest of several lengths of both directions."""
         directions = torch.stack([newton, _direction(at.gradient, at.gauss_newton)])
         steps = torch.cat([length * directions for length in STEP_LENGTHS])

@@ -2,18 +2,41 @@
 
 from collections.abc import Callable
 from contextlib import suppress
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 
 from torch_modal import trees
-from torch_modal.autograd import apply_function, apply_transpose, is_double_backward, merge_vmapped
+from torch_modal.autograd import (
+    Context,
+    InDims,
+    VmapInfo,
+    Vmapped,
+    apply_function,
+    apply_merged,
+    apply_transpose,
+    is_double_backward,
+)
 from torch_modal.elastic.gauss_newton import add_ridge
 from torch_modal.elastic.minimise import Solution, Status, minimise
+from torch_modal.elastic.modal import AmplitudeEnergy, Placed
 from torch_modal.threads import warn
 
-Inverse = Callable[[Any, Tensor, Any, Tensor], Callable[[Tensor], Tensor]]
+Inverse = Callable[..., Callable[[Tensor], Tensor]]
+Limits = tuple[Callable[..., Solution], int, float, Inverse]
+"""The method, its limits, and the inverse of the Hessian."""
+
+
+class ImplicitEnergy(Protocol[Placed]):
+    """An energy in amplitudes whose minimiser is differentiated."""
+
+    @property
+    def n_amplitudes(self) -> int:
+        """Number of amplitudes, n."""
+
+    def value_and_gradient(self, a: Tensor, placement: Placed) -> tuple[Tensor, Tensor]:
+        """*Shape:* ``(B, n) -> (B,), (B, n)``."""
 
 
 class ConvergenceWarning(UserWarning):
@@ -31,7 +54,7 @@ class _ArgMin(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        energy: Any, limits: tuple[Any, ...], tree: Any, usable: Tensor, *tensors: Tensor
+        energy: ImplicitEnergy[Placed], limits: Limits, tree: object, usable: Tensor, *tensors: Tensor
     ) -> tuple[Tensor, ...]:
         method, max_steps, tolerance, _ = limits
         start = usable.new_zeros(len(usable), energy.n_amplitudes, dtype=tensors[0].dtype)
@@ -40,7 +63,7 @@ class _ArgMin(torch.autograd.Function):
         return tuple(value for value in solution if value is not None)
 
     @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
+    def setup_context(ctx: Context, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
         ctx.energy, (*_, ctx.inverse), ctx.tree, _, *tensors = inputs
         amplitudes, *diagnostics = output
         ctx.mark_non_differentiable(*diagnostics)
@@ -49,30 +72,28 @@ class _ArgMin(torch.autograd.Function):
         ctx.save_for_forward(amplitudes, diagnostics[-1], *tensors)
 
     @staticmethod
-    def jvp(ctx: Any, *tangents: Tensor | None) -> tuple[Tensor | None, ...]:
+    def jvp(ctx: Context, *tangents: Tensor | None) -> tuple[Tensor | None, ...]:
         amplitudes, _, *tensors = ctx.saved_tensors
-        pull_back = _adjoint(ctx.energy, ctx.inverse, ctx.tree, *ctx.saved_tensors)
+        pull_back = _adjoint(ctx)
         moved = apply_transpose(pull_back, torch.zeros_like(amplitudes), tensors, tangents[4:])
         return moved, *(None,) * ctx.n_diagnostics
 
     @staticmethod
-    def backward(ctx: Any, to_amplitudes: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:
-        pull_back = _adjoint(ctx.energy, ctx.inverse, ctx.tree, *ctx.saved_tensors)
+    def backward(ctx: Context, to_amplitudes: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:
+        pull_back = _adjoint(ctx)
         return (None,) * 4 + pull_back(to_amplitudes)
 
     @staticmethod
     def vmap(
-        info: Any, in_dims: tuple[Any, ...], energy: Any, limits: Any, tree: Any, *tensors: Tensor
-    ) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
-        output = _ArgMin.apply(energy, limits, tree, *merge_vmapped(info.batch_size, in_dims[3:], tensors))
-        return tuple(value.unflatten(0, (info.batch_size, -1)) for value in output), (0,) * len(output)
+        info: VmapInfo, in_dims: InDims, energy: ImplicitEnergy[Placed], limits: Limits, tree: object, *x: Tensor
+    ) -> Vmapped:
+        return apply_merged(_ArgMin, (energy, limits, tree), info, in_dims, x)
 
 
-def _adjoint(
-    energy: Any, inverse: Inverse, tree: Any, amplitudes: Tensor, status: Tensor, *tensors: Tensor
-) -> Callable[[Tensor], tuple[Tensor, ...]]:
+def _adjoint(ctx: Context) -> Callable[[Tensor], tuple[Tensor, ...]]:
     """From gradients in the amplitudes, ``(B, n)``, to gradients in the tensors of the placement: linear."""
-    solve = inverse(energy, amplitudes, trees.fill(tree, tensors), status == Status.CONVERGED)
+    energy, tree, (amplitudes, status, *tensors) = ctx.energy, ctx.tree, ctx.saved_tensors
+    solve = ctx.inverse(energy, amplitudes, trees.fill(tree, tensors), status == Status.CONVERGED)
 
     def slope(*tensors: Tensor) -> Tensor:
         return energy.value_and_gradient(amplitudes, trees.fill(tree, tensors))[1]
@@ -88,7 +109,9 @@ def _adjoint(
     return pull_back
 
 
-def dense_inverse(energy: Any, amplitudes: Tensor, placement: Any, converged: Tensor) -> Callable[[Tensor], Tensor]:
+def dense_inverse(
+    energy: AmplitudeEnergy[Placed], amplitudes: Tensor, placement: Placed, converged: Tensor
+) -> Callable[[Tensor], Tensor]:
     """Products with the inverse of the full Hessian; zero for samples that did not converge. *Shape:* ``(B, n)``."""
     hessian = add_ridge(energy.derivatives(amplitudes, placement).hessian)
     eye = torch.eye(hessian.shape[-1], dtype=hessian.dtype, device=hessian.device)
@@ -107,8 +130,8 @@ def dense_inverse(energy: Any, amplitudes: Tensor, placement: Any, converged: Te
 
 
 def solve_implicit(
-    energy: Any,
-    placement: Any,
+    energy: ImplicitEnergy[Placed],
+    placement: Placed,
     usable: Tensor,
     max_steps: int,
     tolerance: float,

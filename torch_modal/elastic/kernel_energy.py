@@ -12,9 +12,14 @@ from torch import Tensor, nn
 
 from torch_modal.elastic.bend import NEEDLE, NEEDLE_OF_STEPS
 from torch_modal.elastic.energy import Energy, Reference, RestShapes
-from torch_modal.elastic.kernel_terms import KernelTerm, KernelVolume, passes_of
+from torch_modal.elastic.kernel_terms import KernelTerm, KernelVolume, Pass, passes_of
 from torch_modal.elastic.kernels.function import Operation
 from torch_modal.geometry.vectors import inverse
+
+Factors = Sequence[Sequence[Tensor | None]]
+"""Factors of the term, and of the term that rides on it, of each pass. *Shape of each:* ``(B, M, f)``."""
+Seen = tuple[Tensor, Tensor | None]
+"""Shapes of the elements that are merged, and the sum of their measures where it counts."""
 
 
 class KernelPoint(NamedTuple):
@@ -22,13 +27,13 @@ class KernelPoint(NamedTuple):
 
     value: Tensor
     """But for the constant. *Shape:* ``(B,)``."""
-    gradient: Any
+    gradient: Tensor
     """*Shape:* ``(B, V, 3)``."""
-    diagonal: Any
+    diagonal: Tensor
     """Blocks of the convex Hessian's diagonal, packed, if wanted. *Shape:* ``(B, V, 6)``."""
-    factors: list[Any]
+    factors: Factors
     """Factors of the term and of the term that rides on it, for each pass. *Shape of each:* ``(B, M, f)``."""
-    normal: Any
+    normal: Tensor
     """Gradient of the volume. *Shape:* ``(B, V, 3)``."""
     moment: Tensor
     """First derivative of the energy in the volume. *Shape:* ``(B,)``."""
@@ -54,16 +59,15 @@ class KernelEnergy(nn.Module):
         super().__init__()
         self.energy = energy
         self.parts: Any = nn.ModuleList(parts)
-        #: Numbers of the volume, and of the other terms.
+        #: The number of the volume, if there is one.
         self.volumes = [i for i, term in enumerate(parts) if isinstance(term, KernelVolume)]
-        self.terms = [i for i in range(len(parts)) if i not in self.volumes]
         #: Numbers of the terms whose rest shapes are merged by kernels, and by torch.
         self.weighed = [i for i, term in enumerate(parts) if term.formulas.weight is not None]
         self.unweighed = [i for i in range(len(parts)) if i not in self.weighed]
         #: The terms in passes over elements, each alone or with another that rides on it.
-        self.passes: Any = nn.ModuleList(passes_of(parts, energy.n_vertices))
+        self.passes: Sequence[Pass] = nn.ModuleList(passes_of(parts, energy.n_vertices))  # type: ignore[assignment]
         #: True if kernels know the adjoints of all terms.
-        self.exact = all(parts[i].formulas.exact for i in self.terms)
+        self.exact = all(part.formulas.exact for part in parts if not isinstance(part, KernelVolume))
 
     def reference(self, rests: RestShapes, start: Tensor | None = None, relative: bool = False) -> Reference:
         """Merge rest shapes into one reference (Eq. 8); arguments as :meth:`RestShapes.reference`."""
@@ -74,7 +78,8 @@ class KernelEnergy(nn.Module):
                 tensors = [rests.shapes, rests.weights, *(rests.stiffness[i] for i in numbers)]
                 tensors += [] if start is None else [start]
                 parts = [self.parts[i] for i in numbers]
-                *merged, left = _MergeRests(self, parts, relative)(*tensors, kernels=by_kernels)
+                merge = _MergeRests(self, parts, relative)
+                *merged, left = merge(*tensors) if by_kernels else merge.by_torch(*(x.double() for x in tensors))
                 records.update(zip(numbers, merged, strict=True))
                 constant = constant + left
         return Reference(tuple(records[i] for i in range(len(self.parts))), constant)
@@ -89,30 +94,20 @@ class KernelEnergy(nn.Module):
             records = to.records[one.number], None if one.other is None else to.records[one.other]
             one.launch("linearise", len(x), x.shape[1], x, *records, energy, gradient, diagonal, *pass_factors)
             factors.append(pass_factors)
-        if not self.volumes:
-            zeros = torch.zeros_like(energy)
-            return KernelPoint(energy, gradient, diagonal, factors, torch.zeros_like(x), zeros, zeros)
-        number = self.volumes[0]
-        sizes, normal = self.parts[number].at(x, order > 0)
-        weight, value = to.records[number][:, 0].unbind(1)
-        stiffness = 2 * weight
-        off = sizes[:, 1, 0] - value
-        moment = stiffness * off
-        energy = torch.addcmul(energy, moment, off, value=0.5)
-        if gradient is not None:
-            gradient.addcmul_(moment[:, None, None], normal)
-        return KernelPoint(energy, gradient, diagonal, factors, normal, moment, stiffness)
-
-    def product(
-        self, factors: Sequence[Any], dim: tuple[int, int], fields: Tensor, start: int, out: Tensor, out_start: int,
-        scalars: Tensor | None = None, first: int = 0,
-    ) -> None:  # fmt: skip
-        """The convex Hessian but for the volume's part times fields of so many samples and vertices.
-
-        Fields, results and scalars begin at the given places of their arrays.
-        """
-        for one, pass_factors in zip(self.passes, factors, strict=True):
-            one.launch("product", *dim, fields, start, *pass_factors, out, out_start, scalars, first)
+        if self.volumes:
+            number = self.volumes[0]
+            sizes, normal = self.parts[number].at(x, order > 0)
+            weight, value = to.records[number][:, 0].unbind(1)
+            stiffness = 2 * weight
+            off = sizes[:, 1, 0] - value
+            moment = stiffness * off
+            energy = torch.addcmul(energy, moment, off, value=0.5)
+            if gradient is not None:
+                gradient.addcmul_(moment[:, None, None], normal)
+        else:
+            normal = torch.zeros_like(x)
+            moment = stiffness = torch.zeros_like(energy)
+        return KernelPoint(energy, gradient, diagonal, factors, normal, moment, stiffness)  # type: ignore[arg-type]
 
     def back(
         self,
@@ -123,7 +118,7 @@ class KernelEnergy(nn.Module):
         to_x: Tensor,
         to_records: Sequence[Tensor],
         to_diagonal: Tensor | None = None,
-        to_factors: Sequence[Any] | None = None,
+        to_factors: Factors | None = None,
         to_normal: Tensor | None = None,
         to_stiffness: Tensor | None = None,
         to_energy: Tensor | None = None,
@@ -170,7 +165,7 @@ class KernelEnergy(nn.Module):
 
 
 @dataclass(frozen=True, eq=False)
-class _MergeRests(Operation):
+class _MergeRests(Operation[Seen]):
     """Rest shapes, weights, the stiffnesses of some terms, and perhaps a start as records, and what remains."""
 
     energy: KernelEnergy
@@ -182,12 +177,7 @@ class _MergeRests(Operation):
         """Number of records."""
         return len(self.parts)
 
-    @property
-    def n_results(self) -> int:  # type: ignore[override]
-        """Records, and the constant."""
-        return len(self.parts) + 1
-
-    def _arguments(self, i: int, seen: tuple[Tensor, Tensor | None], tensors: Sequence[Tensor]) -> list[Any]:
+    def _arguments(self, i: int, seen: Seen, tensors: Sequence[Tensor]) -> list[Tensor | float | None]:
         """Arguments of the kernel before its results, or their gradients."""
         (x, total), (shapes, weights, *stiffness) = seen, tensors
         start = stiffness[-1] if len(stiffness) > len(self.parts) else None
@@ -197,7 +187,7 @@ class _MergeRests(Operation):
         sizes = needle**2, int(relative), shapes.shape[1], stiffness[i].shape[1]
         return [x.shape[1], x, weights, total, stiffness[i], soft, *sizes]
 
-    def run(self, kept: list[Any] | None, *tensors: Tensor) -> tuple[Tensor, ...]:
+    def run(self, kept: list[Seen] | None, *tensors: Tensor) -> tuple[Tensor, ...]:
         shapes, records = tensors[0], []
         constant = shapes.new_zeros(len(shapes))
         for i, term in enumerate(self.parts):
@@ -209,7 +199,7 @@ class _MergeRests(Operation):
                 kept.append(seen)
         return *records, constant
 
-    def back(self, kept: list[Any], grads: Sequence[Tensor], *tensors: Tensor) -> tuple[Tensor | None, ...]:
+    def back(self, kept: list[Seen], grads: Sequence[Tensor], *tensors: Tensor) -> tuple[Tensor | None, ...]:
         if not kept:
             self.run(kept, *tensors)
         gradients = tuple(torch.zeros_like(each) for each in tensors)

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -17,12 +16,15 @@ from torch_modal.elastic.kernels.launch import kernels, launch
 from torch_modal.elastic.steps import (
     FineEnergy,
     FreeEnergy,
+    Step,
     SumOfEnergies,
     TermsTowards,
     descend,
     step_length,
 )
 from torch_modal.elastic.term import Mesh, Term
+
+KernelStep = Step[KernelPoint]
 
 
 class KernelFineEnergy(FineEnergy):
@@ -99,17 +101,14 @@ class KernelProblem:
             inverse of the diagonal, *shape* ``(B, V, 6)``.
         """
         (b, n), module = at.gradient.shape[:2], kernels("steps")
-        n_kept, solution, inverse = (
-            n_products if keep else 1,
-            torch.zeros_like(at.gradient),
-            torch.empty_like(at.diagonal),
-        )
+        n_kept = n_products if keep else 1
+        solution, inverse = torch.zeros_like(at.gradient), torch.empty_like(at.diagonal)
         fields, scalars = at.gradient.new_empty(3, n_kept, b, n, 3), at.gradient.new_zeros(n_products + 1, b, 3)
         launch(module.begin, (b, n), [at.gradient, at.normal, at.diagonal, b, n_kept, n, inverse, fields, scalars])
         for k in range(n_products):
-            first = k % n_kept * b * n
-            place = n_kept * b * n + first, fields, 2 * n_kept * b * n + first
-            self.kernels.product(at.factors, (b, n), fields, *place, scalars, k * b)
+            first, out = ((kind * n_kept + k % n_kept) * b * n for kind in (1, 2))
+            for one, factors in zip(self.kernels.passes, at.factors, strict=True):
+                one.launch("product", b, n, fields, first, *factors, fields, out, scalars, k * b)
             if at.extra is not None:
                 pushed = at.extra(fields[1, k % n_kept])
                 fields[2, k % n_kept].add_(pushed)
@@ -121,31 +120,38 @@ class KernelProblem:
         return solution, fields, scalars, inverse
 
 
+def _without_constant(records: Sequence[Tensor]) -> Reference:
+    """Records as a reference."""
+    return Reference(tuple(records), records[0].new_zeros(len(records[0])))
+
+
 @dataclass(frozen=True, eq=False)
-class _Relaxation(Operation):
+class _Relaxation(Operation[KernelStep]):
     """Steps of all vertices from shapes, towards the records of a reference."""
 
     kernels: KernelEnergy
     products: Sequence[int]
 
-    def run(self, kept: list[Any] | None, x: Tensor, *records: Tensor) -> tuple[Tensor, ...]:
-        problem = KernelProblem(self.kernels, Reference.of_records(records))
+    def run(self, kept: list[KernelStep] | None, x: Tensor, *records: Tensor) -> tuple[Tensor, ...]:
+        problem = KernelProblem(self.kernels, _without_constant(records))
         with torch.no_grad():
             return (descend(problem, x, self.products, kept),)
 
-    def back(self, kept: list[Any], grads: Sequence[Tensor], x: Tensor, *records: Tensor) -> tuple[Tensor | None, ...]:
+    def back(
+        self, kept: list[KernelStep], grads: Sequence[Tensor], x: Tensor, *records: Tensor
+    ) -> tuple[Tensor | None, ...]:
         if not kept:
             self.run(kept, x, *records)
-        to_x, to, to_records = grads[0], Reference.of_records(records), [torch.zeros_like(record) for record in records]
+        to_x, to, to_records = grads[0], _without_constant(records), [torch.zeros_like(record) for record in records]
         for step in reversed(kept):
             to_x = self._step_back(step, to, to_x, to_records)
         return to_x, *to_records
 
     def by_torch(self, x: Tensor, *records: Tensor) -> tuple[Tensor, ...]:
-        terms = TermsTowards(self.kernels.energy, Reference.of_records(records).transpose())
+        terms = TermsTowards(self.kernels.energy, _without_constant(records).transpose())
         return (descend(SumOfEnergies([terms]), x, self.products),)
 
-    def _step_back(self, step: Any, to: Reference, to_reached: Tensor, to_records: Sequence[Tensor]) -> Tensor:
+    def _step_back(self, step: KernelStep, to: Reference, to_reached: Tensor, to_records: Sequence[Tensor]) -> Tensor:
         """Gradient at the start of a step from the gradient at its end; gradients of the records are added.
 
         Args:
@@ -155,11 +161,11 @@ class _Relaxation(Operation):
             to_reached: Gradient at the end. *Shape:* ``(B, V, 3)``.
             to_records: Are added to.
         """
-        x, at, solution, length, fields, scalars, inverse = step
+        x, at, solution, length, (fields, scalars, inverse) = step
         to_x, to_solution, to_energy, to_slope = to_reached.clone(), to_reached, None, None
         if bool((length < 1).any()):
             to_solution, to_energy, to_slope = self._length_back(x, at, solution, to, to_x, to_records)
-        module, (b, n), n_products = kernels("steps_adjoint"), x.shape[:2], fields.shape[1]
+        module, (b, n), n_products = kernels("steps"), x.shape[:2], fields.shape[1]
         values = at.normal, inverse, at.stiffness, fields, scalars
         to_normal, to_inverse, to_stiffness, to_fields, to_scalars = map(torch.zeros_like, values)
         to_factors = [[x if x is None else torch.zeros_like(x) for x in factors] for factors in at.factors]
@@ -174,9 +180,9 @@ class _Relaxation(Operation):
             launch(module.advance, (b, n), moved, to_moved)
             first, out = ((kind * n_products + k) * b * n for kind in (1, 2))
             for one, factors, to_own in zip(self.kernels.passes, at.factors, to_factors, strict=True):
-                values = n, fields, first, *factors, fields, out, scalars, k * b
+                multiplied = n, fields, first, *factors, fields, out, scalars, k * b
                 adjoints = None, to_fields, None, *to_own, to_fields, None, to_scalars
-                one.launch("product", b, *values, adjoints=adjoints)
+                one.launch("product", b, *multiplied, adjoints=adjoints)
         to_gradient = torch.zeros_like(x) if to_slope is None else to_slope[:, None, None] * solution
         to_diagonal = torch.zeros_like(at.diagonal)
         begun = at.gradient, at.normal, at.diagonal, b, n_products, n, inverse, fields, scalars

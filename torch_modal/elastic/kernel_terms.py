@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from functools import cached_property
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -10,7 +9,7 @@ from torch import Tensor, nn
 from torch_modal.autograd import is_eager
 from torch_modal.elastic.energy import AssembledTerm, Energy
 from torch_modal.elastic.kernels.launch import kernels, launch, of_elements
-from torch_modal.elastic.term import Mesh
+from torch_modal.elastic.term import Formulas, Mesh, Term
 from torch_modal.elastic.volume import Volume
 from torch_modal.geometry.rigid import volumes_of
 
@@ -24,33 +23,29 @@ class KernelTerm(nn.Module):
     """
 
     elements: Tensor
-    term: Any
-    bound: dict[Any, Any]
-    """Kernels by kind and name, from their first launch on."""
+    term: Term
 
     def __init__(self, part: AssembledTerm, elements: Tensor | None = None) -> None:
         super().__init__()
-        self.part, self.n, self.bound = part, len(part.corners) - 1, {}
+        self.part, self.n = part, len(part.corners) - 1
         self.__dict__["term"] = part.term  # not registered here: the layer owns it
         elements = part.corners.T if elements is None else elements
         self.register_buffer("elements", elements.int().contiguous(), persistent=False)
         self.n_elements = len(elements)
 
-    def __getstate__(self) -> dict[str, Any]:
-        """Without formulas and kernels, which are no data."""
-        return {name: value for name, value in self.__dict__.items() if name != "formulas"} | {"bound": {}}
+    def __getstate__(self) -> dict[str, object]:
+        """Without formulas, which are no data."""
+        return {name: value for name, value in self.__dict__.items() if name != "formulas"}
 
     @cached_property
-    def formulas(self) -> Any:
+    def formulas(self) -> Formulas:
         """The formulas that kernels are made from."""
-        return self.term.kernel_formulas(self.n)
+        return self.term.kernel_formulas(self.n)  # type: ignore[return-value]  # :func:`by_kernels` has seen them
 
-    def launch(self, name: str, dim: int, *arguments: Any, adjoints: Sequence[Tensor | None] = ()) -> None:
+    def launch(self, name: str, dim: int, *arguments: object, adjoints: Sequence[object] = ()) -> None:
         """Run a kernel over the elements of so many samples, or its adjoint."""
-        key = name, bool(adjoints)
-        if key not in self.bound:
-            self.bound[key] = getattr(of_elements("backward" if adjoints else "forward", self.formulas), name)
-        launch(self.bound[key], (dim, self.n_elements), [self.elements, *arguments], adjoints and [None, *adjoints])
+        kernel = of_elements("merging", name, self.formulas)
+        launch(kernel, (dim, self.n_elements), [self.elements, *arguments], adjoints and [None, *adjoints])
 
     def shapes_to_merge(self, shapes: Tensor) -> tuple[Tensor, Tensor | None]:
         """The shapes that elements are merged of, and all measures together, where their mean counts.
@@ -164,12 +159,12 @@ class Pass(nn.Module):
     own: Tensor | None
 
     def __init__(
-        self, term: tuple[int, KernelTerm], rider: tuple[Any, Any] = (None, None), own: Tensor | None = None
+        self, term: tuple[int, KernelTerm], rider: tuple[int, KernelTerm] | None = None, own: Tensor | None = None
     ) -> None:
         super().__init__()
         self.number, self.term = term
-        self.other, self.rider = rider
-        self.bound: dict[Any, Any] = {}
+        self.other = rider and rider[0]
+        self.rider = rider and rider[1]
         elements = self.term.elements
         if self.rider is not None and own is not None:
             # Where there is no element, all further vertices are the first.
@@ -182,18 +177,11 @@ class Pass(nn.Module):
         self.register_buffer("elements", elements, persistent=False)
         self.register_buffer("own", None if own is None else own.int(), persistent=False)
 
-    def launch(self, name: str, dim: int, *arguments: Any, adjoints: Sequence[Tensor | None] = ()) -> None:
+    def launch(self, name: str, dim: int, *arguments: object, adjoints: Sequence[object] = ()) -> None:
         """Run a kernel over the elements of so many samples, or its adjoint."""
-        key = name, bool(adjoints)
-        if key not in self.bound:
-            given = self.term.formulas, self.rider and self.rider.formulas
-            self.bound[key] = getattr(of_elements("convex_adjoint" if adjoints else "convex", *given), name)
+        kernel = of_elements("elements", name, self.term.formulas, self.rider and self.rider.formulas)
         arguments = self.elements, self.own, self.n_own, *arguments
-        launch(self.bound[key], (dim, self.n_elements), arguments, adjoints and [None] * 3 + [*adjoints])
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Without kernels, which are no data."""
-        return {**self.__dict__, "bound": {}}
+        launch(kernel, (dim, self.n_elements), arguments, adjoints and [None] * 3 + [*adjoints])
 
 
 def passes_of(parts: Sequence[KernelTerm], n_vertices: int) -> list[Pass]:

@@ -1,7 +1,7 @@
 """Minimisation in modal amplitudes by damped Newton steps."""
 
 from enum import IntEnum
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -9,6 +9,7 @@ from torch import Tensor
 from torch_modal import trees
 from torch_modal.autograd import without_saved_tensor_hooks
 from torch_modal.elastic.gauss_newton import GaussNewtonStep, add_ridge
+from torch_modal.elastic.modal import AmplitudeEnergy, Placed
 
 # A Hessian serves for as long as each step leaves at most this part of the gradient: a new one costs ten gradients.
 SHRINKAGE = 0.5
@@ -64,7 +65,9 @@ class Solution(NamedTuple):
 
 
 @without_saved_tensor_hooks
-def minimise(energy: Any, a: Tensor, placement: Any, max_steps: int = 80, tolerance: float = 3e-7) -> Solution:
+def minimise(
+    energy: AmplitudeEnergy[Placed], a: Tensor, placement: Placed, max_steps: int = 80, tolerance: float = 3e-7
+) -> Solution:
     """Minimise by :class:`~torch_modal.elastic.gauss_newton.GaussNewtonStep`, and by further steps with its Hessian.
 
     The first Hessian is Gauss-Newton's, at a fifth of the cost of the full one. Each serves for as long as the gradient

@@ -5,7 +5,7 @@ columns of the space, which are the same for a whole batch.
 """
 
 from functools import reduce
-from typing import Any, NamedTuple
+from typing import Generic, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -14,6 +14,8 @@ from torch.func import vjp
 from torch_modal.elastic.energy import ENERGY_ROUNDING, Energy, Linearised, Reference
 from torch_modal.elastic.shell import ShellEnergy
 from torch_modal.elastic.term import Term
+
+Placed = TypeVar("Placed", contravariant=True)
 
 # The second-order term of a batch passes through an array of this many bytes at a time.
 MOST_BYTES = 2**26
@@ -51,6 +53,29 @@ class Derivatives(NamedTuple):
         return ENERGY_ROUNDING * torch.finfo(self.value.dtype).eps * self.value.abs() + of_positions
 
 
+class AmplitudeEnergy(nn.Module, Generic[Placed]):
+    """An energy in amplitudes that depends on a placement of each sample: nested tuples of tensors."""
+
+    def value(self, a: Tensor, placement: Placed) -> Tensor:
+        """Energy at ``a``. *Shape:* ``(..., B, n) -> (..., B)``."""
+        raise NotImplementedError
+
+    def value_and_gradient(self, a: Tensor, placement: Placed) -> tuple[Tensor, Tensor]:
+        """Energy and gradient at ``a``. *Shape:* ``(B, n) -> (B,), (B, n)``."""
+        value, back = vjp(lambda a: self.value(a, placement), a)[:2]
+        return value, back(torch.ones_like(value))[0]
+
+    def derivatives(self, a: Tensor, placement: Placed, second_order: bool = True) -> Derivatives:
+        """Energy, gradient and Hessians at ``a``.
+
+        Args:
+            a: Amplitudes. *Shape:* ``(B, n)``.
+            placement: What the energy depends on.
+            second_order: True to compute the term beyond Gauss-Newton.
+        """
+        raise NotImplementedError
+
+
 class Placement(NamedTuple):
     """The affine space of each sample, ``x(a) = base + columns a``, and its reference."""
 
@@ -59,7 +84,7 @@ class Placement(NamedTuple):
     reference: Reference
 
 
-class ModalEnergy(nn.Module):
+class ModalEnergy(AmplitudeEnergy[Placement]):
     """An energy in the amplitudes of an affine space.
 
     This is what :class:`torch_modal.GaussNewtonStep` steps on; see there for an example.
@@ -104,18 +129,8 @@ class ModalEnergy(nn.Module):
         """Energy at ``a``. *Shape:* ``(..., B, n) -> (..., B)``."""
         return self.energy.value(self.rows(a, placement), placement.reference)
 
-    def value_and_gradient(self, a: Tensor, placement: Placement) -> tuple[Tensor, Tensor]:
-        """Energy and gradient at ``a``. *Shape:* ``(B, n) -> (B,), (B, n)``."""
-        return value_and_gradient(self, a, placement)
-
     def derivatives(self, a: Tensor, placement: Placement, second_order: bool = True) -> Derivatives:
-        """Energy, gradient and Hessians at ``a``.
-
-        Args:
-            a: Amplitudes. *Shape:* ``(B, n)``.
-            placement: The space of each sample and its reference.
-            second_order: True to compute the term beyond Gauss-Newton.
-        """
+        """Energy, gradient and Hessians at ``a``, as for the base class. *Shape:* ``(B, n)``."""
         x = self.rows(a, placement)
         terms, curved = [], []
         for i, (summand, record) in enumerate(zip(self.energy.parts, placement.reference.records, strict=True)):
@@ -133,12 +148,6 @@ class ModalEnergy(nn.Module):
         resolution = torch.finfo(x.dtype).eps * x.abs().amax((0, -1)) * (stiffest * stiffness).sqrt()
         beyond = reduce(torch.add, curved) if second_order else None
         return Derivatives(placement.reference.constant + value, gradient, inner, beyond, resolution)
-
-
-def value_and_gradient(energy: Any, a: Tensor, placement: Any) -> tuple[Tensor, Tensor]:
-    """Value of an energy and its gradient in the amplitudes. *Shape:* ``(B, n) -> (B,), (B, n)``."""
-    value, back = vjp(lambda a: energy.value(a, placement), a)[:2]
-    return value, back(torch.ones_like(value))[0]
 
 
 def _normal_equations(one: Linearised, columns: Tensor) -> tuple[Tensor, Tensor]:

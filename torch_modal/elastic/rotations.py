@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -82,13 +81,13 @@ class WarpRotations(LocalRotations):
 
 
 @dataclass(frozen=True, eq=False)
-class _RightHandSide(Operation):
+class _RightHandSide(Operation[Tensor]):
     """Pulls of the edge vectors between two shapes. *Shape:* ``(B, 2, V, 3), (B, 2) -> (B, V, 3)``."""
 
     rotations: WarpRotations
     poisson: Poisson
 
-    def run(self, kept: list[Any] | None, shapes: Tensor, weights: Tensor) -> tuple[Tensor, ...]:
+    def run(self, kept: list[Tensor] | None, shapes: Tensor, weights: Tensor) -> tuple[Tensor, ...]:
         rotations, right = self.rotations, torch.zeros_like(shapes[:, 0])
         quaternions, sign, frames = rotations.signed_quaternions(shapes)
         args = [rotations.triangles, shapes.shape[2], quaternions, sign, frames, weights, self._stiffness(), right]
@@ -97,8 +96,8 @@ class _RightHandSide(Operation):
             kept += [quaternions, sign, frames]
         return (right,)
 
-    def back(self, kept: list[Any], grads: Sequence[Tensor], shapes: Tensor, weights: Tensor) -> tuple[Tensor, ...]:
-        rotations, module, dim = self.rotations, kernels("rotations_adjoint"), (len(shapes), len(self.rotations.faces))
+    def back(self, kept: list[Tensor], grads: Sequence[Tensor], shapes: Tensor, weights: Tensor) -> tuple[Tensor, ...]:
+        rotations, module, dim = self.rotations, kernels("rotations"), (len(shapes), len(self.rotations.faces))
         quaternions, sign, frames = kept or rotations.signed_quaternions(shapes)
         to_shapes, to_weights, to_quaternions, to_frames = map(torch.zeros_like, (shapes, weights, quaternions, frames))
         sizes = rotations.triangles, shapes.shape[2]
@@ -119,14 +118,14 @@ class _RightHandSide(Operation):
 
 
 @dataclass(frozen=True, eq=False)
-class _OnTrajectory(Operation):
+class _OnTrajectory(Operation[Tensor]):
     """Edge vectors on packed trajectories. *Shape:* ``(P, F, 30), (B,), (B,) -> (B, E, 3)``."""
 
     rotations: WarpRotations
     n_pairs: int
     """Number of trajectories, P: ``vmap`` passes several batches as one."""
 
-    def run(self, kept: list[Any] | None, packed: Tensor, which: Tensor, t: Tensor) -> tuple[Tensor, ...]:
+    def run(self, kept: list[Tensor] | None, packed: Tensor, which: Tensor, t: Tensor) -> tuple[Tensor, ...]:
         rotations, total = self.rotations, t.new_zeros(len(t), self.rotations.n_edges, 4)
         args = [*self._tables(), packed, self._index(packed, which), t, total]
         launch(kernels("rotations").trajectory_edges, (len(t), len(rotations.faces)), args)
@@ -135,7 +134,7 @@ class _OnTrajectory(Operation):
             kept += [sums, areas]
         return (sums / areas,)
 
-    def back(self, kept: list[Any], grads: Sequence[Tensor], *tensors: Tensor) -> tuple[Tensor | None, ...]:
+    def back(self, kept: list[Tensor], grads: Sequence[Tensor], *tensors: Tensor) -> tuple[Tensor | None, ...]:
         packed, which, t = tensors
         if not kept:
             self.run(kept, packed, which, t)
@@ -145,14 +144,14 @@ class _OnTrajectory(Operation):
         to_packed, to_t = torch.zeros_like(packed), torch.zeros_like(t)
         values = [*self._tables(), packed, self._index(packed, which), t, torch.empty_like(to_total)]
         adjoints = [None, None, None, to_packed, None, to_t, to_total]
-        launch(kernels("rotations_adjoint").trajectory_edges, (len(t), packed.shape[1]), values, adjoints)
+        launch(kernels("rotations").trajectory_edges, (len(t), packed.shape[1]), values, adjoints)
         return to_packed, None, to_t
 
     def by_torch(self, packed: Tensor, which: Tensor, t: Tensor) -> tuple[Tensor, ...]:
         trajectory = Trajectory._make(packed.movedim(-1, 0).split([3, 3, 3, 3, 6, 6, 6]))
         return (LocalRotations.edges_along(self.rotations, trajectory, which.long(), t).movedim(0, -1),)
 
-    def _tables(self) -> tuple[Any, ...]:
+    def _tables(self) -> tuple[Tensor, Tensor, int]:
         return self.rotations.triangle_sides, self.rotations.triangle_signs, self.rotations.n_edges
 
     def _index(self, packed: Tensor, which: Tensor) -> Tensor:
@@ -168,21 +167,21 @@ def mean_pose(to_reference: Tensor, among: Tensor, weights: Tensor) -> tuple[Ten
     return rotations.to(among), pose.to(among)
 
 
-class _MeanPose(Operation):
+class _MeanPose(Operation[Tensor]):
     """*Shape:* ``(B, 2, 3, 3), (B, 2, 2, 3, 3), (B, 2) -> (B, 2, 3, 3), (B, 3, 3)``."""
 
-    n_results = n_differentiable = 2
+    n_differentiable = 2
     by_torch = staticmethod(procrustes.mean_pose)
 
     @staticmethod
-    def run(kept: list[Any] | None, *tensors: Tensor) -> tuple[Tensor, ...]:
+    def run(kept: list[Tensor] | None, *tensors: Tensor) -> tuple[Tensor, ...]:
         rotations, pose = torch.empty_like(tensors[0]), torch.empty_like(tensors[0][:, 0])
         launch(kernels("procrustes").mean_pose, (len(pose),), [*tensors, rotations, pose])
         return rotations, pose
 
     @staticmethod
-    def back(kept: list[Any], grads: Sequence[Tensor], *tensors: Tensor) -> tuple[Tensor | None, ...]:
+    def back(kept: list[Tensor], grads: Sequence[Tensor], *tensors: Tensor) -> tuple[Tensor | None, ...]:
         gradients = [torch.zeros_like(x) for x in tensors]
         scratch = [torch.empty_like(x) for x in grads]
-        launch(kernels("rotations_adjoint").mean_pose, (len(tensors[0]),), [*tensors, *scratch], [*gradients, *grads])
+        launch(kernels("procrustes").mean_pose, (len(tensors[0]),), [*tensors, *scratch], [*gradients, *grads])
         return tuple(gradients)

@@ -1,6 +1,7 @@
 """Discrete-shell energy of Eq. 5: edge lengths, dihedral angles and enclosed volume."""
 
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -65,7 +66,9 @@ class ShellEnergy(nn.Module):
     ) -> None:
         super().__init__()
         self.register_buffer("faces", torch.from_numpy(as_faces(faces)), persistent=False)
-        self.terms: Any = nn.ModuleList([Stretch(alpha), SquaredBend(beta), Volume(gamma), *terms])
+        self.terms: Sequence[Term] = nn.ModuleList(  # type: ignore[assignment]
+            [Stretch(alpha), SquaredBend(beta), Volume(gamma), *terms]
+        )
         self.energy = Energy(Mesh.of(self.faces, int(self.faces.max()) + 1), [*self.terms])
 
     def _rows(self, x: Tensor) -> Tensor:
@@ -122,6 +125,6 @@ class ShellEnergy(nn.Module):
         return self.energy.value(self._rows(x), self.reference_of(x_rest))
 
     @property
-    def stiffness(self) -> list[Any]:
+    def stiffness(self) -> list[float | Tensor]:
         """The stiffness of each term."""
         return [term.stiffness for term in self.terms]

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from functools import reduce
-from typing import Any, NamedTuple
+from typing import NamedTuple, Protocol, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -42,8 +42,43 @@ class Point(NamedTuple):
         return (self.gradient * direction).sum((1, 2))
 
 
-FreeEnergy = Any
-"""An energy of all vertices: ``value(x)``, *shape* ``(B, V, 3) -> (B,)``, and ``at(x)``, a :class:`Point`."""
+class FreeEnergy(Protocol):
+    """An energy of all vertices."""
+
+    def value(self, x: Tensor) -> Tensor:
+        """*Shape:* ``(B, V, 3) -> (B,)``."""
+
+    def at(self, x: Tensor) -> Point:
+        """*Shape:* ``(B, V, 3)``."""
+
+
+class AnyPoint(Protocol):
+    """Parts of a :class:`Point` that the choice of a step needs; points of kernels have them too."""
+
+    @property
+    def value(self) -> Tensor:
+        """*Shape:* ``(B,)``."""
+
+    def slope(self, direction: Tensor) -> Tensor:
+        """*Shape:* ``(B, V, 3) -> (B,)``."""
+
+
+Kind = TypeVar("Kind", bound=AnyPoint)
+Step = tuple[Tensor, Kind, Tensor, Tensor, tuple[Tensor, ...]]
+"""Start, energy there, whole step and its length; what the solver kept."""
+
+
+class Problem(Protocol[Kind]):
+    """An energy of all vertices, with a solver for its Newton steps."""
+
+    def value(self, x: Tensor) -> Tensor:
+        """*Shape:* ``(B, V, 3) -> (B,)``."""
+
+    def at(self, x: Tensor) -> Kind:
+        """*Shape:* ``(B, V, 3)``."""
+
+    def newton_direction(self, at: Kind, n_products: int, keep: bool) -> tuple[Tensor, ...]:
+        """An approximate solution, *shape* ``(B, V, 3)``, and what its gradient needs if it is to be kept."""
 
 
 def inverse_of_symmetric(blocks: Tensor) -> Tensor:
@@ -59,7 +94,9 @@ def inverse_of_symmetric(blocks: Tensor) -> Tensor:
     return (cofactors / (determinant * trace)).unflatten(0, (3, 3))
 
 
-def descend(problem: Any, x: Tensor, products: Sequence[int], taken: list[Any] | None = None) -> Tensor:
+def descend(
+    problem: Problem[Kind], x: Tensor, products: Sequence[int], taken: list[Step[Kind]] | None = None
+) -> Tensor:
     """Steps of a truncated Newton method on all vertices, shortened where the energy would rise.
 
     Each step solves with a convex Hessian by conjugate gradients, preconditioned by its diagonal blocks and cut short:
@@ -70,8 +107,7 @@ def descend(problem: Any, x: Tensor, products: Sequence[int], taken: list[Any] |
         problem: A :class:`SumOfEnergies`, or one that kernels solve.
         x: Where to start. *Shape:* ``(B, V, 3)``.
         products: Iterations of conjugate gradients in each Newton step.
-        taken: A list to which each step is added: its start, the energy there, the whole step, its length, and what
-            the solver kept.
+        taken: A list to which each step is added.
 
     Returns:
         *Shape:* ``(B, V, 3)``.
@@ -86,7 +122,7 @@ def descend(problem: Any, x: Tensor, products: Sequence[int], taken: list[Any] |
         after = problem.value(reached) if there is None else there.value
         length = step_length(at.value, at.slope(solution), after, solution.abs().amax((1, 2)))
         if taken is not None:
-            taken.append((x, at, solution, length, *kept))
+            taken.append((x, at, solution, length, tuple(kept)))
         if there is not None and bool((length == 1).all()):
             x, at = reached, there
         else:

@@ -10,7 +10,7 @@ Kernels of NVIDIA Warp are made from the same formulas (:class:`Formulas`, ``for
 
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -18,6 +18,7 @@ from torch.func import vjp, vmap
 
 from torch_modal.autograd import as_normal_tensor, outside_inference_mode
 from torch_modal.elastic import formulas
+from torch_modal.elastic.bind import Formula, real
 from torch_modal.geometry.connectivity import Connectivity
 
 
@@ -57,14 +58,14 @@ class Formulas(NamedTuple):
     """Name of the modules of the kernels."""
     n: int
     """Edge vectors of an element."""
-    measure: Callable[..., Any]
-    linearised: Callable[..., Any] | None = None
+    measure: Formula
+    linearised: Formula | None = None
     """Measure and its gradient; without it kernels compute no gradients of results."""
-    weight: Callable[..., Any] | None = None
+    weight: Formula | None = None
     """Weight at rest: edge vectors, measure, mean of the measures; None where torch merges the rest shapes."""
-    fullness: Callable[..., Any] | None = None
+    fullness: Formula | None = None
     """Edge vectors, square of an altitude -> 0 to 1 by how far the element is from a needle."""
-    tension: Callable[..., Any] | None = None
+    tension: Formula | None = None
     """Stiffness across an element of two vertices: measure, slope, twice the weight."""
     periodic: bool = False
     """True for an angle."""
@@ -114,14 +115,14 @@ class Term(nn.Module):
     """True if the measures of all elements add up to one measure, such as a volume."""
     sampled = False
     """True if elements name vertices of the caller's mesh, for which a coarse mesh has no counterpart."""
-    formula: Any = None
+    formula: Formula = None  # type: ignore[assignment]  # or there is a measure
     """The measure as a static function of the edge vectors, in the names of :mod:`torch_modal.elastic.bind`: torch
     evaluates it on all elements at once, and kernels are made from it."""
-    linearised: Any = None
+    linearised: Formula | None = None
     """Measure and its gradient in the edge vectors likewise: then kernels compute gradients of results, too."""
     own_formulas: Formulas | None = None
     """Formulas that kernels of exactly this class are made from, where they are not its own measure's."""
-    stiffness: Any
+    stiffness: float | Tensor
 
     def __init__(self, stiffness: float | Tensor = 1.0) -> None:
         super().__init__()
@@ -192,7 +193,7 @@ class Term(nn.Module):
             *Shape:* ``(..., M)``.
         """
         weight, value = record.unbind(-2)
-        return formulas.square_energy(self.difference(measures, value), (weight, 0.0))
+        return formulas.square_energy(self.difference(measures, value), (weight, real(0.0)))
 
     def derivatives(self, measures: Tensor, record: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
         """Derivatives of :meth:`energies` in the measures. *Shape of each:* ``(..., M)``.
@@ -201,7 +202,7 @@ class Term(nn.Module):
             The first; an upper bound of the second that is never negative; and its correction, None where it is zero.
         """
         weight, value = record.unbind(-2)
-        slope = formulas.square_slope(self.difference(measures, value), (weight, 0.0))
+        slope = formulas.square_slope(self.difference(measures, value), (weight, real(0.0)))
         return slope, 2 * weight.expand_as(measures), None
 
     def kernel_formulas(self, n: int) -> Formulas | None:
@@ -277,7 +278,7 @@ class Term(nn.Module):
         return None
 
     @staticmethod
-    def _each(function: Any, edge_vectors: Tensor) -> Tensor:
+    def _each(function: Callable[[Tensor], Tensor], edge_vectors: Tensor) -> Tensor:
         """A function of one element on all, which stay the last dimensions."""
         flat = edge_vectors.flatten(2)
         # vmap needs one element at least.

@@ -1,7 +1,5 @@
 """Bodies of a surface: groups of its connected pieces that are far from each other."""
 
-from typing import Any
-
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
@@ -16,7 +14,7 @@ MOST_BODIES = 16
 LEAST_AREA = 1e-6
 
 
-def bodies(shapes: FloatArray, mesh: Connectivity) -> list[tuple[Any, Connectivity]]:
+def bodies(shapes: FloatArray, mesh: Connectivity) -> list[tuple[torch.Tensor | slice, Connectivity]]:
     """Vertices and connectivity of each body; what belongs to none goes with the nearest. *Shape:* ``(K, V, 3)``.
 
     Groups of pieces are one body if, in any shape, the distance of their bounding boxes is at most the mean of the

@@ -1,7 +1,6 @@
 """Connectivity of triangle meshes: edges, hinges, boundaries, neighbours. NumPy and SciPy only."""
 
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from scipy import sparse
@@ -79,7 +78,7 @@ class Connectivity:
             if isinstance(array, np.ndarray):
                 array.flags.writeable = False
 
-    def __reduce__(self) -> tuple[Any, ...]:
+    def __reduce__(self) -> tuple[object, ...]:
         """Pickles the faces alone: the rest is faster to compute than to read."""
         return Connectivity, (self.faces, self.n_vertices)
 

@@ -1,7 +1,6 @@
 """Vertex positions from target edge vectors: Poisson problems, factorised once per connectivity."""
 
 from functools import partial
-from typing import Any
 
 import numpy as np
 import torch
@@ -9,7 +8,7 @@ from scipy.spatial import KDTree
 from torch import Tensor, nn
 
 from torch_modal.arrays import FloatArray, IntArray
-from torch_modal.autograd import Recent, is_eager
+from torch_modal.autograd import Context, Recent, is_eager
 from torch_modal.geometry.connectivity import Connectivity, half_cotangents, label_pieces, vertex_areas
 from torch_modal.geometry.rigid import RigidMotion, best_fit
 from torch_modal.geometry.sparse import SparseSolver, graph_laplacian, solve_by
@@ -117,11 +116,11 @@ def solve_exported(edges: Tensor, weights: Tensor, right: Tensor) -> Tensor:
     return solver(right)
 
 
-def _save(ctx: Any, inputs: tuple[Tensor, ...], output: Tensor) -> None:
+def _save(ctx: Context, inputs: tuple[Tensor, ...], output: Tensor) -> None:
     ctx.save_for_backward(*inputs[:2])
 
 
-def _backward(ctx: Any, grad: Tensor) -> tuple[None, None, Tensor]:
+def _backward(ctx: Context, grad: Tensor) -> tuple[None, None, Tensor]:
     return None, None, solve_exported(*ctx.saved_tensors, grad)
 
 

@@ -13,7 +13,6 @@ import threading
 import weakref
 from collections.abc import Callable
 from functools import cache
-from typing import Any
 
 import numpy as np
 import torch
@@ -69,7 +68,7 @@ class SparseSolver:
         self._inner.eliminate_zeros()
         self._solves: dict[torch.device, Solve] = {}
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> dict[str, object]:
         """Without the factors, which cannot be pickled."""
         return {**self.__dict__, "_solves": {}}
 

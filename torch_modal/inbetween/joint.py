@@ -8,12 +8,12 @@ import torch
 from torch import Tensor, nn
 
 from torch_modal.elastic.energy import AssembledTerm, Energy, RestShapes
-from torch_modal.elastic.modal import Derivatives, ModalEnergy, Placement, value_and_gradient
+from torch_modal.elastic.modal import AmplitudeEnergy, Derivatives, ModalEnergy, Placement
 from torch_modal.elastic.steps import FineEnergy
 from torch_modal.inbetween.coarse import CoarseMesh
 
 
-class JointSpace(nn.Module):
+class JointSpace(AmplitudeEnergy[Sequence[Placement]]):
     r"""In-betweens ``x(a) = base + U a`` of least :math:`\sum_k w_k\, d(x_k, x) + \tfrac{1}{2} \rho\, |a|^2`.
 
     The basis is orthonormal under vertex weights that add up to one, so that the anchor ``rho`` holds the mean squared
@@ -48,7 +48,7 @@ class JointSpace(nn.Module):
             sampled = terms[numbers[0]].sampled
             energy = Energy(fine.mesh if sampled else coarse.mesh, [terms[i] for i in numbers], sampled)
             parts.append(ModalEnergy(energy, self.basis[:, energy.vertices] if sampled else self.coarse_basis))
-        self.parts: Any = nn.ModuleList(parts)
+        self.parts: Sequence[ModalEnergy] = nn.ModuleList(parts)  # type: ignore[assignment]
         self.coarse, self.anchor = coarse, anchor
         self.__dict__["fine"] = fine  # not registered here: it belongs to the solver
 
@@ -102,10 +102,6 @@ class JointSpace(nn.Module):
         value, gradient, gauss_newton, *others = sums
         value, eye = value + 0.5 * self.anchor * a.square().sum(-1), torch.eye(a.shape[-1]).to(gauss_newton)
         return Derivatives(value, gradient + self.anchor * a, gauss_newton + self.anchor * eye, *others)
-
-    def value_and_gradient(self, a: Tensor, placement: Sequence[Placement]) -> tuple[Tensor, Tensor]:
-        """Energy and gradient at ``a``. *Shape:* ``(B, n) -> (B,), (B, n)``."""
-        return value_and_gradient(self, a, placement)
 
 
 def coarse_values(values: Tensor, fine: AssembledTerm, coarse: AssembledTerm, clusters: Tensor, n: int) -> Tensor:

@@ -1,12 +1,12 @@
 """The paired space of the paper (Eq. 4): one shape near each key-frame, pulled together."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from torch_modal.elastic.energy import RestShapes
-from torch_modal.elastic.modal import Derivatives, Placement, value_and_gradient
+from torch_modal.elastic.modal import AmplitudeEnergy, Derivatives, Placement
 from torch_modal.inbetween.joint import JointSpace
 
 
@@ -23,7 +23,7 @@ class PairedPlacement(NamedTuple):
     """Weight of the similarity. *Shape:* ``(B,)``."""
 
 
-class PairedSpace(nn.Module):
+class PairedSpace(AmplitudeEnergy[PairedPlacement]):
     r"""Mid-shapes as the mean of ``x_1 = x_a + Phi_a a_1`` and ``x_2 = x_b + Phi_b a_2`` that minimise Eq. 4.
 
     .. math:: d(\bar x_1, x_1) + \mu \|x_1 - x_2\|^2 + d(\bar x_2, x_2)
@@ -93,12 +93,10 @@ class PairedSpace(nn.Module):
         value, gradient = first.value + second.value + similarity, torch.cat([first.gradient, second.gradient], -1)
         similar = 2 * placement.mu[:, None, None] * self.gap_gram.to(a)
         gauss_newton = _block_diagonal(first.gauss_newton, second.gauss_newton) + similar
-        curved = _block_diagonal(first.second_order, second.second_order) if second_order else None
+        curved = None
+        if first.second_order is not None and second.second_order is not None:
+            curved = _block_diagonal(first.second_order, second.second_order)
         return Derivatives(value, gradient + slope, gauss_newton, curved, first.resolution + second.resolution)
-
-    def value_and_gradient(self, a: Tensor, placement: PairedPlacement) -> tuple[Tensor, Tensor]:
-        """Energy and gradient at ``a``. *Shape:* ``(B, n) -> (B,), (B, n)``."""
-        return value_and_gradient(self, a, placement)
 
     def _similarity(self, a: Tensor, placement: PairedPlacement) -> tuple[Tensor, Tensor]:
         """The energy of the similarity and its gradient. *Shape:* ``(..., B, n) -> (..., B), (..., B, n)``."""
@@ -107,7 +105,7 @@ class PairedSpace(nn.Module):
         return placement.mu * value, 2 * placement.mu[:, None] * (grown + placement.linear)
 
 
-def _block_diagonal(first: Any, second: Any) -> Tensor:
+def _block_diagonal(first: Tensor, second: Tensor) -> Tensor:
     """*Shape:* ``(B, m, m), (B, n, n) -> (B, m + n, m + n)``."""
     m, n = first.shape[-1], second.shape[-1]
     return torch.cat([nn.functional.pad(first, (0, n)), nn.functional.pad(second, (m, 0))], -2)

@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from torch_modal.arrays import AnyArray
 from torch_modal.io.tensors import bytes_of, read_tensors, write_tensors
 
 CACHE_VERSION = 7  # part of every key: raise it when the algorithm of cached results changes
@@ -29,7 +29,7 @@ FORMAT = "torch_modal.cache"
 SUFFIX = ".safetensors"
 _ENTRY_NAME = re.compile(r"[a-z]+-[0-9a-f]{64}\.safetensors")
 
-Arrays = dict[str, NDArray[Any]]
+Arrays = dict[str, AnyArray]
 
 
 class CacheWarning(UserWarning):
@@ -71,9 +71,9 @@ class Cache:
     def get(
         self,
         kind: str,
-        inputs: Mapping[str, NDArray[Any]],
-        parameters: Mapping[str, Any],
-        compute: Callable[[], Mapping[str, NDArray[Any]]],
+        inputs: Mapping[str, AnyArray],
+        parameters: Mapping[str, object],
+        compute: Callable[[], Mapping[str, AnyArray]],
     ) -> Arrays:
         """Look up a result by its kind, input arrays and parameters (numbers, strings); compute it if it is missing."""
         if self.folder is None:
@@ -116,14 +116,14 @@ class Cache:
                     path.unlink()
 
 
-def entry_name(kind: str, inputs: Mapping[str, NDArray[Any]], parameters: Mapping[str, Any]) -> str:
+def entry_name(kind: str, inputs: Mapping[str, AnyArray], parameters: Mapping[str, object]) -> str:
     """File name of a result: its kind, and a digest of its inputs and the version of the cache."""
     key = content_digest([CACHE_VERSION, kind, sorted(inputs.items()), sorted(parameters.items())])
     return f"{kind}-{key}{SUFFIX}"
 
 
 # ----------------------------------------------------------------------------------------------------------- digests
-def content_digest(value: Any) -> str:
+def content_digest(value: object) -> str:
     """SHA-256 of all contents of a value, the same in every process.
 
     It includes types and shapes of numbers, and classes and all attributes of objects of this package. Other objects

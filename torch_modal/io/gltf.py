@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import BPoly
 from scipy.spatial.transform import Rotation, Slerp
 
-from torch_modal.arrays import FloatArray
+from torch_modal.arrays import AnyArray, FloatArray
 from torch_modal.errors import MeshWarning
 from torch_modal.geometry.skin import WEIGHT_STEPS
 from torch_modal.io.files import read_companion
@@ -105,7 +105,7 @@ class Document:
             warnings.warn(f"{self.path.name} is without image {index}, now white: {error}", MeshWarning, stacklevel=6)
         return WHITE
 
-    def accessor(self, index: int) -> NDArray[Any]:
+    def accessor(self, index: int) -> AnyArray:
         """The numbers of an accessor, in its component type. *Shape:* ``(count, width)``."""
         accessor = self.get("accessors", index)
         kind, width, count = accessor["componentType"], WIDTHS[accessor["type"]], accessor["count"]
@@ -116,7 +116,7 @@ class Document:
             array[self._rows(indices, indices["componentType"], n, 1)[:, 0]] = self._rows(values, kind, n, width)
         return array
 
-    def _rows(self, place: Json, kind: int, count: int, width: int) -> NDArray[Any]:
+    def _rows(self, place: Json, kind: int, count: int, width: int) -> AnyArray:
         """Numbers in a buffer view; zeros, if there is no view. *Shape:* ``(count, width)``."""
         dtype = np.dtype(COMPONENTS[kind])
         if "bufferView" not in place:
@@ -163,7 +163,7 @@ class Document:
         return {"bufferView": self.add_bytes(data), "mimeType": mime}
 
     def add(
-        self, array: NDArray[Any], kind: str, target: int | None = None, bounds: bool = False, normalized: bool = False
+        self, array: AnyArray, kind: str, target: int | None = None, bounds: bool = False, normalized: bool = False
     ) -> int:
         """Add numbers ``(count,)`` or ``(count, width)`` as an accessor with a view of its own; returns its index.
 

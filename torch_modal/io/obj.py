@@ -4,7 +4,6 @@ import re
 from collections import defaultdict
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -170,7 +169,7 @@ def _numbers(rows: list[list[str]], width: int) -> FloatArray:
     return np.array(rows, dtype=np.float64).reshape(-1, width)
 
 
-def obj_bytes(vertices: FloatArray, faces: IntArray, asset: Any = None) -> bytes:
+def obj_bytes(vertices: FloatArray, faces: IntArray, asset: object = None) -> bytes:
     """An OBJ file of vertices and faces; with nine digits, float32 reads back as it was."""
     points = "".join(f"v {x:.9g} {y:.9g} {z:.9g}\n" for x, y, z in vertices.tolist())
     return (points + "".join(f"f {a} {b} {c}\n" for a, b, c in (faces + 1).tolist())).encode("ascii")

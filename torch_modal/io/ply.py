@@ -9,12 +9,10 @@ import re
 from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from torch_modal.arrays import FloatArray, IntArray
+from torch_modal.arrays import AnyArray, FloatArray, IntArray
 from torch_modal.errors import MeshError
 from torch_modal.io.asset import Asset, Material, Part, as_png_or_jpeg, linear_rgba
 from torch_modal.io.files import try_companion
@@ -63,7 +61,7 @@ class PlyFile:
                 raise ValueError(f"the header promises {length} of {name[:40]!r}; it was cut off or is damaged")
 
     @cached_property
-    def _content(self) -> tuple[bytes, NDArray[Any], bytes]:
+    def _content(self) -> tuple[bytes, AnyArray, bytes]:
         """The vertices with all their properties (words, if the file is text), and the bytes before and after them."""
         if next(iter(self.elements)) != "vertex" or any(len(types) > 1 for types in self.properties.values()):
             raise ValueError("vertices are not its first element, or have properties that are lists")
@@ -188,7 +186,7 @@ def read_triangles(path: Path, n_vertices: int, n_faces: int) -> tuple[FloatArra
     return vertices, faces
 
 
-def ply_bytes(vertices: FloatArray, faces: IntArray, asset: Any = None) -> bytes:
+def ply_bytes(vertices: FloatArray, faces: IntArray, asset: object = None) -> bytes:
     """A binary PLY file of vertices and faces, float32."""
     header = (
         "ply\nformat binary_little_endian 1.0\n"
@@ -200,7 +198,7 @@ def ply_bytes(vertices: FloatArray, faces: IntArray, asset: Any = None) -> bytes
     return header.encode("ascii") + vertices.astype("<f4").tobytes() + rows.tobytes()
 
 
-def off_bytes(vertices: FloatArray, faces: IntArray, asset: Any = None) -> bytes:
+def off_bytes(vertices: FloatArray, faces: IntArray, asset: object = None) -> bytes:
     """An OFF file of vertices and faces, text, float64."""
     points = "".join(f"{x!r} {y!r} {z!r}\n" for x, y, z in vertices.tolist())
     triangles = "".join(f"3 {a} {b} {c}\n" for a, b, c in faces.tolist())

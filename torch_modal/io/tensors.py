@@ -26,7 +26,7 @@ ENTRY = "torch_modal"
 
 
 def write_tensors(
-    path: Path, format: str, version: str, tensors: Mapping[str, Tensor], metadata: Mapping[str, Any] | None = None
+    path: Path, format: str, version: str, tensors: Mapping[str, Tensor], metadata: Mapping[str, object] | None = None
 ) -> None:
     """Write a whole file or nothing, into a folder that exists. JSON must be able to hold the metadata."""
     header = json.dumps({"format": format, "version": version, **(metadata or {})}, sort_keys=True)
@@ -89,7 +89,7 @@ class TensorFile:
         return {name: self.tensor(name).clone() for name in self.shapes}
 
 
-def read_tensors(path: Path, format: str, version: str, metadata: Mapping[str, Any]) -> dict[str, Tensor] | None:
+def read_tensors(path: Path, format: str, version: str, metadata: Mapping[str, object]) -> dict[str, Tensor] | None:
     """Memory-mapped tensors of a file; None if it is missing or damaged, or has other metadata."""
     with contextlib.suppress(OSError, ValueError):
         file = TensorFile(path, format, version)

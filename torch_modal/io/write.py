@@ -4,18 +4,16 @@ from collections.abc import Collection, Iterable
 from itertools import chain
 from os.path import realpath
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from torch_modal.arrays import Array, FloatArray, IntArray
+from torch_modal.arrays import AnyArray, Array, ArrayLike, FloatArray, IntArray
 from torch_modal.io.asset import Asset
 from torch_modal.io.files import write_files
 from torch_modal.io.formats import MESH_FORMATS
 
 
-def to_numpy(array: Array) -> NDArray[Any]:
+def to_numpy(array: ArrayLike) -> AnyArray:
     """A torch tensor (any device, with or without gradient) or NumPy array as a NumPy array."""
     if hasattr(array, "detach"):
         tensor = array.detach().cpu()

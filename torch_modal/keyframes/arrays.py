@@ -1,19 +1,17 @@
 """Positions and faces from tensors, NumPy arrays and sequences; checks of tensors."""
 
-from typing import Any
-
 import numpy as np
 import torch
 from torch import Tensor
 
-from torch_modal.arrays import IntArray
+from torch_modal.arrays import ArrayLike, IntArray
 from torch_modal.errors import MeshError
 
 LARGEST_UNIT_RATIO = 8.0
 """Points that extend over more or less than known ones by this factor are in other units."""
 
 
-def as_positions(keyframes: Any) -> Tensor:
+def as_positions(keyframes: ArrayLike) -> Tensor:
     """Convert positions to a float tensor, sharing memory where possible."""
     if isinstance(keyframes, (list, tuple)):
         if not keyframes:
@@ -34,7 +32,7 @@ def as_positions(keyframes: Any) -> Tensor:
     return positions
 
 
-def as_faces(faces: Any) -> IntArray:
+def as_faces(faces: ArrayLike) -> IntArray:
     """Convert faces to an int64 array."""
     tensor = _as_tensor("faces", faces)
     # An empty list becomes a float array; `check_keyframes` reports missing faces.
@@ -45,7 +43,7 @@ def as_faces(faces: Any) -> IntArray:
     return tensor.detach().cpu().numpy().astype(np.int64)
 
 
-def _as_tensor(name: str, value: Any) -> Tensor:
+def _as_tensor(name: str, value: ArrayLike) -> Tensor:
     """Convert a tensor, an array or nested lists to a dense tensor."""
     if isinstance(value, Tensor):
         if value.layout != torch.strided or value.device.type == "meta" or value.is_quantized:
@@ -65,7 +63,7 @@ def _as_tensor(name: str, value: Any) -> Tensor:
 
 
 def check_tensor(
-    name: str, x: Any, *sizes: int | str, device: torch.device | None = None, finite: bool = False, hint: str = ""
+    name: str, x: ArrayLike, *sizes: int | str, device: torch.device | None = None, finite: bool = False, hint: str = ""
 ) -> None:
     """Raise for what is not a floating-point tensor of a shape.
 

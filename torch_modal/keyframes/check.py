@@ -5,12 +5,12 @@
 
 import warnings
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
 
-from torch_modal.arrays import FloatArray, IntArray
+from torch_modal.arrays import ArrayLike, FloatArray, IntArray
 from torch_modal.errors import MeshError, MeshWarning
 from torch_modal.geometry import inspect
 from torch_modal.geometry.connectivity import Connectivity
@@ -39,7 +39,7 @@ class Keyframes(NamedTuple):
     """Vertex indices, int64. *Shape:* ``(F, 3)``."""
 
 
-def check_keyframes(keyframes: Any, faces: Any, *, min_keyframes: int = 1, warn: bool = True) -> Keyframes:
+def check_keyframes(keyframes: ArrayLike, faces: ArrayLike, *, min_keyframes: int = 1, warn: bool = True) -> Keyframes:
     """Check key-frames and repair their faces.
 
     Args:
@@ -64,7 +64,7 @@ def check_keyframes(keyframes: Any, faces: Any, *, min_keyframes: int = 1, warn:
 
 
 def check_surface(
-    keyframes: Any, faces: Any, min_keyframes: int = 1, warn: bool = False
+    keyframes: ArrayLike, faces: ArrayLike, min_keyframes: int = 1, warn: bool = False
 ) -> tuple[torch.Tensor, Connectivity]:
     """`check_keyframes` that returns the connectivity instead of the faces."""
     positions, shapes, indices = check_arrays(keyframes, faces, min_keyframes)
@@ -80,7 +80,9 @@ def check_surface(
     return positions, mesh
 
 
-def check_arrays(keyframes: Any, faces: Any, min_keyframes: int = 1) -> tuple[torch.Tensor, FloatArray, IntArray]:
+def check_arrays(
+    keyframes: ArrayLike, faces: ArrayLike, min_keyframes: int = 1
+) -> tuple[torch.Tensor, FloatArray, IntArray]:
     """Check shapes and values of the arrays; return positions, unchanged and in float64, and faces.
 
     Raises:

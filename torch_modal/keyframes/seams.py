@@ -1,11 +1,12 @@
 """Vertices that exporters split along seams of texture coordinates and normals, joined."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from torch_modal.arrays import ArrayLike
 from torch_modal.geometry.connectivity import merge_seams
 from torch_modal.keyframes.check import check_arrays
 
@@ -33,7 +34,7 @@ class WeldedKeyframes(NamedTuple):
         return shapes.index_select(-2, self.vertex_of.to(shapes.device))
 
 
-def weld_seams(keyframes: Any, faces: Any) -> WeldedKeyframes:
+def weld_seams(keyframes: ArrayLike, faces: ArrayLike) -> WeldedKeyframes:
     """Join the vertices that exporters split along seams of texture coordinates and normals.
 
     Otherwise the surface would tear there. Boundary vertices that coincide in all key-frames become one, with the

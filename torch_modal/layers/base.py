@@ -14,6 +14,7 @@ from torch_modal.elastic.term import Mesh, Term, register_weight
 from torch_modal.elastic.volume import encloses
 from torch_modal.geometry.bodies import bodies
 from torch_modal.geometry.canonical import own_order
+from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.inbetween.results import InBetweenResult, Samples, join_bodies
 from torch_modal.inbetween.settings import Settings, expand_to_samples, stiffnesses
 from torch_modal.inbetween.solver import InBetweenSolver
@@ -67,7 +68,7 @@ def basis_buffers(bases: Bases, required: bool, kept: bool = False) -> list[Basi
 class PreciseModule(nn.Module):
     """A module of bases that stays in float32 or float64, whatever it is cast to, and outlives inference mode."""
 
-    bases: Any
+    bases: Sequence[BasisBuffers]
     faces: Tensor
     built_from: Tensor
     _known: list[int] | None = None  # identities of tensors that are the bases' own
@@ -124,27 +125,27 @@ class PreciseModule(nn.Module):
 class InBetweenLayer(PreciseModule):
     """A layer that solves in-betweens of shapes near the references of its bases (:func:`basis_buffers`)."""
 
-    terms: Any
-    cores: Any
-    mu: Any
+    terms: Sequence[Term]
+    cores: Sequence[InBetweenSolver]
+    mu: float | Tensor
     separate = True
     """False to solve all bodies as one problem, for example with contact."""
 
     def __init__(self, bases: Sequence[BasisBuffers], faces: Tensor, chosen: Settings) -> None:
         super().__init__()
         self.objective, self.solver = chosen
-        self.terms = nn.ModuleList(self.objective.all_terms())
+        self.terms = nn.ModuleList(self.objective.all_terms())  # type: ignore[assignment]
         if self.objective.modal_space is None:
             _warn_of_stiffness(self.terms)
         register_weight(self, "mu", self.objective.mu)
-        self.bases = nn.ModuleList(bases)
+        self.bases = nn.ModuleList(bases)  # type: ignore[assignment]
         self.faces = torch.from_numpy(as_faces(faces))
         self._build()
         self.register_load_state_dict_post_hook(InBetweenLayer._build)
 
     @outside_inference_mode
     @alone()
-    def _build(self, _: Any = None) -> None:
+    def _build(self, _: object = None) -> None:
         """Build everything that follows from the bases, in float64 on the CPU, then of their dtype and device."""
         like = self.bases[0].reference
         references, modes = (
@@ -152,12 +153,13 @@ class InBetweenLayer(PreciseModule):
         )
         connectivity = check_surface(references, self.faces.cpu())[1]
         self.faces = torch.tensor(connectivity.faces)
-        chosen, several = self.objective, [(slice(None), connectivity)]
+        chosen = self.objective
+        several: list[tuple[Tensor | slice, Connectivity]] = [(slice(None), connectivity)]
         numbers = all(torch.as_tensor(term.stiffness).shape[-1:] in ((), (1,)) for term in self.terms)
         if self.separate and chosen.space != "paired" and numbers and not (chosen.contact or chosen.terms):
             several = bodies(torch.stack(references).numpy(), connectivity)
         #: Vertices of each body, and its solver.
-        self.vertices, self.cores = [vertices for vertices, _ in several], nn.ModuleList()
+        self.vertices, cores = [vertices for vertices, _ in several], []
         #: True where there is a volume to be kept: not in sheets, whose energy has two terms.
         self.encloses = []
         kind = ContactSolver if chosen.contact else InBetweenSolver
@@ -168,8 +170,9 @@ class InBetweenLayer(PreciseModule):
                 shapes, moves = shapes[order], [moves[i] for i in order]
             if len(several) > 1:  # without the modes of other bodies
                 moves = [each[each.flatten(1).any(1)] for each in moves]
-            self.cores.append(kind(shapes, moves, Mesh(mesh), list(self.terms), chosen, self.solver).to(like))
+            cores.append(kind(shapes, moves, Mesh(mesh), list(self.terms), chosen, self.solver).to(like))
             self.encloses.append(all(encloses(x, mesh) for x in shapes))
+        self.cores = nn.ModuleList(cores)  # type: ignore[assignment]
         self.register_buffer("built_from", self._marks(), persistent=False)
 
     @property

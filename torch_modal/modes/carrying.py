@@ -1,13 +1,11 @@
 """Deformation of the tetrahedra of one key-frame to other poses, so that each set is meshed once."""
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
-from numpy.typing import NDArray
 
-from torch_modal.arrays import FloatArray, IntArray
+from torch_modal.arrays import AnyArray, FloatArray, IntArray
 from torch_modal.geometry.sparse import factorize
 from torch_modal.geometry.surface import Surface
 from torch_modal.modes.solid import Solid
@@ -108,7 +106,7 @@ def vertex_rotations(before: FloatArray, after: FloatArray, faces: IntArray) -> 
     return nearest_rotations(np.stack(summed, axis=1).reshape(-1, 3, 3))
 
 
-def nearest_rotations(matrices: NDArray[Any]) -> FloatArray:
+def nearest_rotations(matrices: AnyArray) -> FloatArray:
     """The rotations nearest to matrices. *Shape:* ``(·, 3, 3) -> (·, 3, 3)``.
 
     The orthogonal factor of the polar decomposition by Newton's iteration ``X <- (s X + X^-T / s) / 2``, scaled by

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from torch_modal.arrays import FloatArray, IntArray
+from torch_modal.arrays import ArrayLike, FloatArray, IntArray
 from torch_modal.errors import MeshError, MeshWarning, ModalAnalysisError
 from torch_modal.geometry.bodies import bodies
 from torch_modal.geometry.connectivity import Connectivity
@@ -41,7 +41,7 @@ VERTICES_AT_ONCE = 30_000
 """Total size of concurrent eigenproblems: about 2 GiB."""
 
 
-def extract_modes(vertices: Any, faces: Any, n_modes: int = 30, **options: Any) -> ModalBasis:
+def extract_modes(vertices: ArrayLike, faces: ArrayLike, n_modes: int = 30, **options: Any) -> ModalBasis:
     """Lowest vibration modes of one shape: `extract_bases` for a single key-frame, with the same errors and warnings.
 
     Args:
@@ -57,8 +57,8 @@ def extract_modes(vertices: Any, faces: Any, n_modes: int = 30, **options: Any) 
 
 
 def extract_bases(
-    keyframes: Any,
-    faces: Any,
+    keyframes: ArrayLike,
+    faces: ArrayLike,
     n_modes: int = 30,
     *,
     method: Method = "auto",
@@ -121,8 +121,12 @@ def bases_of_checked(
     mesher: Mesher | str = "auto",
     cache: Cache | None = None,
     progress: Progress = None,
+    stacklevel: int = 3,
 ) -> list[ModalBasis]:
-    """`extract_bases` for the output of :func:`~torch_modal.keyframes.check.check_keyframes`."""
+    """`extract_bases` for the output of :func:`~torch_modal.keyframes.check.check_keyframes`.
+
+    Its warning names the line that is so many calls above.
+    """
     for what, choice, choices in (("method", method, METHODS), ("Hessian form", form, HESSIAN_FORMS)):
         if choice not in choices:
             raise ValueError(f"the {what} is {choice!r}; give one of {choices}")
@@ -151,7 +155,7 @@ def bases_of_checked(
             "how they move against each other is left to the interpolation of the key-frames; join them if they "
             "belong together",
             MeshWarning,
-            stacklevel=3,
+            stacklevel=stacklevel,
         )
     bases = []
     for shape, surface, result in zip(shapes, extraction.surfaces, results, strict=True):
@@ -258,7 +262,7 @@ class _Extraction:
         return self._all(compute, inputs, {"form": form, **self.mesher.key()}, len(solid.tetrahedra.vertices))
 
     def _all(
-        self, compute: Callable[[int], Arrays], inputs: Arrays, parameters: dict[str, Any], n_vertices: int
+        self, compute: Callable[[int], Arrays], inputs: Arrays, parameters: dict[str, object], n_vertices: int
     ) -> list[Arrays]:
         """Modes of all key-frames, from the cache or computed in as many threads as fit into memory."""
 

@@ -6,7 +6,6 @@ Deterministic; accepts every surface.
 import itertools
 import threading
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from scipy.fft import irfftn, next_fast_len, rfftn
@@ -94,7 +93,7 @@ class Lattice:
         if not 0 < self.cube <= 1:
             raise ValueError(f"cube is {self.cube}; give a number above 0, up to 1")
 
-    def key(self) -> dict[str, Any]:
+    def key(self) -> dict[str, object]:
         """The edge length and the version."""
         return {"mesher": "lattice", "cube": self.cube, "version": VERSION}
 

@@ -2,13 +2,11 @@
 
 import threading
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
-from numpy.typing import NDArray
 
-from torch_modal.arrays import FloatArray, IntArray
+from torch_modal.arrays import AnyArray, FloatArray, IntArray
 from torch_modal.geometry.surface import Surface
 from torch_modal.io.cache import Cache
 from torch_modal.modes.eigen import ElasticBody
@@ -46,7 +44,7 @@ class Solid:
         def embed(tetrahedra: Tetrahedra) -> tuple[Tetrahedra, IntArray, FloatArray]:
             return tetrahedra, *find_neighbours(surface.vertices, tetrahedra, surface.vertex_normals)
 
-        def compute() -> dict[str, NDArray[Any]]:
+        def compute() -> dict[str, AnyArray]:
             tetrahedra, neighbours, kernel = embed(without_small_pieces(mesher.fill(surface, stop)))
             piece = loose_pieces(tetrahedra)
             bears = np.bincount(piece[neighbours[kernel > 0]], minlength=piece.max() + 1) > 0

@@ -1,12 +1,11 @@
 """Tetrahedral meshes, their pieces, and meshers."""
 
 import threading
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-from torch_modal.arrays import BoolArray, FloatArray, IntArray
+from torch_modal.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from torch_modal.errors import ModalAnalysisError
 from torch_modal.geometry.connectivity import label_pieces
 from torch_modal.geometry.surface import Surface
@@ -36,7 +35,7 @@ class Tetrahedra(NamedTuple):
     tets: IntArray
     inside: FloatArray | None = None
 
-    def arrays(self) -> dict[str, NDArray[Any]]:
+    def arrays(self) -> dict[str, AnyArray]:
         """The arrays by name, without those that are None."""
         return {name: array for name, array in self._asdict().items() if array is not None}
 
@@ -48,7 +47,7 @@ class MesherError(ModalAnalysisError):
 class Mesher(Protocol):
     """Fills surfaces with tetrahedra."""
 
-    def key(self) -> dict[str, Any]:
+    def key(self) -> dict[str, object]:
         """Cache key besides the surface: name, settings and versions, as numbers, strings or None."""
         ...
 
@@ -116,7 +115,7 @@ def without_debris(tetrahedra: Tetrahedra) -> Tetrahedra:
     return submesh(tetrahedra, ~debris[piece])
 
 
-def small_pieces(amounts: NDArray[Any], corners: FloatArray, piece: IntArray) -> BoolArray:
+def small_pieces(amounts: AnyArray, corners: FloatArray, piece: IntArray) -> BoolArray:
     """True for pieces that have little volume or area, and little extent; false for the largest.
 
     From the amount of each piece, and the corners and pieces of elements. *Shape:* ``(P,), (M, n, 3), (M,) -> (P,)``.

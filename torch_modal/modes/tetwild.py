@@ -7,7 +7,6 @@ import zipfile
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -84,7 +83,7 @@ class TetWild:
             if value is not None and not low <= value <= high:
                 raise ValueError(f"{name} is {value}; give a number from {low:g} to {high:g}")
 
-    def key(self) -> dict[str, Any]:
+    def key(self) -> dict[str, object]:
         """Settings, and the versions of the packages."""
         settings = {name: value for name, value in asdict(self).items() if name not in ("timeout", "processor_time")}
         versions = {name: version(name) for name in ("pytetwild", "fast-simplification")}
@@ -137,7 +136,7 @@ class TetWild:
 class Auto:
     """The mesher ``"auto"``: a lattice, but fTetWild where parts of the surface touch, unless it fails or is slow."""
 
-    def key(self) -> dict[str, Any]:
+    def key(self) -> dict[str, object]:
         """The keys of both meshers."""
         return {**Lattice().key(), **{f"touching_{name}": value for name, value in TetWild().key().items()}}
 

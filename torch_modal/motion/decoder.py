@@ -8,7 +8,6 @@ stretch.
 
 import copy
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -93,7 +92,7 @@ class ModalDecoder(nn.Module):
         self.register_load_state_dict_post_hook(ModalDecoder._build)
 
     @outside_inference_mode
-    def _build(self, _: Any = None) -> None:
+    def _build(self, _: object = None) -> None:
         """Build everything that follows from the key-frames, their times and the reference."""
         keyframes = self.keyframes
         used = self.reference[self.faces.unique()]

@@ -1,6 +1,6 @@
 """Motion through many key-frames: smooth in time, at any time, differentiable."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -11,6 +11,7 @@ from torch_modal.autograd import disable_compile, full_precision, outside_infere
 from torch_modal.contact.active import refuse_transforms
 from torch_modal.contact.in_between import push_apart
 from torch_modal.elastic.backend import choose
+from torch_modal.elastic.distortion import Distortion
 from torch_modal.elastic.energy import RestShapes
 from torch_modal.elastic.shell import ALPHA, BETA
 from torch_modal.elastic.term import Mesh
@@ -21,7 +22,7 @@ from torch_modal.inbetween.results import InBetweenResult, join_bodies, report, 
 from torch_modal.inbetween.settings import Objective, Preset, Solver, settings
 from torch_modal.keyframes.arrays import as_faces, broadcast_leading
 from torch_modal.keyframes.check import check_surface
-from torch_modal.layers.base import Bases, BasisBuffers, PreciseModule, basis_buffers
+from torch_modal.layers.base import Bases, BasisBuffers, InBetweenLayer, PreciseModule, basis_buffers
 from torch_modal.layers.blend import Blend
 from torch_modal.layers.in_between import InBetween
 from torch_modal.motion.cubics import Scheme, evaluate_by_interval
@@ -68,8 +69,8 @@ class Path(PreciseModule):
     """
 
     times: Tensor
-    splines: Any
-    distortions: Any
+    splines: Sequence[Spline]
+    distortions: Sequence[Distortion]
 
     @outside_inference_mode
     def __init__(
@@ -100,7 +101,7 @@ class Path(PreciseModule):
         self.contact = objective.contact
         self.objective = replace(objective, contact=False)
         self.register_buffer("times", check_times(times, n, cyclic).to(buffers[0].reference.device))
-        self.bases = nn.ModuleList(buffers)
+        self.bases = nn.ModuleList(buffers)  # type: ignore[assignment]
         #: Number of key-frames, K.
         self.n_keyframes = n
         #: The key-frames of each interval.
@@ -109,14 +110,14 @@ class Path(PreciseModule):
         #: The path scheme; None for the default.
         self.scheme = smooth if callable(smooth) else None
         options: dict[str, Any] = {"objective": self.objective, "solver": self.solver}
-        #: In-betweens of each interval; a smooth path has none, or, with contact or further terms, one of all bases.
-        self.layers: Any = nn.ModuleList()
+        layers: list[InBetweenLayer] = []
         if not self.smooth:
-            self.layers.extend(InBetween([buffers[i], buffers[j]], self.faces, **options) for i, j in self.pairs)
+            layers.extend(InBetween([buffers[i], buffers[j]], self.faces, **options) for i, j in self.pairs)
         elif self.objective.terms or self.contact:
-            self.layers.append(Blend(buffers, self.faces, **options))
-        layer: Any
-        for layer in self.layers if self.contact else ():
+            layers.append(Blend(buffers, self.faces, **options))
+        #: In-betweens of each interval; a smooth path has none, or, with contact or further terms, one of all bases.
+        self.layers: Sequence[InBetweenLayer] = nn.ModuleList(layers)  # type: ignore[assignment]
+        for layer in layers if self.contact else ():
             layer.separate = False
             if len(layer.cores) > 1:
                 layer._build()
@@ -124,7 +125,7 @@ class Path(PreciseModule):
         self.register_load_state_dict_post_hook(Path._build)
 
     @outside_inference_mode
-    def _build(self, _: Any = None) -> None:
+    def _build(self, _: object = None) -> None:
         """Build the splines of the bases' references, on their device and in their dtype."""
         like = self.bases[0].reference
         references = torch.stack([basis.reference.double().cpu() for basis in self.bases])
@@ -134,10 +135,11 @@ class Path(PreciseModule):
         pieces = [(slice(None), connectivity)] if alone else bodies(references.numpy(), connectivity)
         #: Vertices of each body, and its spline.
         self.vertices = [vertices for vertices, _ in pieces]
-        self.splines, self.distortions = nn.ModuleList(), nn.ModuleList()
-        for vertices, mesh in pieces:
-            self.splines.append(Spline(mesh, references[:, vertices], self.times.cpu(), self.scheme, backend).to(like))
-            self.distortions.append(backend.distortion(Mesh(mesh), None).to(like))
+        times = self.times.cpu()
+        splines = [Spline(mesh, references[:, rows], times, self.scheme, backend) for rows, mesh in pieces]
+        distortions = [backend.distortion(Mesh(mesh), None) for _, mesh in pieces]
+        self.splines = nn.ModuleList(splines).to(like)  # type: ignore[assignment]
+        self.distortions = nn.ModuleList(distortions).to(like)  # type: ignore[assignment]
         self.register_buffer("built_from", self._marks(), persistent=False)
 
     @property

@@ -5,18 +5,18 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from itertools import pairwise
-from typing import Any
 
 import torch
 from torch import Tensor
 
+from torch_modal.arrays import ArrayLike
 from torch_modal.elastic.backend import choose
 from torch_modal.errors import MeshWarning
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.crossings import Crossings
 from torch_modal.inbetween.results import report
 from torch_modal.inbetween.settings import Objective, Preset, Settings, Solver, settings
-from torch_modal.keyframes.check import check_keyframes
+from torch_modal.keyframes.check import Keyframes, check_keyframes
 from torch_modal.layers.mid_shape import MidShape
 from torch_modal.modes.basis import ModalBasis
 from torch_modal.modes.extract import bases_of_checked
@@ -27,13 +27,16 @@ from torch_modal.times import Times, check_times
 
 MAX_LEVELS = 12
 
+GivenBases = Sequence[ModalBasis] | Callable[[Tensor, Tensor], Sequence[ModalBasis]] | None
+"""Bases, or what makes them of key-frames and faces."""
+
 
 def interpolate(
-    keyframes: Any,
-    faces: Any,
+    keyframes: ArrayLike,
+    faces: ArrayLike,
     levels: int = 3,
     *,
-    bases: Sequence[ModalBasis] | Callable[[Tensor, Tensor], Sequence[ModalBasis]] | None = None,
+    bases: GivenBases = None,
     n_modes: int = 30,
     cyclic: bool = False,
     n_frames: int | None = None,
@@ -97,50 +100,87 @@ def interpolate(
             key-frame does.
     """
     keyframes, faces = check_keyframes(keyframes, faces, min_keyframes=2)
-    n_keys, originals = len(keyframes), keyframes
-    places = keyframe_places(n_keys, levels, cyclic=cyclic, n_frames=n_frames, times=times)
-    made = None if callable(bases) else bases
-    if made is not None and proxy:
-        raise ValueError("the bases belong to the whole mesh, and a proxy has its own: leave out bases, or proxy")
-    n_proxy = proxy_size(proxy if made is None else 0, keyframes.shape[1])
-    carrier = Proxy(keyframes, faces, n_proxy) if n_proxy else None
-    if carrier:
-        keyframes, faces = check_keyframes(carrier.keyframes, carrier.faces)
+    places = keyframe_places(len(keyframes), levels, cyclic=cyclic, n_frames=n_frames, times=times)
+    carrier = _carrier(keyframes, faces, bases, proxy)
+    moving = check_keyframes(carrier.keyframes, carrier.faces) if carrier else Keyframes(keyframes, faces)
     chosen = settings(preset, objective, solver, regions, contact=contact, mu=mu)
     recursive = chosen.objective.space == "paired"
     if recursive and (smooth or n_frames is not None):
         raise ValueError("the paired space (Eq. 4) has the middle of a pair only: leave out smooth and n_frames")
-    smooth = not recursive and n_keys > 2 if smooth is None else smooth
-    objective = chosen.objective
+    smooth = not recursive and len(keyframes) > 2 if smooth is None else smooth
+    made = _make_bases(moving, bases, n_modes, smooth, chosen, progress)
+    sequence = _fill(moving, made, places, levels, times, cyclic, smooth, chosen, progress)
+    return carrier.carry(sequence, places, keyframes) if carrier else sequence
+
+
+subdivide = interpolate
+"""The paper's name of :func:`interpolate`."""
+
+
+def _carrier(keyframes: Tensor, faces: Tensor, bases: GivenBases, proxy: int | None) -> Proxy | None:
+    """A coarser mesh that moves instead, where it is asked for, or by default where a mesh without bases is large.
+
+    Raises:
+        ValueError: There are bases, too.
+    """
+    given = bases is not None and not callable(bases)
+    if given and proxy:
+        raise ValueError("the bases belong to the whole mesh, and a proxy has its own: leave out bases, or proxy")
+    n_proxy = proxy_size(0 if given else proxy, keyframes.shape[1])
+    return Proxy(keyframes, faces, n_proxy) if n_proxy else None
+
+
+def _make_bases(
+    moving: Keyframes, bases: GivenBases, n_modes: int, smooth: bool, chosen: Settings, progress: Progress
+) -> Sequence[ModalBasis] | Tensor:
+    """The given bases; otherwise bases with modes where these are needed, or the key-frames.
+
+    Raises:
+        ValueError: Their number is not the number of key-frames.
+    """
+    objective, n_keys = chosen.objective, len(moving.keyframes)
+    made: Sequence[ModalBasis] | Tensor = moving.keyframes.detach()
     in_modes = bool(objective.terms) or (objective.modal_space is not None and not (smooth and n_keys > 2))
-    if made is None and n_modes and (in_modes or objective.contact):
-        if callable(bases):
-            made = bases(keyframes, faces)
+    if bases is not None and not callable(bases):
+        made = bases
+    elif n_modes and (in_modes or objective.contact):
+        if bases is not None:
+            made = bases(*moving)
         else:
             with ThreadPoolExecutor(1) as pool:
                 loading = pool.submit(choose(chosen.solver.backend).load)  # takes a second
-                made = bases_of_checked(keyframes, faces, n_modes, progress=progress)
+                made = bases_of_checked(*moving, n_modes, progress=progress, stacklevel=4)
                 loading.result()
-    made = keyframes.detach() if made is None else made
     if len(made) != n_keys:
         raise ValueError(f"each key-frame needs its basis: got {len(made)} bases for {n_keys} key-frames")
+    return made
+
+
+def _fill(
+    moving: Keyframes,
+    bases: Sequence[ModalBasis] | Tensor,
+    places: Sequence[int],
+    levels: int,
+    times: Times,
+    cyclic: bool,
+    smooth: bool,
+    chosen: Settings,
+    progress: Progress,
+) -> Tensor:
+    """The sequence of checked key-frames with their bases: the key-frames at their places, shapes between them."""
+    keyframes, faces = moving
     sequence = keyframes.new_empty(places[-1] + 1, *keyframes.shape[1:])
     with ProgressReport(len(places) - 1, "in-between shapes", progress) as bar, torch.no_grad():
-        if recursive:
-            intervals = _subdivide_pairs(keyframes, faces, made, levels, len(places) - 1, chosen)
+        if chosen.objective.space == "paired":
+            intervals = _subdivide_pairs(keyframes, faces, bases, levels, len(places) - 1, chosen)
         else:
-            path = Path(made, faces.cpu(), times, cyclic, smooth, objective=chosen.objective, solver=chosen.solver)
+            path = Path(bases, faces.cpu(), times, cyclic, smooth, objective=chosen.objective, solver=chosen.solver)
             intervals = _follow_path(path.to(keyframes.device), keyframes, faces, places)
         for i, shapes in enumerate(intervals):
             sequence[places[i]], sequence[places[i] + 1 : places[i + 1]] = keyframes[i], shapes
             bar.update()
         sequence[-1] = keyframes[-1]
-    sequence = sequence[:-1] if cyclic else sequence
-    return carrier.carry(sequence, places, originals) if carrier else sequence
-
-
-subdivide = interpolate
-"""The paper's name of :func:`interpolate`."""
+    return sequence[:-1] if cyclic else sequence
 
 
 def _follow_path(path: Path, keyframes: Tensor, faces: Tensor, places: Sequence[int]) -> Iterator[Tensor]:

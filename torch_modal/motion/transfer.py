@@ -7,7 +7,6 @@ cotangent weights of the target.
 
 import math
 import warnings
-from typing import Any
 
 import numpy as np
 import torch
@@ -29,7 +28,7 @@ from torch_modal.keyframes.seams import WeldedKeyframes, weld_seams
 from torch_modal.motion.path import Path
 from torch_modal.motion.standing import stand
 from torch_modal.progress import Progress, ProgressReport
-from torch_modal.registration.landmarks import landmark_table
+from torch_modal.registration.landmarks import Landmarks, landmark_table
 from torch_modal.registration.load import ADVICE
 from torch_modal.registration.register import register
 from torch_modal.registration.report import TRUSTED, Registration
@@ -54,7 +53,7 @@ def transfer(
     *,
     rest: "Array | None" = None,
     registration: Registration | Tensor | None = None,
-    landmarks: Any = None,
+    landmarks: Landmarks = None,
     times: Times = None,
     anchors: bool = True,
     keep_doubtful: bool = False,
@@ -99,7 +98,7 @@ def transfer(
     if isinstance(frames, Path):
         knots = torch.stack([basis.reference for basis in frames.bases]).to(frames.dtype)
         frames = frames(knots, frames.times[: frames.n_keyframes] if times is None else torch.as_tensor(times))
-    given = as_positions(frames)
+    given = as_positions(frames)  # type: ignore[arg-type]  # a path has become shapes
     if given.ndim < 3:
         raise MeshError(f"frames have shape {tuple(given.shape)}; (T, V, 3) is needed, one shape alone is frames[None]")
     start = given.reshape(-1, *given.shape[-2:])[:1] if rest is None else as_positions(rest)[None].to(given)
@@ -131,7 +130,7 @@ def correspond(
     faces: Array,
     target: Array,
     target_faces: Array,
-    landmarks: Any = None,
+    landmarks: Landmarks = None,
     cache: bool = True,
     progress: Progress = None,
 ) -> Registration | Tensor:

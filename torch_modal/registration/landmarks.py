@@ -3,17 +3,20 @@
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from torch_modal.arrays import FloatArray, IntArray
+from torch_modal.arrays import ArrayLike, FloatArray, IntArray
 from torch_modal.errors import MeshError
 from torch_modal.io.write import to_numpy
 
+Landmarks: TypeAlias = "ArrayLike | str | os.PathLike[str] | None"
+"""None, a file, vertices ``(n, K)`` or points ``(n, K, 3)``."""
 
-def landmark_table(landmarks: Any, shapes: Sequence[FloatArray]) -> FloatArray:
+
+def landmark_table(landmarks: Landmarks, shapes: Sequence[FloatArray]) -> FloatArray:
     """Landmarks as points of all K meshes, from None, a file, vertices ``(n, K)`` or points. *Shape:* ``(n, K, 3)``.
 
     Raises:
@@ -21,8 +24,11 @@ def landmark_table(landmarks: Any, shapes: Sequence[FloatArray]) -> FloatArray:
         MeshError: Landmarks do not match the meshes, or a vertex does not exist.
     """
     n = len(shapes)
-    is_file = isinstance(landmarks, (str, os.PathLike))
-    table: Any = read_landmarks(landmarks, n) if is_file else to_numpy(np.zeros(0) if landmarks is None else landmarks)
+    table: Any = np.zeros(0)
+    if isinstance(landmarks, (str, os.PathLike)):
+        table = read_landmarks(landmarks, n)
+    elif landmarks is not None:
+        table = to_numpy(landmarks)
     if table.size == 0:
         return np.zeros((0, n, 3))
     if table.ndim == 3 and table.shape[1:] == (n, 3) and table.dtype.kind in "iuf" and np.isfinite(table).all():

@@ -3,7 +3,7 @@
 import os
 import warnings
 from collections.abc import Callable, Sequence
-from typing import Any
+from functools import partial
 
 import numpy as np
 import torch
@@ -12,7 +12,7 @@ from torch_modal.errors import MeshError, MeshWarning
 from torch_modal.io.read import open_asset, require_same_mesh
 from torch_modal.keyframes.check import Keyframes
 from torch_modal.progress import Progress
-from torch_modal.registration.landmarks import landmark_table
+from torch_modal.registration.landmarks import Landmarks, landmark_table
 
 ADVICE = (
     "give landmarks, five or more: a text file with a line for each, which names one vertex of each mesh, counted from "
@@ -24,7 +24,7 @@ def load_keyframes(
     paths: Sequence[str | os.PathLike[str]],
     *,
     register: bool = False,
-    landmarks: Any = None,
+    landmarks: Landmarks = None,
     same_subject: bool = True,
     cache_dir: str | os.PathLike[str] | None = None,
     cache: bool = True,
@@ -89,9 +89,8 @@ def load_keyframes(
                 raise
         from torch_modal.registration.register import register as register_pair
 
-        options: dict[str, Any] = {"same_subject": same_subject, "cache_dir": cache_dir, "cache": cache}
-        options |= {"landmarks": marks[:, k - 1 : k + 1], "progress": progress}
-        result = register_pair(shapes[-1], faces, there, there_faces, **options)
+        onto = partial(register_pair, same_subject=same_subject, cache_dir=cache_dir, cache=cache, progress=progress)
+        result = onto(shapes[-1], faces, there, there_faces, landmarks=marks[:, k - 1 : k + 1])
         name, origin = os.fspath(paths[k]), os.fspath(paths[k - 1])
         report(f"{name} registered from {origin}: {result.summary()}")
         if result.doubtful:

@@ -1,13 +1,13 @@
 """Registration of one mesh to another."""
 
 import os
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from threadpoolctl import threadpool_limits
 
-from torch_modal.arrays import BoolArray, FloatArray, IntArray
+from torch_modal.arrays import AnyArray, ArrayLike, BoolArray, FloatArray, IntArray
 from torch_modal.errors import MeshError
 from torch_modal.geometry.rigid import best_fit
 from torch_modal.io.cache import Cache
@@ -16,7 +16,7 @@ from torch_modal.keyframes.seams import weld_seams
 from torch_modal.passengers.passengers import Passengers
 from torch_modal.progress import Progress, ProgressReport
 from torch_modal.registration.fit import COARSE_STAGES, FINE_STAGES, TemplateFit, sliding_freedom
-from torch_modal.registration.landmarks import landmark_table
+from torch_modal.registration.landmarks import Landmarks, landmark_table
 from torch_modal.registration.maps import (
     COARSE_FUNCTIONS,
     FINE_FUNCTIONS,
@@ -66,12 +66,12 @@ class _Candidate(NamedTuple):
 
 
 def register(
-    template: Any,
-    template_faces: Any,
-    target: Any,
-    target_faces: Any,
+    template: ArrayLike,
+    template_faces: ArrayLike,
+    target: ArrayLike,
+    target_faces: ArrayLike,
     *,
-    landmarks: Any = None,
+    landmarks: Landmarks = None,
     same_subject: bool = True,
     cache_dir: str | os.PathLike[str] | None = None,
     cache: bool = True,
@@ -117,7 +117,7 @@ def register(
         )
     meshes = [(one.keyframes[0].numpy(), one.faces.numpy()) for one in (welded, welded_goal)]
 
-    def compute() -> dict[str, Any]:
+    def compute() -> dict[str, AnyArray]:
         # The matrices are too small for BLAS threads.
         with ProgressReport(None, "register", progress) as report, threadpool_limits(1):
             return _RegistrationProblem(meshes[0], meshes[1], points, same_subject, report).solve().arrays()

@@ -1,16 +1,17 @@
 """Result and confidence of a registration."""
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
-from torch_modal.arrays import FloatArray
+from torch_modal.arrays import AnyArray, ArrayLike, FloatArray
 from torch_modal.errors import MeshError
 from torch_modal.io.write import to_numpy
 from torch_modal.registration.surface import MeshSurface, keep_pieces
+
+Number = TypeVar("Number", float, FloatArray)
 
 TRUSTED = 0.5  # confidence below which a result is doubtful
 
@@ -134,13 +135,13 @@ class Registration(NamedTuple):
         """True for a confidence below 0.5."""
         return self.confidence < TRUSTED
 
-    def arrays(self) -> dict[str, NDArray[Any]]:
+    def arrays(self) -> dict[str, AnyArray]:
         """Arrays for a file."""
         arrays = {name: to_numpy(value) for name, value in self._asdict().items() if name != "warnings"}
         return arrays | {"warnings": np.frombuffer("\n".join(self.warnings).encode(), dtype=np.uint8)}
 
     @classmethod
-    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> "Registration":
+    def from_arrays(cls, arrays: Mapping[str, AnyArray]) -> "Registration":
         """Inverse of `arrays`."""
         fields: dict[str, Any] = {"warnings": tuple(arrays["warnings"].tobytes().decode().splitlines())}
         fields |= {name: Distances(*arrays[name].tolist()) for name in ("to_target", "from_target")}
@@ -148,7 +149,7 @@ class Registration(NamedTuple):
             fields[name] = torch.from_numpy(arrays[name]) if arrays[name].ndim else arrays[name].item()
         return cls(**fields)
 
-    def sample(self, values: Any) -> torch.Tensor:
+    def sample(self, values: ArrayLike) -> torch.Tensor:
         """Transfer attributes from the target's vertices to the template's vertices.
 
         Floats (colours, texture coordinates) are interpolated in the closest face; integers and booleans (labels) come
@@ -187,7 +188,7 @@ class Registration(NamedTuple):
         )
 
 
-def ramp(value: Any, bad: float, good: float) -> Any:
+def ramp(value: Number, bad: float, good: float) -> Number:
     """Linear ramp from 0 at ``bad`` to 1 at ``good``."""
     return np.clip((value - bad) / (good - bad), 0, 1)
 

@@ -1,13 +1,14 @@
 """Local weights of a set's shapes, and the rigid motion, that bring them closest to a few observed points."""
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from scipy.optimize import least_squares
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from torch_modal.autograd import Context
 from torch_modal.elastic.steps import conjugate_gradients
 from torch_modal.geometry.rigid import RigidMotion, best_fit, centroid, infinitesimal_motions
 from torch_modal.statistics.variation import Variation
@@ -154,14 +155,14 @@ class _FactorsOfPoints(torch.autograd.Function):
     """Factors of least cost, with their derivatives in the observed points by the implicit function theorem."""
 
     @staticmethod
-    def forward(ctx: Any, factors: Tensor, points: Tensor, problem: LocalWeights, to: Observations) -> Tensor:
+    def forward(ctx: Context, factors: Tensor, points: Tensor, problem: LocalWeights, to: Observations) -> Tensor:
         ctx.problem, ctx.to = problem, to._replace(points=points.detach())
         ctx.save_for_backward(factors, points)
         return factors.clone()
 
     @staticmethod
     @once_differentiable  # second derivatives lack the elastic steps, which are constants of the graph
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Context, grad: Tensor) -> tuple[Tensor | None, ...]:
         (factors, points), problem = ctx.saved_tensors, ctx.problem
         slopes = problem.slopes(factors, ctx.to, problem.noise)
         matrix = slopes.mT @ slopes

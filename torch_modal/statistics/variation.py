@@ -10,6 +10,7 @@ from torch.nn.functional import one_hot
 from torch_modal import trees
 from torch_modal.elastic.backend import choose
 from torch_modal.elastic.bend import Bend
+from torch_modal.elastic.energy import Energy, Rest
 from torch_modal.elastic.shell import ALPHA, BETA, GAMMA
 from torch_modal.elastic.steps import FreeEnergy
 from torch_modal.elastic.stretch import Stretch
@@ -106,7 +107,7 @@ class Variation:
         The springs are an energy at a size of 100. *Shape:* ``(V, 3), (K, V)``.
         """
         energy = self.fine.energy
-        rest = trees.map_leaves(energy.mix_rests(self.rest, weights), lambda measure: measure[None])
+        rest = trees.map_leaves(mix_rests(energy, self.rest, weights), lambda measure: measure[None])
         reference = energy.reference_of(rest, self.stiffness)
         further = [] if springs is None else [springs]
         return self.fine.descend_towards(self.scale * x[None], reference, products, further)[0] / self.scale
@@ -248,3 +249,24 @@ def check_density(concentration: float, locality: float, beyond: tuple[float, fl
         raise ValueError(f"concentration is above 0, locality 0 or more; got {concentration} and {locality}")
     if not 0 <= beyond[0] <= beyond[1] <= 1:
         raise ValueError(f"beyond is a range (low, high) within [0, 1]; got {beyond}")
+
+
+def mix_rests(energy: Energy, rest: Rest, weights: Tensor) -> Rest:
+    """One rest shape whose measures are weighted sums of the measures of K shapes.
+
+    Where weights differ from vertex to vertex, or are far below zero, merging the shapes (Eq. 8) asks for harmonic
+    means.
+
+    Args:
+        energy: The terms.
+        rest: Measures and weights of K shapes.
+        weights: They add up to one. *Shape:* ``(K, V)``.
+    """
+    measures, stiffness = [], []
+    for summand, values, rest_weights in zip(energy.parts, rest.measures, rest.weights, strict=True):
+        total = summand.term.total
+        element_weights = weights.mean(1, keepdim=True) if total else weights[:, summand.corners].mean(1)
+        first = values[..., :1, :]  # differences of angles from it go the short way round
+        measures.append((element_weights * (first + summand.term.difference(values, first))).sum(-2))
+        stiffness.append((element_weights * rest_weights.expand_as(values)).sum(-2).clamp_min(0))
+    return Rest(tuple(measures), tuple(stiffness))

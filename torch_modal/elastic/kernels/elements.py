@@ -136,7 +136,7 @@ def _rider(f: Formulas | None) -> SimpleNamespace:
 
 
 @cache
-def convex(f: Formulas, rider: Formulas | None) -> SimpleNamespace:
+def kernels_of(f: Formulas, rider: Formulas | None) -> SimpleNamespace:
     """Value, gradient and convex Hessian of a term, and of another that rides on its elements.
 
     Where both read and write the same vertices, one pass takes two thirds of the time of two. The elements are then
@@ -255,11 +255,3 @@ def _product(f: Formulas, rider: Formulas | None) -> "wp.Kernel":
             wp.atomic_add(scalars, first + s, vec3(real(0.0), real(0.0), total))
 
     return product
-
-
-@cache
-def convex_adjoint(f: Formulas, rider: Formulas | None) -> SimpleNamespace:
-    """Adjoints of :func:`convex`, which Warp generates."""
-    module = module_of(f, f"convex_adjoint.{rider.name if rider else None}")
-    kernels = vars(convex(f, rider))
-    return SimpleNamespace(**{name: wp.kernel(kernel.func, module=module) for name, kernel in kernels.items()})

@@ -1,18 +1,29 @@
 """Functions of tensors by kernels, for all that autograd and ``torch.func`` do."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import torch
 from torch import Tensor
 
-from torch_modal.autograd import apply_transpose, is_double_backward, is_traced, merge_vmapped, needs_function
+from torch_modal.autograd import (
+    Context,
+    InDims,
+    VmapInfo,
+    Vmapped,
+    apply_merged,
+    apply_transpose,
+    is_double_backward,
+    is_traced,
+    needs_function,
+)
+
+Kept = TypeVar("Kept")
 
 
-class Operation:
+class Operation(Generic[Kept]):
     """A function of float64 tensors by kernels. The first dimension of all tensors counts the samples."""
 
-    n_results = 1
     n_differentiable = 1
     """Number of results with gradients; they come first."""
     run: Callable[..., tuple[Tensor, ...]]
@@ -22,38 +33,39 @@ class Operation:
     by_torch: Callable[..., tuple[Tensor, ...]]
     """Results by torch instead of kernels: for forward mode, second derivatives, and tensors without data."""
 
-    def __call__(self, *tensors: Tensor, kernels: bool = True) -> tuple[Tensor, ...]:
-        """The results for tensors of any dtype, by kernels or torch."""
-        if kernels and not needs_function(*tensors):
+    def __call__(self, *tensors: Tensor) -> tuple[Tensor, ...]:
+        """The results for tensors of any dtype."""
+        if not needs_function(*tensors):
             with torch.no_grad():
                 return self.run(None, *(x.detach().double().contiguous() for x in tensors))
         tensors = tuple(x.double() for x in tensors)
-        if not kernels or any(map(is_traced, tensors)):
+        if any(map(is_traced, tensors)):
             return self.by_torch(*tensors)
         return tuple(_Fused.apply(self, [] if any(x.requires_grad for x in tensors) else None, *tensors))
 
 
 class _Fused(torch.autograd.Function):
     @staticmethod
-    def forward(operation: Operation, kept: list[Any] | None, *tensors: Tensor) -> tuple[Tensor, ...]:
+    def forward(operation: Operation[Kept], kept: list[Kept] | None, *tensors: Tensor) -> tuple[Tensor, ...]:
         return operation.run(kept, *(x.detach().contiguous() for x in tensors))
 
     @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
+    def setup_context(ctx: Context, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
         ctx.operation, ctx.kept, *tensors = inputs
+        ctx.n_results = len(output)
         ctx.mark_non_differentiable(*output[ctx.operation.n_differentiable :])
         ctx.save_for_backward(*tensors)
         ctx.save_for_forward(*tensors)
 
     @staticmethod
-    def jvp(ctx: Any, *tangents: Tensor | None) -> tuple[Tensor | None, ...]:
+    def jvp(ctx: Context, *tangents: Tensor | None) -> tuple[Tensor | None, ...]:
         n, by_torch = ctx.operation.n_differentiable, ctx.operation.by_torch
         results, back = torch.func.vjp(lambda *tensors: by_torch(*tensors)[:n], *ctx.saved_tensors)[:2]
         moved = apply_transpose(back, tuple(map(torch.zeros_like, results)), ctx.saved_tensors, tangents[2:])
-        return *moved, *[None] * (ctx.operation.n_results - n)
+        return *moved, *[None] * (ctx.n_results - n)
 
     @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Context, *grads: Tensor) -> tuple[Tensor | None, ...]:
         operation, tensors = ctx.operation, ctx.saved_tensors
         if is_double_backward(*grads, *tensors):
             gradients = torch.func.vjp(operation.by_torch, *tensors)[1](grads)
@@ -64,8 +76,6 @@ class _Fused(torch.autograd.Function):
 
     @staticmethod
     def vmap(
-        info: Any, in_dims: tuple[Any, ...], operation: Operation, kept: list[Any] | None, *tensors: Tensor
-    ) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
-        flat = merge_vmapped(info.batch_size, in_dims[2:], tensors)
-        results = _Fused.apply(operation, None if kept is None else [], *flat)
-        return tuple(x.unflatten(0, (info.batch_size, -1)) for x in results), (0,) * len(results)
+        info: VmapInfo, in_dims: InDims, operation: Operation[Kept], kept: list[Kept] | None, *x: Tensor
+    ) -> Vmapped:
+        return apply_merged(_Fused, (operation, None if kept is None else []), info, in_dims, x)

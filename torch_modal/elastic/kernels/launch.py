@@ -4,15 +4,20 @@ import importlib
 import inspect
 import os
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
-from typing import Any, Literal
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
+from torch_modal.elastic.term import Formulas
 from torch_modal.progress import ProgressReport
+
+if TYPE_CHECKING:
+    import warp as wp
 
 PACKAGE = "torch_modal.elastic.kernels"
 MOST_ENTRIES = 2**31 - 1
@@ -21,28 +26,35 @@ _LOADING = threading.RLock()
 
 
 @cache
-def kernels(name: str) -> Any:
+def kernels(name: str) -> ModuleType:
     """A module of the kernels. The first launch on a machine's kind of device compiles it, and Warp keeps it."""
     return importlib.import_module(f"{PACKAGE}.{name}")
 
 
-def of_elements(kind: Literal["convex", "convex_adjoint", "forward", "backward"], *arguments: Any) -> Any:
-    """Kernels of a module that one or two terms have: of the energy, or of the merging of rest shapes."""
+@cache
+def of_elements(file: str, name: str, *formulas: Formulas | None) -> "wp.Kernel":
+    """A kernel that a file, ``"elements"`` or ``"merging"``, makes of the formulas of one or two terms."""
     with _LOADING:
-        return getattr(kernels("elements" if kind.startswith("convex") else "merging"), kind)(*arguments)
+        return getattr(kernels(file).kernels_of(*formulas), name)
 
 
-def load_kernels(files: Iterable[str], make: Callable[[], None]) -> None:
-    """Load kernels for the CPU: of files, and those that a function makes."""
+@cache
+def _adjoint(kernel: "wp.Kernel") -> "wp.Kernel":
+    """A kernel once more, with the adjoint that Warp generates, in another module."""
+    import warp as wp
+
+    return wp.kernel(kernel.func, module=wp.get_module(f"{kernel.module.name}_adjoint"))
+
+
+def load_kernels(make: Callable[[], None]) -> None:
+    """Load the kernels that a function makes, for the CPU."""
     with _LOADING:
-        for name in files:
-            kernels(name)
         make()
         _load(PACKAGE, torch.device("cpu"))
 
 
 @cache
-def _load(module: Any, device: torch.device) -> None:
+def _load(module: "str | wp.Module", device: torch.device) -> None:
     """Compile a module and those below it, several at a time, or take them from Warp's cache."""
     import warp as wp
 
@@ -79,7 +91,7 @@ def _quietly() -> Iterator[None]:
 
 
 @cache
-def _entries(kernel: Any) -> list[tuple[int, torch.dtype] | None]:
+def _entries(kernel: "wp.Kernel") -> list[tuple[int, torch.dtype] | None]:
     """Number and type of the numbers in an entry of each argument that is an array; None for others."""
     import warp as wp
 
@@ -95,7 +107,9 @@ def _entries(kernel: Any) -> list[tuple[int, torch.dtype] | None]:
     return entries
 
 
-def launch(kernel: Any, dim: tuple[int, ...], arguments: Sequence[Any], adjoints: Sequence[Any] = ()) -> None:
+def launch(
+    kernel: "wp.Kernel", dim: tuple[int, ...], arguments: Sequence[object], adjoints: Sequence[object] = ()
+) -> None:
     """Run a kernel, or its adjoint, on the tensors' device and torch's stream.
 
     Args:
@@ -131,9 +145,12 @@ class _Command:
     Its descriptions of arrays are written anew each time: they do not hold the tensors.
     """
 
-    def __init__(self, kernel: Any, device: torch.device, back: bool, arguments: Sequence[Any]) -> None:
+    def __init__(self, kernel: "wp.Kernel", device: torch.device, back: bool, arguments: Sequence[object]) -> None:
         import warp as wp
 
+        if back:
+            with _LOADING:  # of the whole module, as Warp compiles no kernel for itself
+                kernel, *_ = [_adjoint(one) for one in (kernel, *kernel.module.kernels.values())]
         _load(kernel.module, device)
         self.device, self.n_threads, entries = device, 1, _entries(kernel)
         values = [x if entry is None else None for entry, x in zip(entries, arguments, strict=True)]
@@ -156,7 +173,7 @@ class _Command:
                     self.recorded.set_param_at_index_from_ctype(i, array, adjoint=adjoint > 0)
                     arrays.append((i, array, array.shape, *entry))
 
-    def __call__(self, n_threads: int, arguments: Sequence[Any], adjoints: Sequence[Any]) -> None:
+    def __call__(self, n_threads: int, arguments: Sequence[object], adjoints: Sequence[object]) -> None:
         for i, before in self.numbers.items():
             x = arguments[i]
             if x is not before:
@@ -194,7 +211,7 @@ class _Commands(threading.local):
     """The commands of a thread."""
 
     def __init__(self) -> None:
-        self.known: dict[tuple[Any, torch.device, bool], _Command] = {}
+        self.known: dict[tuple[wp.Kernel, torch.device, bool], _Command] = {}
 
 
 _COMMANDS = _Commands()

@@ -61,7 +61,7 @@ def _merging(f: Formulas) -> SimpleNamespace:
 
 
 @cache
-def forward(f: Formulas) -> SimpleNamespace:
+def kernels_of(f: Formulas) -> SimpleNamespace:
     """Kernels that merge the rest shapes of a term into records (Eq. 8)."""
     c, potential, module = common(f), functions_of(f).potential, module_of(f, "forward")
     measure = functions_of(f).measure
@@ -109,9 +109,3 @@ def forward(f: Formulas) -> SimpleNamespace:
         wp.atomic_add(out, s, moments_sum)
 
     return SimpleNamespace(merge=merge, total=total)
-
-
-@cache
-def backward(f: Formulas) -> SimpleNamespace:
-    """The adjoint of ``merge``."""
-    return SimpleNamespace(merge=wp.kernel(forward(f).merge.func, module=module_of(f, "backward")))

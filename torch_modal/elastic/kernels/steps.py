@@ -1,8 +1,8 @@
 """Conjugate gradients for the steps of all vertices, preconditioned by the vertices' blocks.
 
 The scalars of an iteration are the inner product of its residual, the volume that its direction sweeps, and the inner
-product of the direction with the Hessian's product but for the volume's part. Warp differentiates these kernels
-(:mod:`torch_modal.elastic.kernels.steps_adjoint`), where the fields of all iterations are kept.
+product of the direction with the Hessian's product but for the volume's part. Adjoints need the fields of all
+iterations.
 """
 
 import warp as wp

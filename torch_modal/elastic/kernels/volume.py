@@ -10,7 +10,7 @@ SIXTH = wp.constant(real(formulas.SIXTH))
 triangle_area = for_kernels(formulas.triangle_area)
 
 
-@wp.kernel
+@wp.kernel(enable_backward=False)
 def sizes(
     faces: wp.array[wp.vec3i], n_vertices: int, x: wp.array[vec3], result: wp.array[vec3], n_areas: int,
     normal: wp.array[vec3], threads: int,
