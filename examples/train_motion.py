@@ -70,10 +70,7 @@ class Next(nn.Module):
 
 
 def learn(x: Tensor, faces: Tensor, kind: Kind, steps: int, rate: float, seed: int) -> tuple[dict[str, float], Tensor]:
-    """Train a network on all but the last animals; errors on these in percent, and the first one's predicted stride.
-
-    Errors are of decoded true codes and of predicted strides, over the diagonal, and of their edges, over the lengths.
-    """
+    """Train on all but the last animals; errors on these in % of the diagonal and of edges, and a predicted stride."""
     codes, decode = kind
     net, generator = Next(codes[:-N_TEST], seed), torch.Generator().manual_seed(seed)
     optimizer = torch.optim.Adam(net.parameters(), rate)
@@ -98,16 +95,16 @@ def learn(x: Tensor, faces: Tensor, kind: Kind, steps: int, rate: float, seed: i
 def main(n_animals: int = 4, steps: int = 300, seed: int = 0, n_modes: int = 30, out: str = "") -> dict[str, tuple]:
     """Errors and the first predicted stride, in each kind of coordinates; these are drawn to a file."""
     x, faces = map(torch.from_numpy, strides(n_animals + N_TEST, N_FRAMES, 0.04, 0.7, 1.2, seed))
-    kinds = spaces(x, faces, n_animals, n_modes)
-    found = {name: learn(x, faces, kind, steps, RATES.get(name, 5e-3), seed) for name, kind in kinds.items()}
+    found = {}
+    for name, kind in spaces(x, faces, n_animals, n_modes).items():
+        found[name] = learn(x, faces, kind, steps, RATES.get(name, 5e-3), seed)
     if out:
         shown = torch.linspace(0, N_FRAMES - 3, 5).long()
         rows = {"truth": x[-N_TEST, 2:][shown], **{name: stride[shown] for name, (_, stride) in found.items()}}
         style = {"titles": [f"step {step + 1}" for step in shown], "view": (0.0, 8.0), "up": "y"}
         errors = {name: 100 * (y - rows["truth"]).norm(dim=-1) for name, y in rows.items()}
-        tm.render_sequence(
-            rows, faces, out, keyframe_indices=[], colors=errors, color_label="error, % of size", **style
-        )
+        label = "error in % of the bounding box"
+        tm.render_sequence(rows, faces, out, colors=errors, color_label=label, keyframe_indices=[], **style)
     return found
 
 

@@ -77,7 +77,7 @@ class Asset(ABC):
     """Features that :meth:`with_positions` keeps."""
 
     suffix: str
-    """Ending of such a file, ``".obj"``, ``".ply"``, ``".off"`` or ``".glb"``; it is GLB of a GLTF file."""
+    """Ending of such a file, as ``".obj"``; it is GLB of a GLTF file, and VTP of a VTU file."""
 
     def __init__(self, path: Path) -> None:
         self.path = path

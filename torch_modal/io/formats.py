@@ -62,6 +62,9 @@ MESH_FORMATS: dict[str, OutputFormat] = {
     ".obj": OutputFormat("torch_modal.io.obj:obj_bytes"),
     ".off": OutputFormat("torch_modal.io.ply:off_bytes"),
     ".glb": OutputFormat("torch_modal.io.glb:glb_bytes", GLB_HOLDS),
+    ".stl": OutputFormat("torch_modal.io.stl:stl_bytes"),
+    ".vtk": OutputFormat("torch_modal.io.vtk:vtk_bytes", (), ("pyvista",), "vtk"),
+    ".vtp": OutputFormat("torch_modal.io.vtk:vtp_bytes", (), ("pyvista",), "vtk"),
 }
 ANIMATION_FORMATS: dict[str, OutputFormat] = {
     ".glb": OutputFormat("torch_modal.io.glb:write_glb", GLB_HOLDS),
