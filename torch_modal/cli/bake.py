@@ -81,7 +81,7 @@ def run(args: argparse.Namespace) -> None:
             args.report(f"error:     {error((filled - frames)[left])} at the {len(left)} frames between key-frames")
         frames = filled
     skin = tm.bake(frames, faces, args.bones) if args.bones else None
-    asset = None if files[0].suffix.lower() == ".npz" else tm.open_asset(files[0])
+    asset = None if files[0].suffix.lower() in (".npz", ".abc") else tm.open_asset(files[0])
     if asset is not None:
         asset.carries.pop("posing", None)  # it is what is written
     options = pick_options(args, "cyclic", "targets", "progress")

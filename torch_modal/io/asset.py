@@ -3,7 +3,8 @@
 import io
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -41,6 +42,12 @@ def linear_rgba(colors: FloatArray) -> FloatArray:
     rgb = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
     alpha = clipped[:, 3:] if colors.shape[1] > 3 else np.ones((len(colors), 1))
     return np.concatenate([rgb, alpha], axis=1)
+
+
+def fans(polygons: Iterable[IntArray]) -> IntArray:
+    """Triangles ``(F, 3)`` of polygons, from the first corner of each, so that they are the same in all frames."""
+    faces = [(polygon[0], *pair) for polygon in polygons for pair in pairwise(polygon[1:])]
+    return np.array(faces, dtype=np.int64).reshape(-1, 3)
 
 
 class Material(NamedTuple):

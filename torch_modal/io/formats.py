@@ -74,6 +74,7 @@ ANIMATION_FORMATS: dict[str, OutputFormat] = {
         (".usd", ".usda", ".usdc"),
         OutputFormat("torch_modal.io.usd:write_usd", USD_HOLDS, ("pxr",), "usd"),
     ),
+    ".abc": OutputFormat("torch_modal.io.alembic:write_alembic", ("polygons", "texcoords"), ("alembic3d",), "alembic"),
     **dict.fromkeys((".mdd", ".pc2"), OutputFormat("torch_modal.io.animations:write_point_cache", FEATURES)),
     ".npz": OutputFormat("torch_modal.io.animations:write_npz", FEATURES),
 }

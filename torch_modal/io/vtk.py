@@ -1,7 +1,6 @@
 """Surfaces of VTK files, read and written by PyVista."""
 
 import tempfile
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +9,7 @@ import numpy as np
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.errors import MeshError
 from torch_modal.extras import require
-from torch_modal.io.asset import Asset
+from torch_modal.io.asset import Asset, fans
 
 
 class VtkAsset(Asset):
@@ -31,11 +30,9 @@ class VtkAsset(Asset):
         self.suffix = ".vtk" if path.suffix.lower() == ".vtk" else ".vtp"
         self._mesh = mesh
         self.positions = np.array(mesh.points, dtype=np.float64)
-        # Not by VTK, which cuts along the shorter diagonal of each frame.
         polygons = mesh.irregular_faces
-        fans = [(polygon[0], *pair) for polygon in polygons for pair in pairwise(polygon[1:])]
-        self.faces = np.array(fans, dtype=np.int64).reshape(-1, 3)
-        self._note("polygons", "polygons", len(fans) > len(polygons))
+        self.faces = fans(polygons)  # not by VTK, which cuts along the shorter diagonal of each frame
+        self._note("polygons", "polygons", len(self.faces) > len(polygons))
         self._note("normals", "normals", mesh.point_data.active_normals is not None)
         arrays = [*mesh.point_data, *mesh.cell_data]
         self._note("properties", f"arrays {', '.join(arrays)}", arrays)

@@ -43,9 +43,9 @@ def save_animation(
     ``.glb`` is glTF 2.0 with a morph target for each frame after the first; viewers interpolate linearly between
     neighbouring frames. glTF calls Y up and metres the unit; the caller's coordinates are written as they are
     (float32), so a Z-up sequence lies on its back there. Normals move with the shape. ``.usd``, ``.usda`` and ``.usdc``
-    (extra ``usd``) hold the points over time in the same manner. A GLB with ``bones`` holds a skin instead
-    (:func:`torch_modal.bake`), a tenth of the size, with which every engine plays; with ``targets``, the mean and a few
-    principal shapes.
+    (extra ``usd``) hold the points over time in the same manner, ``.abc`` (extra ``alembic``) at a fixed rate. A GLB
+    with ``bones`` holds a skin instead (:func:`torch_modal.bake`), a tenth of the size, with which every engine plays;
+    with ``targets``, the mean and a few principal shapes.
 
     ``.mp4`` (extra ``video``) and ``.gif`` are drawn. ``.mdd`` and ``.pc2`` are point caches, for a mesh that is
     already in Blender, Maya or Houdini. ``.npz`` holds ``frames``, ``faces``, ``times`` and ``keyframes`` as arrays.
