@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from torch_modal.geometry.skin import Skin
 
 FPS = 24.0
+PIXELS = 640  # the longer side of a picture of a video
 
 
 @dataclass(frozen=True)
@@ -184,3 +185,5 @@ class Animation(NamedTuple):
     """The motion as bones, instead of morph targets."""
     targets: int | None = None
     """Number of principal shapes, instead of a morph target for each frame."""
+    size: int = PIXELS
+    """The longer side of a picture of a video, in pixels."""
