@@ -156,7 +156,8 @@ def test_gif_read_back(tmp_path):
     assert (pictures[0] < 250).any(axis=2).mean() > 0.1  # there is something to see
 
 
-def test_textures_are_drawn(tmp_path):
+@pytest.mark.parametrize("suffix", ["obj", "glb"])
+def test_textures_are_drawn(tmp_path, suffix):
     """A square of two triangles seen from the front: each quarter has the colour of its quarter of the picture."""
     texture = np.zeros((2, 2, 3), np.uint8)
     texture[:] = [[(200, 0, 0), (0, 200, 0)], [(0, 0, 200), (200, 200, 0)]]
@@ -165,6 +166,9 @@ def test_textures_are_drawn(tmp_path):
     corners = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"
     (tmp_path / "a.obj").write_text(f"mtllib a.mtl\n{corners}usemtl skin\nf 1/1 2/2 3/3 4/4\n")
     asset = tm.open_asset(tmp_path / "a.obj")
+    if suffix == "glb":
+        (path,) = tm.save_mesh(asset.positions, asset.faces, tmp_path / "a.glb", asset=asset)
+        asset = tm.open_asset(path)
     path = tm.save_animation(asset.positions[None], asset.faces, tmp_path / "a.gif", asset=asset, size=120)
     picture = np.asarray(Image.open(path).convert("RGB"), dtype=float)
     assert max(picture.shape) == 120
@@ -174,6 +178,10 @@ def test_textures_are_drawn(tmp_path):
         for column, color in zip(columns, line, strict=True):
             seen = picture[row, column]
             assert ((seen > 60) == (color > 0)).all(), (row, column, seen, color)
+    (tmp_path / "skin.png").write_bytes((tmp_path / "skin.png").read_bytes()[:40])
+    if suffix == "obj":
+        with pytest.warns(MeshWarning, match="texture of 'skin' cannot be read"):
+            tm.save_animation(asset.positions[None], asset.faces, path, asset=tm.open_asset(tmp_path / "a.obj"))
     with pytest.raises(ValueError, match="size must be a number of pixels, 2 or more"):
         tm.save_animation(FRAMES[:1], FACES, tmp_path / "b.gif", size=1)
 

@@ -1,12 +1,14 @@
 """Shapes and points drawn by matplotlib into cells of a figure, in view coordinates, a cell centred at the origin."""
 
 import io
+import warnings
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from torch_modal.arrays import FloatArray, IntArray
+from torch_modal.errors import MeshWarning
 from torch_modal.geometry.vectors import vertex_normals
 from torch_modal.io.asset import Asset, linear_rgba
 
@@ -51,8 +53,14 @@ def textured(asset: Asset, n: int) -> Surface:
         paint = np.broadcast_to(np.array(part.material.color[:3]), (len(part.triangles) * len(pieces), 3, 3))
         if part.colors is not None:
             paint = paint * _interpolate(pieces, part.colors[part.triangles, :3])
+        picture = None
         if part.material.texture is not None and part.texcoords is not None:
-            picture = np.asarray(Image.open(io.BytesIO(part.material.texture)).convert("RGB")) / 255
+            try:
+                picture = np.asarray(Image.open(io.BytesIO(part.material.texture)).convert("RGB")) / 255
+            except Exception as error:  # damaged pictures may raise any exception
+                text = f"the texture of {part.material.name!r} cannot be read, and is not drawn: {error}"
+                warnings.warn(text, MeshWarning, stacklevel=5)
+        if picture is not None and part.texcoords is not None:
             places = _interpolate(pieces, part.texcoords[part.triangles]) % 1 * picture.shape[1::-1]
             x, y = np.moveaxis(places.astype(np.int64), -1, 0)
             texels = picture[np.minimum(y, len(picture) - 1), np.minimum(x, picture.shape[1] - 1)]
