@@ -25,8 +25,11 @@ def description_for_pypi() -> str:
 EXTRAS = {
     "video": ["imageio[ffmpeg]>=2.28"],  # MP4
     "usd": ["usd-core>=24.5"],
-    # Caches; there are no wheels for others.
-    "alembic": ["alembic3d>=1.8.12; platform_machine in 'x86_64 AMD64' or sys_platform == 'darwin'"],
+    # Caches; there are no wheels for other machines.
+    "alembic": [
+        "alembic3d>=1.8.12 ; (sys_platform != 'darwin' and platform_machine in 'x86_64 AMD64')"
+        " or (sys_platform == 'darwin' and platform_machine == 'arm64')"
+    ],
     "vtk": ["pyvista>=0.47"],  # surfaces of medical images and simulations
     # Meshes of different connectivity; libigl's AABB tree came to Python with 2.6.
     "register": ["robust_laplacian>=1.0", "potpourri3d>=1.2", "libigl>=2.6"],

@@ -1,5 +1,6 @@
 """Alembic caches are written, and read with their transforms."""
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,14 @@ def test_a_motion_comes_back(tmp_path: Path) -> None:
     assert torch.equal(triangles, faces) and fps == pytest.approx(30)
     main(["bake", str(tmp_path / "a.abc"), "--out", str(tmp_path / "a.glb"), "--bones", "4", "--quiet"])
     assert (tmp_path / "a.glb").stat().st_size > 1e4
+
+
+def test_a_full_disk_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    x, faces, *_ = load_sample("hand")
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: shutil._ntuple_diskusage(10**9, 10**9, 10**5))
+    with pytest.raises(OSError, match="too little space"):
+        tm.save_animation(x, faces, tmp_path / "a.abc")
+    assert not list(tmp_path.iterdir())
 
 
 def test_polygons_and_texture_coordinates_are_written_clockwise(tmp_path: Path) -> None:

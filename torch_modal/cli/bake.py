@@ -12,7 +12,7 @@ from torch_modal.io.write import check_suffix
 def add_arguments(sub: argparse.ArgumentParser) -> None:
     """Add the arguments of ``bake``."""
     add = sub.add_argument
-    text = "meshes in their order, a folder or a quoted pattern of them, an animated GLB, or an NPZ file"
+    text = "meshes in their order, a folder or a quoted pattern of them, an animated GLB, Alembic or NPZ file"
     add("meshes", nargs="+", type=Path, metavar="MESH", help=text)
     text = f"the file: {', '.join(ANIMATION_FORMATS)}"
     add("--out", type=Path, required=True, metavar="FILE", help=text)

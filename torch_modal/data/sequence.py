@@ -1,4 +1,4 @@
-"""Sequences of shapes from files: numbered meshes, a folder or a pattern of them, an animated GLB, or an NPZ file."""
+"""Sequences of shapes from files: numbered meshes, a folder or a pattern of them, an animated GLB, Alembic or NPZ."""
 
 import glob
 import os

@@ -1,5 +1,7 @@
 """Alembic caches: a motion of one connectivity, read and written by ``alembic3d``."""
 
+import errno
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -12,9 +14,15 @@ from torch_modal.extras import require
 from torch_modal.io.asset import fans
 from torch_modal.io.formats import Animation, resample
 
+SPACE = 2**20  # bytes of a cache besides its arrays, at most
+
 
 def write_alembic(animation: Animation, path: Path) -> None:
-    """Write one mesh with float32 positions at the timing's rate; polygons and texture coordinates of the asset."""
+    """Write one mesh with float32 positions at the timing's rate; polygons and texture coordinates of the asset.
+
+    Raises:
+        OSError: There is too little space.
+    """
     import imath
     from alembic3d import Abc, AbcCoreAbstract, AbcGeom
 
@@ -22,6 +30,9 @@ def write_alembic(animation: Animation, path: Path) -> None:
     triangles = np.full(len(animation.faces), 3), animation.faces.reshape(-1), None
     sizes, corners, texcoords = triangles if animation.asset is None else animation.asset.polygons()
     turned = _turned(sizes)
+    # alembic3d ends the process when it cannot write.
+    if shutil.disk_usage(path.parent).free < frames.nbytes + 16 * corners.nbytes + SPACE:
+        raise OSError(errno.ENOSPC, "too little space for an Alembic cache", str(path))
     archive = Abc.OArchive(str(path))
     rate = archive.addTimeSampling(AbcCoreAbstract.TimeSampling(1 / animation.timing.fps, 0.0))
     schema = AbcGeom.OPolyMesh(archive.getTop(), "mesh", rate).getSchema()

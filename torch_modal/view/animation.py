@@ -19,7 +19,7 @@ from torch_modal.view.drawing import ByteArray, draw_image, plain, textured
 from torch_modal.view.picture import BETWEEN_COLOR, fit_into_cells, view_rotation
 
 PIECE_PIXELS = 4  # sides of the pieces of a textured face
-MOST_PIECES = 60_000  # of all faces of a picture: drawing takes a second for 200,000
+MOST_PIECES = 60_000  # of all faces of a picture; 80,000 take a second of processor time
 
 
 def save_animation(
