@@ -19,7 +19,7 @@ GAP = 12  # pixels between cells
 LIGHTS = (((-2, 3, 4), 0.82), ((4, 1, 3), 0.30), ((0, -3, 2), 0.14))  # directions as the viewer sees them; brightness
 
 
-class Surface(NamedTuple):
+class PaintedFaces(NamedTuple):
     """Triangles, cut into pieces of equal size, and colours to draw them with, RGB in [0, 1]."""
 
     faces: IntArray
@@ -34,12 +34,12 @@ class Surface(NamedTuple):
         return _interpolate(self.pieces, numbers[self.faces])
 
 
-def plain(colors: FloatArray, faces: IntArray) -> Surface:
+def plain(colors: FloatArray, faces: IntArray) -> PaintedFaces:
     """Whole faces with colours of their vertices. *Shape:* ``(V, 3), (F, 3)``."""
-    return Surface(faces, np.eye(3)[None], colors[faces])
+    return PaintedFaces(faces, np.eye(3)[None], colors[faces])
 
 
-def textured(asset: Asset, n: int) -> Surface:
+def textured(asset: Asset, n: int) -> PaintedFaces:
     """Faces with the materials, textures and vertex colours of a file; each is cut into ``n²`` pieces."""
     from PIL import Image
 
@@ -66,7 +66,7 @@ def textured(asset: Asset, n: int) -> Surface:
             texels = picture[np.minimum(y, len(picture) - 1), np.minimum(x, picture.shape[1] - 1)]
             paint = paint * linear_rgba(texels.reshape(-1, 3))[:, :3].reshape(texels.shape)
         colors.append(np.where(paint <= 0.0031308, 12.92 * paint, 1.055 * paint ** (1 / 2.4) - 0.055))
-    return Surface(np.concatenate(faces), pieces, np.concatenate(colors))
+    return PaintedFaces(np.concatenate(faces), pieces, np.concatenate(colors))
 
 
 def _interpolate(pieces: FloatArray, corners: FloatArray) -> FloatArray:
@@ -96,7 +96,7 @@ def make_cells(n_rows: int, n_columns: int, half_size: FloatArray, pixels: IntAr
     return cells
 
 
-def draw_shape(cell: Any, points: FloatArray, surface: Surface) -> None:
+def draw_shape(cell: Any, points: FloatArray, surface: PaintedFaces) -> None:
     """Draw a surface with its vertices at points into a cell, from back to front. *Shape:* ``(V, 3)``."""
     from matplotlib.collections import TriMesh
     from matplotlib.tri import Triangulation
@@ -123,7 +123,7 @@ def draw_points(cell: Any, points: FloatArray, color: tuple[float, ...]) -> None
     cell.scatter(x, y, diameter**2, paint, linewidths=0, rasterized=True)
 
 
-def draw_image(points: FloatArray, surface: Surface, half_size: FloatArray, pixels: IntArray) -> ByteArray:
+def draw_image(points: FloatArray, surface: PaintedFaces, half_size: FloatArray, pixels: IntArray) -> ByteArray:
     """Image of a shape alone. Arguments as above. *Shape:* ``(height, width, 3)``."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
