@@ -25,6 +25,12 @@ def description_for_pypi() -> str:
 EXTRAS = {
     "video": ["imageio[ffmpeg]>=2.28"],  # MP4
     "usd": ["usd-core>=24.5"],
+    # Caches; there are no wheels for other machines.
+    "alembic": [
+        "alembic3d>=1.8.12 ; (sys_platform != 'darwin' and platform_machine in 'x86_64 AMD64')"
+        " or (sys_platform == 'darwin' and platform_machine == 'arm64')"
+    ],
+    "vtk": ["pyvista>=0.47"],  # surfaces of medical images and simulations
     # Meshes of different connectivity; libigl's AABB tree came to Python with 2.6.
     "register": ["robust_laplacian>=1.0", "potpourri3d>=1.2", "libigl>=2.6"],
     "contact": ["libigl>=2.6.3"],  # parts that pass through each other
@@ -107,7 +113,6 @@ setup(
                 "pygltflib>=1.16",
                 "selenium>=4.20",
                 "viser>=1.1",  # examples/live.py
-                "pyvista>=0.46",  # bodies of the benchmarks
                 "h5py>=3.11",
                 "lightning>=2.4",  # its Trainer over a data set
             ],

@@ -11,7 +11,7 @@ import argparse
 from collections.abc import Sequence
 
 import torch
-from make_samples import parts_of
+from samples.make_samples import parts_of
 from torch import Tensor, nn
 
 import torch_modal as tm

@@ -15,7 +15,7 @@ from pathlib import Path
 import autodecoder
 import numpy as np
 import torch
-from make_samples import gesture, sculpted
+from samples.make_samples import gesture, sculpted
 from torch import Tensor
 
 import torch_modal as tm

@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from _animals import animal, galloping, tips
+from samples.animals import animal, galloping, tips
 from scipy.spatial import cKDTree
 
 import torch_modal as tm

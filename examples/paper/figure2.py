@@ -9,10 +9,10 @@ from pathlib import Path
 
 import _paths  # noqa: F401
 import torch
-from _bipeds import biped
 from _meshes import poses
 from errors import edge_error, lengths, percents
 from results import Table, wanted
+from samples.bipeds import biped
 
 import torch_modal as tm
 from torch_modal.times import fill_linear

@@ -20,7 +20,7 @@ from torch_modal.data.samples import load_sample
 from torch_modal.geometry.canonical import CANONICAL_SIZE
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.inbetween.regions import fitting_error, segments
-from torch_modal.view.drawing import draw_image
+from torch_modal.view.drawing import draw_image, plain
 from torch_modal.view.picture import BETWEEN_COLOR, ERROR_COLORS, KEYFRAME_COLOR, fit_into_cells, view_rotation
 
 matplotlib.use("Agg")
@@ -131,7 +131,7 @@ def _images(points: FloatArray, paint: FloatArray, faces: Tensor, half: FloatArr
     """*Shape:* ``(S, V, 3)`` in view coordinates, and colours in [0, 1]."""
     pixels = np.maximum((420 * half / half.max()).round(), 1).astype(np.int64)
     each = zip(points, paint, strict=True)
-    return np.stack([draw_image(x, colors, faces.numpy(), half, pixels) for x, colors in each])
+    return np.stack([draw_image(x, plain(colors, faces.numpy()), half, pixels) for x, colors in each])
 
 
 if __name__ == "__main__":

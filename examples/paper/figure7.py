@@ -11,10 +11,10 @@ from pathlib import Path
 import _paths  # noqa: F401
 import numpy as np
 import torch
-from _bipeds import Biped, biped
 from decimated_pair import ReducedPair, froehlich_botsch
 from errors import edge_error, percents, vertex_error
 from results import Table, wanted
+from samples.bipeds import Biped, biped
 from torch import Tensor
 
 import torch_modal as tm

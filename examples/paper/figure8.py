@@ -15,8 +15,8 @@ import _paths  # noqa: F401
 import morph_animals
 import numpy as np
 import torch
-from _animals import animal, galloping
 from results import Table, wanted
+from samples.animals import animal, galloping
 from torch import Tensor
 
 import torch_modal as tm

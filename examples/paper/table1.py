@@ -15,9 +15,9 @@ from typing import Any
 
 import _paths  # noqa: F401
 import torch
-from _bipeds import KINDS, biped
 from _meshes import gallop, poses
 from results import Table, wanted
+from samples.bipeds import KINDS, biped
 
 import torch_modal as tm
 from torch_modal.data.samples import load_sample

@@ -22,7 +22,7 @@ import torch_modal as tm
 from torch_modal.geometry.rigid import best_fit
 
 sys.path.append(str(Path(__file__).parents[2] / "examples"))
-from make_samples import gesture, sculpted
+from samples.make_samples import gesture, sculpted
 from train_timing import farthest_points
 
 N_MORE, N_TEST, N_CODE, N_HIDDEN, BATCH = 400, 24, 16, 128, 16

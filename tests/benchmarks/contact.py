@@ -7,8 +7,8 @@ Each case is two key-frames, and 33 shapes of a path between them with and witho
 are those of parts that pass through each other (docs/contact.md), summed over the shapes. The energy is that of Eq. 5
 without the contact term, towards both key-frames, summed, over that without contact after as many steps of all
 vertices. The peak is the largest second difference in time, over that without contact, as is the processor's time on
-one thread. The legs are the sample creature's, made by ``examples/make_samples.py``: they swing past each other in one
-line.
+one thread. The legs are the sample creature's, made by ``examples/samples/make_samples.py``: they swing past each other
+in one line.
 """
 
 import argparse
@@ -45,8 +45,8 @@ class Case(NamedTuple):
 def legs(inward: float = 10.0, swing: float = 14.0) -> Case:
     """A creature whose legs of each pair swing past each other, and would meet in the middle."""
     sys.path.append(str(EXAMPLES))
-    import make_samples as made
     import trimesh
+    from samples import make_samples as made
     from scipy.spatial.transform import Rotation
 
     bones, flesh = made.creature()

@@ -14,7 +14,7 @@ from cases import KeyframeSet, keyframes_of
 from torch import Tensor
 
 sys.path.append(str(Path(__file__).parents[2] / "examples"))
-import make_samples
+from samples import make_samples
 
 Truth = Callable[[float], Tensor]
 

@@ -28,7 +28,7 @@ from torch_modal.geometry.rigid import best_fit
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "examples"))
 from augment_segmentation import BATCH, N_MORE, N_POINTS, NOISE, TURNS, PointNet, mean_iou, trained
-from make_samples import gesture, parts_of, sculpted
+from samples.make_samples import gesture, parts_of, sculpted
 from train_timing import farthest_points
 
 N_FRAMES, N_TEST, N_LANDMARKS, N_MODES = 49, 24, 12, 30

@@ -44,10 +44,10 @@ from torch_modal.registration.report import Registration
 from torch_modal.registration.surface import MeshSurface, drop_unreferenced
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "examples"))
-from _animals import animal, galloping, held_out, tips
-from _sculpt import sculpt
-from make_samples import hand
 from morph_animals import TIMES
+from samples.animals import animal, galloping, held_out, tips
+from samples.make_samples import hand
+from samples.sculpt import sculpt
 
 SHARED = Path(__file__).resolve().parents[2].parent / "shared" / "data"
 BODIES = {

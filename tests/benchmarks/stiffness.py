@@ -36,7 +36,7 @@ COLUMNS = ["", "`mesher`", "`form`", "tetrahedra's vertices", "first", "second",
 
 def bodies() -> Iterator[tuple[str, CanonicalSurface]]:
     """A closed fist without the other poses of its hand, and a bird on slender legs."""
-    from _bipeds import biped
+    from samples.bipeds import biped
 
     if (fist := keyframes_of("mh-hand-path", "08")) is not None:
         yield "closed fist alone", CanonicalSurface(fist[0][0].numpy(), fist[1].numpy())

@@ -53,10 +53,14 @@ def test_missing_points_are_left_out_and_normals_that_are_zero_are_none(tmp_path
     assert found.points[:, 0].tolist() == [0, 6, 9, 12] and found.normals is None
 
 
-@pytest.mark.parametrize("suffix", [".obj", ".ply", ".off", ".glb"])
+@pytest.mark.parametrize("suffix", [".obj", ".ply", ".off", ".glb", ".stl", ".vtk"])
 def test_meshes_are_clouds_of_their_vertices_with_outward_normals(tmp_path: Path, suffix: str) -> None:
+    if suffix == ".vtk":
+        pytest.importorskip("pyvista", reason="pyvista is not installed; it is part of the extra 'vtk'")
     stray = np.array([[9.0, 9.0, 9.0]])  # a vertex without a face is no point of the surface
-    x = torch.from_numpy(np.concatenate([BALL.vertices, stray]) if suffix != ".glb" else np.asarray(BALL.vertices))
+    x = torch.from_numpy(
+        np.concatenate([BALL.vertices, stray]) if suffix not in (".glb", ".stl") else np.asarray(BALL.vertices)
+    )
     (path,) = tm.save_mesh(x, torch.tensor(np.asarray(BALL.faces)), tmp_path / f"ball{suffix}")
     (found,) = load_observations([path], 3)
     assert found.normals is not None and len(found.points) == len(BALL.vertices)

@@ -75,8 +75,8 @@ def test_unknown_sample_is_refused_with_the_names_there_are() -> None:
 def test_our_own_code_makes_them(tmp_path: Path) -> None:
     """Sculpting magnifies the rounding of a machine in a few places, where a diagonal may be flipped: nine in ten
     vertices agree to 1e-5 of the size, the others to half a percent."""
-    script = ROOT / "examples" / "make_samples.py"
-    subprocess.run([sys.executable, str(script), "--out", str(tmp_path)], check=True, timeout=900, capture_output=True)
+    command = [sys.executable, "-m", "examples.samples.make_samples", "--out", str(tmp_path)]
+    subprocess.run(command, cwd=ROOT, check=True, timeout=900, capture_output=True)
     for name in SAMPLES:
         shipped = sorted(FOLDER.glob(f"{name}/*.ply"))
         assert [file.name for file in sorted((tmp_path / name).glob("*.ply"))] == [file.name for file in shipped]

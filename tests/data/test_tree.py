@@ -20,7 +20,7 @@ def test_sets_are_folders_with_two_meshes_or_more(tmp_path: Path) -> None:
     make(tmp_path, "a/1.obj", "a/2.OBJ", "b/c/x.ply", "b/c/y.ply", "b/c/z.ply", "b/c/notes.txt", "b/c/skin.mtl")
     make(tmp_path, "single/one.off", "texts/readme.txt", "a/texture.png", "loose.stl", "mixed/1.glb", "mixed/2.stl")
     sets, left_out = find_keyframe_sets(tmp_path, tmp_path / "out")
-    assert sets == ["a", "b/c", "mixed"]  # that STL is refused is said when the set is worked on
+    assert sets == ["a", "b/c", "mixed"]
     reason = "it holds one mesh only; a set needs two or more"
     assert sorted(left_out) == [f"left out .: {reason}", f"left out single: {reason}"]
 

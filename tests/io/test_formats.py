@@ -52,9 +52,10 @@ def test_own_formats_write(tmp_path: Path) -> None:
 def test_messages_and_help_list_all_formats(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(ValueError, match=r"\.npz or \.csv or \.needs, got 'a\.avi'"):
         tm.save_animation(FRAMES, FACES, tmp_path / "a.avi")
-    with pytest.raises(ValueError, match="fmt must be one of ply, obj, off, glb, xyz, got 'stl'"):
-        tm.save_mesh(FRAMES, FACES, tmp_path, "stl")
+    with pytest.raises(ValueError, match="fmt must be one of ply, obj, off, glb, stl, vtk, vtp, xyz, got 'step'"):
+        tm.save_mesh(FRAMES, FACES, tmp_path, "step")
     with pytest.raises(SystemExit):
         cli.main(["subdivide", "--help"])
     said = " ".join(capsys.readouterr().out.split())
-    assert "{ply,obj,off,glb,xyz}" in said and all(suffix in said for suffix in (".glb", ".mp4", ".usdc", ".npz"))
+    assert "{ply,obj,off,glb,stl,vtk,vtp,xyz}" in said
+    assert all(suffix in said for suffix in (".glb", ".mp4", ".usdc", ".npz"))

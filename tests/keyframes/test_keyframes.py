@@ -223,7 +223,8 @@ HUGE = {
     ("name", "text", "match"),
     [
         *((f"empty.{suffix}", "", "the file is empty") for suffix in ("obj", "ply", "off", "glb", "gltf")),
-        ("a.stl", "solid\n", r"supported are .*\(STL has no shared"),
+        ("a.stl", "solid\n", "no faces"),
+        ("junk.stl", "hello", "no faces"),
         ("a.step", "x", r"unknown extension '\.step'; supported are \.obj, \.ply"),
         ("cloud.obj", obj(CUBE, []), "point cloud of 8 vertices"),
         ("nothing.obj", "# nothing\n", "no faces"),

@@ -126,12 +126,12 @@ def test_figures_of_the_paper_are_drawn(tmp_path: Path, monkeypatch: pytest.Monk
 
 @pytest.mark.slow
 def test_train_motion_learns_more_in_amplitudes() -> None:
-    """A short run: what follows two true shapes, and the stride that is told from them."""
-    data, found = load_example("train_motion").main(n_animals=2, steps=48, n_modes=16)
+    """A short run: the stride that is told from its first two shapes."""
+    found = {name: errors for name, (errors, _) in load_example("train_motion").main(2, steps=48, n_modes=16).items()}
     own = found.pop("amplitudes")
-    assert own.reconstruction < 1 and own.shapes.shape == data.test[0, 2:].shape
-    assert own.stride < 0.85 * min(other.stride for other in found.values())
-    assert own.edges < 0.5 * min(other.edges for other in found.values())
+    assert own["reconstruction"] < 1
+    assert own["stride"] < 0.85 * min(other["stride"] for other in found.values())
+    assert own["edges"] < 0.5 * min(other["edges"] for other in found.values())
 
 
 @pytest.mark.slow

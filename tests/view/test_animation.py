@@ -13,7 +13,6 @@ import torch_modal as tm
 from torch_modal.errors import MeshWarning, MissingPackageError
 from torch_modal.geometry.vectors import vertex_normals
 from torch_modal.io.formats import ANIMATION_FORMATS, Timing
-from torch_modal.view import animation
 
 X, FACES = triangles_of_tube()
 FRAMES = np.stack([bend(X, turn) for turn in (0.01, 0.3, 0.6, 0.9)])
@@ -143,8 +142,8 @@ def test_usd_read_back(tmp_path, suffix):
     assert [p.name for p in tmp_path.iterdir() if p.name.startswith(".")] == []
 
 
-def test_gif_read_back(tmp_path, small_pictures):
-    path = tm.save_animation(FRAMES[:2], FACES, tmp_path / "a.gif", duration=0.4, fps=10, ping_pong=True)
+def test_gif_read_back(tmp_path):
+    path = tm.save_animation(FRAMES[:2], FACES, tmp_path / "a.gif", duration=0.4, fps=10, ping_pong=True, size=160)
     image = Image.open(path)
     assert image.n_frames == 8 and image.info["loop"] == 0 and image.info["duration"] == 100
     assert max(image.size) == 160
@@ -157,22 +156,47 @@ def test_gif_read_back(tmp_path, small_pictures):
     assert (pictures[0] < 250).any(axis=2).mean() > 0.1  # there is something to see
 
 
-def test_mp4_read_back(tmp_path, small_pictures):
+@pytest.mark.parametrize("suffix", ["obj", "glb"])
+def test_textures_are_drawn(tmp_path, suffix):
+    """A square of two triangles seen from the front: each quarter has the colour of its quarter of the picture."""
+    texture = np.zeros((2, 2, 3), np.uint8)
+    texture[:] = [[(200, 0, 0), (0, 200, 0)], [(0, 0, 200), (200, 200, 0)]]
+    Image.fromarray(texture).save(tmp_path / "skin.png")
+    (tmp_path / "a.mtl").write_text("newmtl skin\nKd 1 1 1\nmap_Kd skin.png\n")
+    corners = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"
+    (tmp_path / "a.obj").write_text(f"mtllib a.mtl\n{corners}usemtl skin\nf 1/1 2/2 3/3 4/4\n")
+    asset = tm.open_asset(tmp_path / "a.obj")
+    if suffix == "glb":
+        (path,) = tm.save_mesh(asset.positions, asset.faces, tmp_path / "a.glb", asset=asset)
+        asset = tm.open_asset(path)
+    path = tm.save_animation(asset.positions[None], asset.faces, tmp_path / "a.gif", asset=asset, size=120)
+    picture = np.asarray(Image.open(path).convert("RGB"), dtype=float)
+    assert max(picture.shape) == 120
+    shown = (picture.min(-1) < 240).nonzero()
+    rows, columns = ((np.quantile(each, [0.25, 0.75])).astype(int) for each in shown)
+    for row, line in zip(rows, texture, strict=True):
+        for column, color in zip(columns, line, strict=True):
+            seen = picture[row, column]
+            assert ((seen > 60) == (color > 0)).all(), (row, column, seen, color)
+    (tmp_path / "skin.png").write_bytes((tmp_path / "skin.png").read_bytes()[:40])
+    if suffix == "obj":
+        with pytest.warns(MeshWarning, match="texture of 'skin' cannot be read"):
+            tm.save_animation(asset.positions[None], asset.faces, path, asset=tm.open_asset(tmp_path / "a.obj"))
+    with pytest.raises(ValueError, match="size must be a number of pixels, 2 or more"):
+        tm.save_animation(FRAMES[:1], FACES, tmp_path / "b.gif", size=1)
+
+
+def test_mp4_read_back(tmp_path):
     pytest.importorskip("imageio_ffmpeg", reason="imageio-ffmpeg is not installed")
     import imageio.v2 as imageio
 
-    path = tm.save_animation(FRAMES[:2], FACES, tmp_path / "a.mp4", duration=1, fps=8)
+    path = tm.save_animation(FRAMES[:2], FACES, tmp_path / "a.mp4", duration=1, fps=8, size=160)
     with imageio.get_reader(path) as reader:
         meta = reader.get_meta_data()
         pictures = [np.asarray(picture, dtype=float) for picture in reader]
     assert meta["codec"] == "h264" and meta["fps"] == 8 and len(pictures) == 9
     assert max(meta["size"]) == 160 and not any(side % 2 for side in meta["size"])
     assert np.abs(pictures[0] - pictures[-1]).mean() > 1
-
-
-@pytest.fixture
-def small_pictures(monkeypatch):
-    monkeypatch.setattr(animation, "PIXELS", 160)
 
 
 @pytest.mark.parametrize("suffix", ["usda", "usdc"])
@@ -201,10 +225,10 @@ def test_missing_packages_are_named_before_the_work(tmp_path, monkeypatch, suffi
 
 
 @pytest.mark.parametrize("suffix", ["mdd", "pc2", "npz", "usda", "gif"])
-def test_one_frame_and_another_in_its_place(tmp_path, suffix, small_pictures):
+def test_one_frame_and_another_in_its_place(tmp_path, suffix):
     if suffix == "usda":
         pytest.importorskip("pxr")
-    path = tm.save_animation(FRAMES[:1], FACES, tmp_path / "new" / f"a.{suffix}")
+    path = tm.save_animation(FRAMES[:1], FACES, tmp_path / "new" / f"a.{suffix}", size=160)
     before = path.read_bytes()
-    tm.save_animation(FRAMES[1:], FACES, path)
+    tm.save_animation(FRAMES[1:], FACES, path, size=160)
     assert path.read_bytes() != before and list(path.parent.iterdir()) == [path]

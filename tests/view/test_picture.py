@@ -25,7 +25,9 @@ def drawn(image, level=250):
 
 def draw(points, colors=(0.8, 0.24, 0.24), faces=BALL.faces):
     colors = np.broadcast_to(colors, np.shape(points))
-    return drawing.draw_image(points, colors, np.asarray(faces), np.array([2.5, 2.5]), np.array([100, 100]))
+    return drawing.draw_image(
+        points, drawing.plain(colors, np.asarray(faces)), np.array([2.5, 2.5]), np.array([100, 100])
+    )
 
 
 def test_shapes_are_drawn_to_scale():

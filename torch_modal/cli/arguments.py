@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from torch_modal.io.formats import ANIMATION_FORMATS
+from torch_modal.io.formats import ANIMATION_FORMATS, PIXELS
 from torch_modal.io.write import refuse_existing
 
 MODES = ("n_modes", "method", "mesher", "cache", "progress")
@@ -38,6 +38,12 @@ def add_forms(sub: argparse._ActionsContainer) -> None:
     text = "GLB: a skin of at most N bones, a tenth of the size, for engines (40 are usual)"
     sub.add_argument("--bones", type=int, metavar="N", help=text)
     sub.add_argument("--targets", type=int, metavar="N", help="GLB: N principal shapes as morph targets")
+
+
+def add_size(sub: argparse._ActionsContainer) -> None:
+    """Add ``--size`` of videos."""
+    text = "MP4, GIF: pixels of the longer side (default: %(default)s)"
+    sub.add_argument("--size", type=int, default=PIXELS, metavar="N", help=text)
 
 
 def add_registration(sub: argparse.ArgumentParser, optional: bool = False) -> None:

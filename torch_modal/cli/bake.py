@@ -12,11 +12,12 @@ from torch_modal.io.write import check_suffix
 def add_arguments(sub: argparse.ArgumentParser) -> None:
     """Add the arguments of ``bake``."""
     add = sub.add_argument
-    text = "meshes in their order, a folder or a quoted pattern of them, an animated GLB, or an NPZ file"
+    text = "meshes in their order, a folder or a quoted pattern of them, an animated GLB, Alembic or NPZ file"
     add("meshes", nargs="+", type=Path, metavar="MESH", help=text)
     text = f"the file: {', '.join(ANIMATION_FORMATS)}"
     add("--out", type=Path, required=True, metavar="FILE", help=text)
     arguments.add_forms(sub)
+    arguments.add_size(sub)
     add("--fps", type=float, metavar="X", help="frames a second (default: as in the file, or 24)")
     add("--cyclic", action="store_true", help="the last frame leads on to the first")
     text = "take out trembling: what has a period of X frames is halved, what is slower hardly changes"
@@ -81,10 +82,10 @@ def run(args: argparse.Namespace) -> None:
             args.report(f"error:     {error((filled - frames)[left])} at the {len(left)} frames between key-frames")
         frames = filled
     skin = tm.bake(frames, faces, args.bones) if args.bones else None
-    asset = None if files[0].suffix.lower() == ".npz" else tm.open_asset(files[0])
+    asset = None if files[0].suffix.lower() in (".npz", ".abc") else tm.open_asset(files[0])
     if asset is not None:
         asset.carries.pop("posing", None)  # it is what is written
-    options = pick_options(args, "cyclic", "targets", "progress")
+    options = pick_options(args, "cyclic", "targets", "progress", "size")
     tm.save_animation(frames, faces, args.out, fps, bones=skin, asset=asset, **options)
     bones = f", {skin.weights.shape[1]} bones" if skin else ""
     args.report(f"animation: {args.out}, {args.out.stat().st_size / 1e6:.2f} MB{bones}")

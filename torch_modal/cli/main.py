@@ -20,7 +20,7 @@ PROGRAM = "torch-modal"
 DESCRIPTION = """\
 Fill key-frame meshes with physically plausible shapes in between.
 
-Key-frames are triangle meshes (OBJ, PLY, OFF, GLB, GLTF) with the same faces and
+Key-frames are triangle meshes (OBJ, PLY, OFF, GLB, GLTF, STL, VTK) with the same faces and
 the same vertex order, in any units. Results are in the same units and coordinates."""
 
 EXAMPLES = """\

@@ -21,6 +21,7 @@ def add_output(sub: argparse.ArgumentParser, picture: str) -> None:
     add("--out", type=Path, required=True, metavar="FILE_OR_FOLDER", help=text)
     text = "format of the numbered frames (default: as the first mesh, with everything else in its file)"
     add("--format", choices=[suffix[1:] for suffix in MESH_FORMATS], help=text)
+    arguments.add_size(sub)
     add("--picture", type=Path, metavar="FILE", help=f"also draw {picture}, .png or .pdf")
 
 
@@ -49,7 +50,8 @@ def write_sequence(
         if left:  # they look like the end of this sequence
             message = f"{args.out} also holds {len(left)} frames of an earlier run, from {left[0].name}"
             warnings.warn(message, stacklevel=2)
-    tm.save_animation(frames, faces, animation, args.fps, asset=asset, progress=args.progress, **options)
+    options |= pick_options(args, "progress", "size")
+    tm.save_animation(frames, faces, animation, args.fps, asset=asset, **options)
     args.report(f"animation: {animation}")
 
 

@@ -11,7 +11,7 @@ from torch_modal.cli.subdivide import add_output, check_files, write_sequence
 def add_arguments(sub: argparse.ArgumentParser) -> None:
     """Add the arguments of ``transfer``."""
     add = sub.add_argument
-    text = "the motion: meshes in their order, a folder or a quoted pattern, an animated GLB, or an NPZ file"
+    text = "the motion: meshes in their order, a folder or a quoted pattern, an animated GLB, Alembic or NPZ file"
     add("meshes", nargs="+", type=Path, metavar="MESH", help=text)
     add("--to", type=Path, required=True, metavar="FILE", help="the other body, in the pose of the first mesh")
     text = "the first body in the pose of the other one (default: the first mesh)"

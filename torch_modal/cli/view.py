@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 def add_arguments(sub: argparse.ArgumentParser) -> None:
     """Add the arguments of ``view``."""
     add = sub.add_argument
-    text = "shapes in their order, a folder, or one animated GLB or NPZ"
+    text = "shapes in their order, a folder, or one animated GLB, Alembic or NPZ file"
     add("meshes", nargs="+", type=Path, metavar="MESH", help=text)
     text = "another sequence of as many shapes, of the same faces; may be given several times"
     add("--compare", nargs="+", type=Path, action="append", default=[], metavar="FILE", help=text)
@@ -43,7 +43,7 @@ def run(args: argparse.Namespace) -> None:
     indices.
 
     The page is one HTML file that needs no network. Shapes are numbered mesh files, a
-    folder or a quoted pattern of them, an animated GLB, or an NPZ with frames and faces.
+    folder or a quoted pattern of them, or an animated GLB, Alembic or NPZ file.
 
     With --landmarks, they are meshes of any connectivity, side by side, on which vertices
     that belong together are picked, for `register` and `subdivide --register`.

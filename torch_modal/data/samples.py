@@ -1,4 +1,4 @@
-"""Sample key-frames that come with the package, made by ``examples/make_samples.py``."""
+"""Sample key-frames that come with the package, made by ``examples/samples/make_samples.py``."""
 
 from pathlib import Path
 from typing import Any, NamedTuple

@@ -1,4 +1,4 @@
-"""Sequences of shapes from files: numbered meshes, a folder or a pattern of them, an animated GLB, or an NPZ file."""
+"""Sequences of shapes from files: numbered meshes, a folder or a pattern of them, an animated GLB, Alembic or NPZ."""
 
 import glob
 import os
@@ -13,6 +13,7 @@ from torch import Tensor
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.data.tree import mesh_files, natural
 from torch_modal.errors import MeshError
+from torch_modal.io.alembic import read_alembic
 from torch_modal.io.formats import FPS
 from torch_modal.io.gltf import key_times
 from torch_modal.io.gltf_asset import GltfAsset
@@ -114,6 +115,9 @@ def read_shapes(paths: Paths, fps: float | None = None, **registration: Any) -> 
     suffix = files[0].suffix.lower() if len(files) == 1 and files[0].is_file() else ""
     if suffix == ".npz":
         return _arrays(files[0])
+    if suffix == ".abc":
+        with mesh_errors(f"{files[0]}: cannot be read as Alembic"):
+            return read_alembic(files[0])
     if suffix in (".glb", ".gltf"):
         asset = open_asset(files[0])
         assert isinstance(asset, GltfAsset)

@@ -6,9 +6,6 @@ from pathlib import Path
 
 from torch_modal.io.read import SUFFIXES
 
-MESH_SUFFIXES = (*SUFFIXES, ".stl")
-"""STL cannot serve as a key-frame; it is listed so that its set is refused with a reason."""
-
 
 def find_keyframe_sets(root: Path, skip: Path) -> tuple[list[str], list[str]]:
     """Walk a folder tree.
@@ -38,7 +35,7 @@ def find_keyframe_sets(root: Path, skip: Path) -> tuple[list[str], list[str]]:
 
 def mesh_files(folder: Path) -> list[Path]:
     """The mesh files that lie directly in a folder, in natural order of their names."""
-    files = [path for path in folder.iterdir() if path.name[0] != "." and path.suffix.lower() in MESH_SUFFIXES]
+    files = [path for path in folder.iterdir() if path.name[0] != "." and path.suffix.lower() in SUFFIXES]
     return sorted(filter(Path.is_file, files), key=lambda path: natural(path.name))
 
 

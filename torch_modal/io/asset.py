@@ -3,7 +3,8 @@
 import io
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -43,6 +44,12 @@ def linear_rgba(colors: FloatArray) -> FloatArray:
     return np.concatenate([rgb, alpha], axis=1)
 
 
+def fans(polygons: Iterable[IntArray]) -> IntArray:
+    """Triangles ``(F, 3)`` of polygons, from the first corner of each, so that they are the same in all frames."""
+    faces = [(polygon[0], *pair) for polygon in polygons for pair in pairwise(polygon[1:])]
+    return np.array(faces, dtype=np.int64).reshape(-1, 3)
+
+
 class Material(NamedTuple):
     """Appearance of a surface, in the terms of glTF."""
 
@@ -77,7 +84,7 @@ class Asset(ABC):
     """Features that :meth:`with_positions` keeps."""
 
     suffix: str
-    """Ending of such a file, ``".obj"``, ``".ply"``, ``".off"`` or ``".glb"``; it is GLB of a GLTF file."""
+    """Ending of such a file, as ``".obj"``; it is GLB of a GLTF file, and VTP of a VTU file."""
 
     def __init__(self, path: Path) -> None:
         self.path = path

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from torch_modal.geometry.skin import Skin
 
 FPS = 24.0
+PIXELS = 640  # the longer side of a picture of a video
 
 
 @dataclass(frozen=True)
@@ -62,6 +63,9 @@ MESH_FORMATS: dict[str, OutputFormat] = {
     ".obj": OutputFormat("torch_modal.io.obj:obj_bytes"),
     ".off": OutputFormat("torch_modal.io.ply:off_bytes"),
     ".glb": OutputFormat("torch_modal.io.glb:glb_bytes", GLB_HOLDS),
+    ".stl": OutputFormat("torch_modal.io.stl:stl_bytes"),
+    ".vtk": OutputFormat("torch_modal.io.vtk:vtk_bytes", (), ("pyvista",), "vtk"),
+    ".vtp": OutputFormat("torch_modal.io.vtk:vtp_bytes", (), ("pyvista",), "vtk"),
 }
 ANIMATION_FORMATS: dict[str, OutputFormat] = {
     ".glb": OutputFormat("torch_modal.io.glb:write_glb", GLB_HOLDS),
@@ -71,6 +75,7 @@ ANIMATION_FORMATS: dict[str, OutputFormat] = {
         (".usd", ".usda", ".usdc"),
         OutputFormat("torch_modal.io.usd:write_usd", USD_HOLDS, ("pxr",), "usd"),
     ),
+    ".abc": OutputFormat("torch_modal.io.alembic:write_alembic", ("polygons", "texcoords"), ("alembic3d",), "alembic"),
     **dict.fromkeys((".mdd", ".pc2"), OutputFormat("torch_modal.io.animations:write_point_cache", FEATURES)),
     ".npz": OutputFormat("torch_modal.io.animations:write_npz", FEATURES),
 }
@@ -180,3 +185,5 @@ class Animation(NamedTuple):
     """The motion as bones, instead of morph targets."""
     targets: int | None = None
     """Number of principal shapes, instead of a morph target for each frame."""
+    size: int = PIXELS
+    """The longer side of a picture of a video, in pixels."""

@@ -12,7 +12,7 @@ import torch
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.errors import MeshError
 from torch_modal.geometry.skin import blend_bones
-from torch_modal.io.asset import Asset, Material, Part
+from torch_modal.io.asset import Asset, Material, Part, as_png_or_jpeg
 from torch_modal.io.gltf import (
     ARRAY_BUFFER,
     ELEMENT_ARRAY_BUFFER,
@@ -194,11 +194,28 @@ class GltfAsset(Asset):
 
     # --------------------------------------------------------------------------------------------- for other formats
     def parts(self) -> list[Part]:
-        """One part for each primitive, with its colours alone: materials stay in the document."""
+        """One part for each primitive; of materials, colour, roughness and the texture of the colour."""
         parts = []
         for primitive in self._primitives:
-            index = primitive.json["attributes"].get("COLOR_0")
-            colors = None if index is None else self.document.floats(index)
+            attributes, material, channel = primitive.json["attributes"], Material(), 0
+            if "material" in primitive.json:
+                material, channel = self._material(primitive.json["material"])
+            colors, texcoords = (
+                None if name not in attributes else self.document.floats(attributes[name])
+                for name in ("COLOR_0", f"TEXCOORD_{channel}")
+            )
             vertices = np.arange(primitive.points.start, primitive.points.stop)
-            parts.append(Part(vertices, primitive.triangles, Material(), colors=colors))
+            parts.append(Part(vertices, primitive.triangles, material, texcoords, colors))
         return parts
+
+    def _material(self, index: int) -> tuple[Material, int]:
+        """A material, and the number of the texture coordinates that its texture uses."""
+        material = self.document.get("materials", index)
+        surface = material.get("pbrMetallicRoughness", {})
+        used, texture = surface.get("baseColorTexture", {}), None
+        source = self.document.get("textures", used["index"]).get("source") if "index" in used else None
+        if source is not None:  # otherwise it is that of an extension
+            texture = as_png_or_jpeg(self.document.image(source))
+        color = tuple(map(float, surface.get("baseColorFactor", (1, 1, 1, 1))))
+        numbers = float(surface.get("metallicFactor", 1)), float(surface.get("roughnessFactor", 1))
+        return Material(material.get("name", f"material-{index}"), color, *numbers, texture), used.get("texCoord", 0)

@@ -8,11 +8,13 @@ from pathlib import Path
 import numpy as np
 
 from torch_modal.arrays import FloatArray, IntArray
-from torch_modal.errors import MeshError
+from torch_modal.errors import MeshError, MissingPackageError
 from torch_modal.io.asset import Asset
 from torch_modal.io.gltf_asset import GltfAsset
 from torch_modal.io.obj import ObjAsset
 from torch_modal.io.ply import OffAsset, PlyAsset
+from torch_modal.io.stl import StlAsset
+from torch_modal.io.vtk import VtkAsset
 
 READERS: dict[str, type[Asset]] = {
     ".obj": ObjAsset,
@@ -20,6 +22,10 @@ READERS: dict[str, type[Asset]] = {
     ".off": OffAsset,
     ".glb": GltfAsset,
     ".gltf": GltfAsset,
+    ".stl": StlAsset,
+    ".vtk": VtkAsset,
+    ".vtp": VtkAsset,
+    ".vtu": VtkAsset,
 }
 SUFFIXES = tuple(READERS)
 Mesh = tuple[FloatArray, IntArray]  # vertices and faces
@@ -30,7 +36,7 @@ def mesh_errors(problem: str) -> Iterator[None]:
     """Raise a MeshError of this problem for any exception, as damaged files may raise all kinds."""
     try:
         yield
-    except MeshError:
+    except (MeshError, MissingPackageError):
         raise
     except Exception as error:
         reason = " ".join(str(error).split()) or type(error).__name__
@@ -41,7 +47,7 @@ def open_asset(path: str | os.PathLike[str]) -> Asset:
     """Read a mesh file with all its content.
 
     Args:
-        path: An OBJ, PLY, OFF, GLB or GLTF file.
+        path: An OBJ, PLY, OFF, GLB, GLTF, STL, VTK, VTP or VTU file; the last three need the extra ``vtk``.
 
     Returns:
         The asset: ``positions`` and ``faces`` are as from :func:`torch_modal.load_keyframes`;
@@ -49,16 +55,15 @@ def open_asset(path: str | os.PathLike[str]) -> Asset:
 
     Raises:
         FileNotFoundError: There is no such file.
-        MeshError: The file holds no mesh that can be read, or one without shared vertices (STL).
+        MeshError: The file holds no mesh that can be read.
+        MissingPackageError: The extra ``vtk`` is needed and not installed.
     """
     path = Path(path)
     suffix = path.suffix.lower()
     if not os.path.lexists(path):
         raise FileNotFoundError(f"{str(path)[:300]}: no such file or folder")
     if suffix not in READERS and not path.is_dir():
-        raise MeshError(
-            f"{path}: unknown extension {suffix!r}; supported are {', '.join(SUFFIXES)} (STL has no shared vertices)"
-        )
+        raise MeshError(f"{path}: unknown extension {suffix!r}; supported are {', '.join(SUFFIXES)}")
     if not os.path.isfile(path):
         raise MeshError(f"{path}: not a file, or a link to none")
     with mesh_errors(f"{path}: cannot be read as {suffix[1:].upper()}"):
@@ -83,6 +88,8 @@ def require_same_mesh(
 ) -> None:
     """Raise a MeshError unless two files have equally many vertices and the same faces."""
     hint = "all key-frames need the same vertices and faces, in the same vertex order"
+    if os.fspath(first).lower().endswith(".stl"):
+        hint += "; STL files have no vertices, so that equal corners are merged: export OBJ or PLY, or register"
     for what, mine, its in zip(("vertices", "faces"), mesh, other_mesh, strict=True):
         if len(mine) != len(its):
             raise MeshError(f"{other} has {len(its)} {what}, {first} has {len(mine)}; {hint}")

@@ -88,7 +88,8 @@ def save_mesh(
 ) -> list[Path]:
     """Write one shape as a mesh file, or several as ``frame-000.ply``, ``frame-001.ply``, ... of a folder.
 
-    Vertices and faces keep their order. OBJ has nine digits, as float32 needs, OFF float64, PLY and GLB float32.
+    Vertices and faces keep their order. OBJ has nine digits, as float32 needs, OFF, VTK and VTP float64, others
+    float32; STL has no vertices.
 
     With an asset, each file is a copy of the asset's with other positions: polygons, texture coordinates, materials,
     groups and everything else stay, normals turn with the surface, and material libraries and textures are copied too.
@@ -96,9 +97,9 @@ def save_mesh(
     Args:
         shapes: Vertex positions, in the caller's coordinates. *Shape:* ``(V, 3)``, or ``(N, V, 3)``.
         faces: Vertex indices. *Shape:* ``(F, 3)``.
-        out: Of one shape, the file: ``.ply``, ``.obj``, ``.off`` or ``.glb``. Of several, their folder. Folders are
-            made if missing.
-        fmt: Format of several: ``"ply"``, ``"obj"``, ``"off"`` or ``"glb"``; by default the asset's, or PLY. Another
+        out: Of one shape, the file: ``.ply``, ``.obj``, ``.off``, ``.glb``, ``.stl``, ``.vtk`` or ``.vtp``. Of several,
+            their folder. Folders are made if missing.
+        fmt: Format of several, as ``"ply"``; by default the asset's, or PLY. Another
             format than the asset's gets the bare mesh (GLB: also materials and textures), with a warning of what is
             lost.
         stem: Start of the names of several.

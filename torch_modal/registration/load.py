@@ -31,7 +31,7 @@ def load_keyframes(
     progress: Progress = None,
     report: Callable[[str], None] = lambda line: None,
 ) -> Keyframes:
-    """Read key-frames from OBJ, PLY, OFF, GLB or GLTF files.
+    """Read key-frames from files, see :func:`torch_modal.open_asset`.
 
     Vertices keep their order. Faces may differ between the files in order, first corner and winding; the faces of the
     first file are used. `check_keyframes` reports flaws of the meshes.
@@ -57,7 +57,7 @@ def load_keyframes(
         FileNotFoundError: A file does not exist.
         MeshError: A file cannot be read, or differs from the first in its number of vertices or in its faces; or,
             with ``register``, a registration is doubtful.
-        MissingPackageError: With ``register``, the extra of that name is not installed.
+        MissingPackageError: With ``register``, or of VTK files, an extra is not installed.
 
     Warns:
         MeshWarning: A file has a skeleton, animations or morph targets.

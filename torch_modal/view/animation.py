@@ -11,14 +11,15 @@ from torch_modal.arrays import Array
 from torch_modal.geometry.skin import Skin
 from torch_modal.io.asset import Asset
 from torch_modal.io.files import atomic_write
-from torch_modal.io.formats import ANIMATION_FORMATS, Animation, Timing, check_forms, resample
+from torch_modal.io.formats import ANIMATION_FORMATS, PIXELS, Animation, Timing, check_forms, resample
 from torch_modal.io.write import check_frames, check_indices, check_suffix, refuse_existing
 from torch_modal.motion.skin import bake
 from torch_modal.progress import Progress, ProgressReport
-from torch_modal.view.drawing import ByteArray, draw_image
+from torch_modal.view.drawing import ByteArray, draw_image, plain, textured
 from torch_modal.view.picture import BETWEEN_COLOR, fit_into_cells, view_rotation
 
-PIXELS = 640  # the longer side of a picture of a video
+PIECE_PIXELS = 4  # sides of the pieces of a textured face
+MOST_PIECES = 60_000  # of all faces of a picture; 80,000 take a second of processor time
 
 
 def save_animation(
@@ -36,6 +37,7 @@ def save_animation(
     asset: Asset | None = None,
     bones: int | Skin | None = None,
     targets: int | None = None,
+    size: int = PIXELS,
     progress: Progress = None,
 ) -> Path:
     """Write the sequence as one file that plays.
@@ -43,12 +45,13 @@ def save_animation(
     ``.glb`` is glTF 2.0 with a morph target for each frame after the first; viewers interpolate linearly between
     neighbouring frames. glTF calls Y up and metres the unit; the caller's coordinates are written as they are
     (float32), so a Z-up sequence lies on its back there. Normals move with the shape. ``.usd``, ``.usda`` and ``.usdc``
-    (extra ``usd``) hold the points over time in the same manner. A GLB with ``bones`` holds a skin instead
-    (:func:`torch_modal.bake`), a tenth of the size, with which every engine plays; with ``targets``, the mean and a few
-    principal shapes.
+    (extra ``usd``) hold the points over time in the same manner, ``.abc`` (extra ``alembic``) at a fixed rate. A GLB
+    with ``bones`` holds a skin instead (:func:`torch_modal.bake`), a tenth of the size, with which every engine plays;
+    with ``targets``, the mean and a few principal shapes.
 
-    ``.mp4`` (extra ``video``) and ``.gif`` are drawn. ``.mdd`` and ``.pc2`` are point caches, for a mesh that is
-    already in Blender, Maya or Houdini. ``.npz`` holds ``frames``, ``faces``, ``times`` and ``keyframes`` as arrays.
+    ``.mp4`` (extra ``video``) and ``.gif`` are drawn, with the materials and textures of the asset. ``.mdd`` and
+    ``.pc2`` are point caches, for a mesh that is already in Blender, Maya or Houdini. ``.npz`` holds ``frames``,
+    ``faces``, ``times`` and ``keyframes`` as arrays.
 
     Args:
         frames: Vertex positions, in the caller's coordinates. *Shape:* ``(N, V, 3)``. One shape gives a file that
@@ -70,6 +73,7 @@ def save_animation(
             textures, texture coordinates, colours and normals, USD its polygons, texture coordinates and colours.
         bones: Most bones of a skin, or a skin of these frames. GLB alone.
         targets: Principal shapes, as the only morph targets; they give the frames approximately. GLB alone.
+        size: The longer side of pictures of MP4 and GIF, in pixels.
         progress: A bar while a video is drawn: see :data:`torch_modal.progress.Progress`.
 
     Returns:
@@ -88,6 +92,8 @@ def save_animation(
     check_forms(path, bones, targets)
     if targets is not None and not (isinstance(targets, int) and 1 <= targets < len(shapes)):
         raise ValueError(f"targets must be a whole number, 1 to {len(shapes) - 1} of these frames; got {targets!r}")
+    if size < 2:
+        raise ValueError(f"size must be a number of pixels, 2 or more; got {size}")
     suffix = check_suffix(path, ANIMATION_FORMATS)
     if asset is not None:
         asset.check(shapes, path, ANIMATION_FORMATS[suffix].holds)
@@ -108,7 +114,7 @@ def save_animation(
             raise ValueError(f"bones is a skin of {n} other frames than these {len(shapes)}; bake these")
         skin = replace(skin, transforms=skin.transforms[: len(shapes)])
     path.parent.mkdir(parents=True, exist_ok=True)
-    animation = Animation(shapes, triangles, timing, path.name, keyframes, asset, progress, skin, targets)
+    animation = Animation(shapes, triangles, timing, path.name, keyframes, asset, progress, skin, targets, size)
     with atomic_write(path, suffix) as temporary:
         ANIMATION_FORMATS[suffix].write(animation, temporary)
     return path
@@ -145,11 +151,16 @@ def _pictures(animation: Animation) -> list[ByteArray]:
     points = resample(shapes, unique) @ view_rotation(shapes[0], None, None).T
     points, half = fit_into_cells(points[None])
     # H.264 stores colour for blocks of two by two.
-    size = np.maximum((PIXELS * half / half.max() / 2).round() * 2, 2).astype(np.int64)
-    paint = np.broadcast_to(BETWEEN_COLOR, points[0, 0].shape)
+    size = np.maximum((animation.size * half / half.max() / 2).round() * 2, 2).astype(np.int64)
+    surface, asset = plain(np.broadcast_to(BETWEEN_COLOR, points[0, 0].shape), faces), animation.asset
+    if asset is not None and {"materials", "colors"} & asset.carries.keys():
+        corners = points[0, 0][faces] * float(size.max() / half.max() / 2)
+        side = float(np.quantile(np.linalg.norm(corners - np.roll(corners, 1, 1), axis=-1), 0.9))
+        most = (MOST_PIECES / len(faces)) ** 0.5
+        surface = textured(asset, max(1, int(min(np.ceil(side / PIECE_PIXELS), most))))
     images: list[ByteArray] = []
     with ProgressReport(len(unique), "pictures", animation.progress, unit="picture") as report:
         for shape in points[0]:
-            images.append(draw_image(shape, paint, faces, half, size))
+            images.append(draw_image(shape, surface, half, size))
             report.update()
     return [images[number] for number in which.reshape(-1)]

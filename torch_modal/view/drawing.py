@@ -1,18 +1,77 @@
 """Shapes and points drawn by matplotlib into cells of a figure, in view coordinates, a cell centred at the origin."""
 
-from typing import Any
+import io
+import warnings
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from torch_modal.arrays import FloatArray, IntArray
+from torch_modal.errors import MeshWarning
 from torch_modal.geometry.vectors import vertex_normals
+from torch_modal.io.asset import Asset, linear_rgba
 
 ByteArray = NDArray[np.uint8]
 
 DPI = 128  # a power of two: sizes in inches are exact
 GAP = 12  # pixels between cells
 LIGHTS = (((-2, 3, 4), 0.82), ((4, 1, 3), 0.30), ((0, -3, 2), 0.14))  # directions as the viewer sees them; brightness
+
+
+class PaintedFaces(NamedTuple):
+    """Triangles, cut into pieces of equal size, and colours to draw them with, RGB in [0, 1]."""
+
+    faces: IntArray
+    """*Shape:* ``(F, 3)``."""
+    pieces: FloatArray
+    """Barycentric coordinates of the corners of each piece of a face. *Shape:* ``(P, 3, 3)``."""
+    colors: FloatArray
+    """Of the corners of all pieces. *Shape:* ``(F P, 3, 3)``."""
+
+    def interpolate(self, numbers: FloatArray) -> FloatArray:
+        """Numbers of the vertices, at the corners of all pieces. *Shape:* ``(V, n) -> (F P, 3, n)``."""
+        return _interpolate(self.pieces, numbers[self.faces])
+
+
+def plain(colors: FloatArray, faces: IntArray) -> PaintedFaces:
+    """Whole faces with colours of their vertices. *Shape:* ``(V, 3), (F, 3)``."""
+    return PaintedFaces(faces, np.eye(3)[None], colors[faces])
+
+
+def textured(asset: Asset, n: int) -> PaintedFaces:
+    """Faces with the materials, textures and vertex colours of a file; each is cut into ``n²`` pieces."""
+    from PIL import Image
+
+    at = [np.array([(i, j), (i + 1, j), (i, j + 1)]) for i in range(n) for j in range(n - i)]
+    at += [np.array([(i, j + 1), (i + 1, j), (i + 1, j + 1)]) for i in range(n) for j in range(n - 1 - i)]
+    steps = np.array(at) / n
+    pieces = np.concatenate([1 - steps.sum(-1, keepdims=True), steps], -1)
+    faces, colors = [], []
+    for part in asset.parts():
+        faces.append(part.vertices[part.triangles])
+        paint = np.broadcast_to(np.array(part.material.color[:3]), (len(part.triangles) * len(pieces), 3, 3))
+        if part.colors is not None:
+            paint = paint * _interpolate(pieces, part.colors[part.triangles, :3])
+        picture = None
+        if part.material.texture is not None and part.texcoords is not None:
+            try:
+                picture = np.asarray(Image.open(io.BytesIO(part.material.texture)).convert("RGB")) / 255
+            except Exception as error:  # damaged pictures may raise any exception
+                text = f"the texture of {part.material.name!r} cannot be read, and is not drawn: {error}"
+                warnings.warn(text, MeshWarning, stacklevel=5)
+        if picture is not None and part.texcoords is not None:
+            places = _interpolate(pieces, part.texcoords[part.triangles]) % 1 * picture.shape[1::-1]
+            x, y = np.moveaxis(places.astype(np.int64), -1, 0)
+            texels = picture[np.minimum(y, len(picture) - 1), np.minimum(x, picture.shape[1] - 1)]
+            paint = paint * linear_rgba(texels.reshape(-1, 3))[:, :3].reshape(texels.shape)
+        colors.append(np.where(paint <= 0.0031308, 12.92 * paint, 1.055 * paint ** (1 / 2.4) - 0.055))
+    return PaintedFaces(np.concatenate(faces), pieces, np.concatenate(colors))
+
+
+def _interpolate(pieces: FloatArray, corners: FloatArray) -> FloatArray:
+    """*Shape:* ``(P, 3, 3), (F, 3, n) -> (F P, 3, n)``."""
+    return np.einsum("pcb,fbn->fpcn", pieces, corners).reshape(-1, 3, corners.shape[-1])
 
 
 def make_cells(n_rows: int, n_columns: int, half_size: FloatArray, pixels: IntArray) -> Any:
@@ -37,19 +96,19 @@ def make_cells(n_rows: int, n_columns: int, half_size: FloatArray, pixels: IntAr
     return cells
 
 
-def draw_shape(cell: Any, points: FloatArray, colors: FloatArray, faces: IntArray) -> None:
-    """Draw faces into a cell, from back to front. *Shape:* ``(V, 3), (V, 3), (F, 3)``; colours are RGB in [0, 1]."""
+def draw_shape(cell: Any, points: FloatArray, surface: PaintedFaces) -> None:
+    """Draw a surface with its vertices at points into a cell, from back to front. *Shape:* ``(V, 3)``."""
     from matplotlib.collections import TriMesh
     from matplotlib.tri import Triangulation
 
     lights = np.array([brightness / np.linalg.norm(place) * np.array(place) for place, brightness in LIGHTS])
-    corners = points[faces]
+    corners = surface.interpolate(points)
     order = corners[..., 2].mean(axis=1).argsort(kind="stable")
-    normals = vertex_normals(points, faces)[faces]
+    normals = surface.interpolate(vertex_normals(points, surface.faces))
     normals *= np.where(normals[..., 2].sum(axis=1) < 0, -1.0, 1.0)[:, None, None]  # open meshes show their inside too
     shade = 0.25 + 0.85 * np.clip(normals @ lights.T, 0, None).sum(axis=2)
     rim = 0.75 + 0.25 * np.clip(normals[..., 2], 0, 1) ** 0.5  # darker outlines separate what overlaps
-    paint = np.clip(colors[faces] * (shade * rim)[..., None], 0, 1)
+    paint = np.clip(surface.colors * (shade * rim)[..., None], 0, 1)
     x, y, _ = corners[order].reshape(-1, 3).T
     triangles = Triangulation(x, y, np.arange(len(x)).reshape(-1, 3))
     cell.add_collection(TriMesh(triangles, facecolors=paint[order].reshape(-1, 3), rasterized=True))
@@ -64,14 +123,12 @@ def draw_points(cell: Any, points: FloatArray, color: tuple[float, ...]) -> None
     cell.scatter(x, y, diameter**2, paint, linewidths=0, rasterized=True)
 
 
-def draw_image(
-    points: FloatArray, colors: FloatArray, faces: IntArray, half_size: FloatArray, pixels: IntArray
-) -> ByteArray:
+def draw_image(points: FloatArray, surface: PaintedFaces, half_size: FloatArray, pixels: IntArray) -> ByteArray:
     """Image of a shape alone. Arguments as above. *Shape:* ``(height, width, 3)``."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     ((cell,),) = make_cells(1, 1, half_size, pixels)
-    draw_shape(cell, points, colors, faces)
+    draw_shape(cell, points, surface)
     canvas = FigureCanvasAgg(cell.figure)
     canvas.draw()
     return np.array(canvas.buffer_rgba())[..., :3]

@@ -17,7 +17,7 @@ from torch_modal.arrays import Array, FloatArray, IntArray
 from torch_modal.io.files import write_files
 from torch_modal.io.formats import PICTURES
 from torch_modal.io.write import check_frames, check_indices, check_suffix, refuse_existing, to_numpy
-from torch_modal.view.drawing import DPI, draw_points, draw_shape, make_cells
+from torch_modal.view.drawing import DPI, draw_points, draw_shape, make_cells, plain
 
 KEYFRAME_COLOR = (0.91, 0.60, 0.36)  # warm: given
 BETWEEN_COLOR = (0.62, 0.71, 0.82)  # cool: computed
@@ -174,12 +174,12 @@ def render_sequence(
     for column, (n, title) in enumerate(zip(chosen, titles, strict=True)):
         color = "#b4581a" if n in keyframes else "#333333"
         cells[0, column].set_title(title, fontsize=points_of_text, color=color)
-        plain = np.broadcast_to(KEYFRAME_COLOR if n in keyframes else BETWEEN_COLOR, shapes[0][0].shape)
+        usual = np.broadcast_to(KEYFRAME_COLOR if n in keyframes else BETWEEN_COLOR, shapes[0][0].shape)
         for cell, cloud in zip(cells[:, column], clouds.values(), strict=False):
             draw_points(cell, cloud[n] @ rotation.T + moves[column], DOT_COLOR)
         for cell, label, shape in zip(cells[len(clouds) :, column], rows, placed[:, column], strict=True):
-            paint = scale.to_rgba(values[label][n])[:, :3] if label in values else plain
-            draw_shape(cell, shape, paint, triangles)
+            paint = scale.to_rgba(values[label][n])[:, :3] if label in values else usual
+            draw_shape(cell, shape, plain(paint, triangles))
     figure = cells[0, 0].figure
     if scale:
         width, height = (pixels / DPI / figure.get_size_inches()).tolist()

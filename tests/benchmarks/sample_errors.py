@@ -1,6 +1,6 @@
 """The samples of the package, whose true in-betweens are known: what ``torch-modal demo`` shows, as a table.
 
-    python tests/benchmarks/samples.py [creature hand]
+    python tests/benchmarks/sample_errors.py [creature hand]
 
 Means over the known in-betweens of the mean relative errors of edge lengths, and of the volume over the true one.
 """

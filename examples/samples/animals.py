@@ -4,8 +4,10 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
-from _sculpt import Array, Bone, Cone, IntArray, Point, bind, place_bones, sculpt, skin
-from make_samples import creature, gallop
+from scipy.spatial.transform import Rotation
+
+from .make_samples import creature, gallop
+from .sculpt import Array, Bone, Cone, IntArray, Point, bind, place_bones, sculpt, skin
 
 TIPS = ("tail4", "forepaw-right", "forepaw-left", "hindpaw-right", "hindpaw-left", "ear-right", "ear-left")
 SIDES = ("thigh", "shin", "upperarm", "forearm", "scapula")
@@ -23,12 +25,45 @@ def animal(kind: str, cell: float | None = None) -> tuple[Array, IntArray, tuple
     return vertices, faces, tuple(cones)
 
 
-def galloping(kind: str, time: float, cell: float | None = None) -> Array:
-    """The same animal at a time of its gallop, in frames, of which a stride takes six. *Shape:* ``(V, 3)``."""
+@cache
+def _weights(kind: str, cell: float | None) -> Array:
+    """Weights of the bones on its vertices. *Shape:* ``(V, B)``."""
     rest, faces, cones = animal(kind, cell)
+    return bind(list(cones), _skeleton(kind)[0], rest, faces, 1.15)[0]
+
+
+def galloping(
+    kind: str, time: float, cell: float | None = None, reach: tuple[float, float, float] = (1.0, 1.0, 1.0)
+) -> Array:
+    """The same animal at a time of its gallop, in frames, of which a stride takes six. *Shape:* ``(V, 3)``.
+
+    Rotations of the joints of fore legs, hind legs and spine are multiplied by ``reach``.
+    """
     bones, _ = _skeleton(kind)
-    weights, _ = bind(list(cones), bones, rest, faces, 1.15)
-    return skin(rest, weights, *place_bones(bones, *gallop(bones, time)))
+    turns, shift = gallop(bones, time)
+    scaled = {name: Rotation.from_rotvec(reach[_limb(name, bones)] * turn.as_rotvec()) for name, turn in turns.items()}
+    return skin(animal(kind, cell)[0], _weights(kind, cell), *place_bones(bones, scaled, shift))
+
+
+def strides(n: int, n_frames: int, cell: float, low: float, high: float, seed: int) -> tuple[Array, IntArray]:
+    """One stride each of slender animals that gallop with a random reach between two numbers, and their faces.
+
+    Lengths are in bounding-box diagonals. *Shape:* ``(N, T, V, 3), (F, 3)``.
+    """
+    reaches = np.random.default_rng(seed).uniform(low, high, (n, 3))
+    times = 6 * np.arange(n_frames) / n_frames
+    x = np.array([[galloping("slender", time, cell, tuple(reach)) for time in times] for reach in reaches])
+    return x / np.linalg.norm(np.ptp(x[0, 0], axis=0)), animal("slender", cell)[1]
+
+
+def _limb(name: str, bones: dict[str, Bone]) -> int:
+    """0 for the bones of a fore leg, 1 of a hind leg, 2 of the spine."""
+    bone: str | None = name
+    while bone is not None:
+        if bone.startswith(("scapula", "thigh")):
+            return int(bone.startswith("thigh"))
+        bone = bones[bone].parent
+    return 2
 
 
 def _skeleton(kind: str) -> tuple[dict[str, Bone], list[Cone]]:

@@ -10,8 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 import trimesh
-from _sculpt import Array, Bone, Cone, IntArray, Point, bind, place_bones, restore_volume, sculpt, skin
 from scipy.spatial.transform import Rotation
+
+from .sculpt import Array, Bone, Cone, IntArray, Point, bind, place_bones, restore_volume, sculpt, skin
 
 Turn = tuple[float, float, float]
 """Of a bone against its parent, as a rotation vector in degrees: about X to the side, Y round, Z back and up."""

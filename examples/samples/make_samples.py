@@ -3,7 +3,7 @@
 Everything is sculpted and posed by the tables below, so the samples are free of anyone else's rights, and the
 frames between the key-frames are known: they come from the same smooth curves at other times.
 
-    python examples/make_samples.py [--out DIR]
+    python -m examples.samples.make_samples [--out DIR]
 """
 
 import argparse
@@ -13,7 +13,12 @@ from typing import NamedTuple
 
 import numpy as np
 import trimesh
-from _sculpt import (
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation
+
+import torch_modal as tm
+
+from .sculpt import (
     Array,
     Bone,
     Cone,
@@ -25,10 +30,6 @@ from _sculpt import (
     sculpt,
     skin,
 )
-from scipy.interpolate import CubicSpline
-from scipy.spatial.transform import Rotation
-
-import torch_modal as tm
 
 # -------------------------------------------------------------------------------------------- creature, shape
 # About 2 units long, Y up, facing +X; its right side is +Z. Left limbs are mirror images of the right ones.
@@ -337,7 +338,7 @@ def describe(name: str, rest: Array, faces: IntArray, frames: dict[str, Array]) 
 def main() -> None:
     """Write all samples."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--out", type=Path, default=Path(__file__).parents[1] / "torch_modal" / "samples")
+    parser.add_argument("--out", type=Path, default=Path(__file__).parents[2] / "torch_modal" / "samples")
     out = parser.parse_args().out
     for name in SAMPLES:
         rest, faces, frame = sculpted(name)
