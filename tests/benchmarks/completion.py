@@ -13,8 +13,9 @@ Errors are mean distances of all vertices from the truth at the times of the sam
   Beside it the path, and ``ShapeSpace.fit`` frame by frame.
 - noise: all vertices of all frames with a noise of 1 %. Beside it the noise, and the mean over three times.
 
-Hidden over seen is the error of the vertices that no point of the scan is near, over that of the others; certain over
-doubtful the error of vertices with a confidence below 0.5 over that of the others. Seconds are of the processor.
+Hidden over seen is the error of the vertices that no point of the scan is near, over that of the others. Within is the
+part of the vertices that are nearer to the truth than their expected errors, of which nine of ten should be, and rank
+the correlation of the ranks of both. Seconds are of the processor.
 """
 
 import argparse
@@ -30,6 +31,7 @@ from measures import NAN
 from numpy.typing import NDArray
 from results import Table, add_keep
 from scipy.spatial import cKDTree
+from scipy.stats import spearmanr
 from spaces import markers
 from timing import limit_threads
 from torch import Tensor
@@ -129,7 +131,7 @@ def noisy(frames: Tensor, at: Sequence[int], vertices: Tensor, lost: float, size
 
 
 def complete(name: str, samples: str) -> tuple[list[float], float]:
-    """Errors without samples, of what is simple, and completed; hidden over seen; doubtful over certain; seconds."""
+    """Errors without samples, of what is simple, and completed; hidden over seen; within, rank; seconds."""
     frames, faces = motion(name)
     step = MOTIONS[name][1]
     size = float((frames[0].amax(0) - frames[0].amin(0)).norm())
@@ -164,10 +166,12 @@ def complete(name: str, samples: str) -> tuple[list[float], float]:
     seconds = time.process_time() - start
     off = (result.shapes - truth).norm(dim=-1)
     near = [cKDTree(one.points).query(x)[0] < NEAR * size for one, x in zip(observations, truth, strict=True)]
-    seen, doubtful = torch.from_numpy(np.stack(near)), result.confidence < 0.5
-    ratios = [float(off[some].mean() / off[~some].mean()) if some.any() else NAN for some in (~seen, doubtful)]
+    seen = torch.from_numpy(np.stack(near))
+    hidden = float(off[~seen].mean() / off[seen].mean()) if (~seen).any() else NAN
+    within = 100 * float((off <= result.errors).double().mean())
+    rank = float(spearmanr(result.errors.flatten(), off.flatten()).statistic)
     errors = [100 / size * float((x - truth).norm(dim=-1).mean()) for x in (without, simple, result.shapes)]
-    return [*errors, *ratios], seconds
+    return [*errors, hidden, within, rank], seconds
 
 
 def main() -> None:
@@ -186,7 +190,8 @@ def main() -> None:
         "simple, %",
         "completed, %",
         "hidden over seen",
-        "doubtful over certain",
+        "within, %",
+        "rank",
         "s",
     ]
     check = "--samples markers --motions creature"

@@ -12,7 +12,7 @@ from test_completion import VIEWS, error, scanned
 
 import torch_modal as tm
 from torch_modal.completion import poses
-from torch_modal.completion.confidence import compare, confidence_of
+from torch_modal.completion.confidence import OF_MODES, OF_NOISE, compare, expected_errors
 from torch_modal.completion.frames import CompletionProblem
 from torch_modal.completion.pairs import ObservedPoints, SampledSurface
 from torch_modal.completion.poses import FramePoses, ModalFit, times_between
@@ -199,20 +199,40 @@ def test_noise_is_estimated(tube, kind, noise):
 
 
 # ----------------------------------------------------------------------------------------------------------- confidence
-@pytest.mark.parametrize("seen_at", [(0, 2), (0,), (2,)], ids=["around", "before", "after"])
-def test_what_neighbours_in_time_saw_of_a_still_body_is_known(tube, seen_at):
+def test_errors_grow_with_noise_way_and_what_was_not_seen(tube):
+    """Each part alone, of a body at three times."""
     x, faces, diagonal = tube
-    sides = [
-        scanned(x[2], faces, t, (1 if t in seen_at else -1) * VIEWS[1], n=1500, noise=1e-4 * diagonal) for t in range(3)
-    ]
+    sides = [scanned(x[2], faces, t, VIEWS[1], n=1500, noise=1e-3 * diagonal) for t in range(3)]
+    sides = [replace(one, noise=1e-3 * diagonal) for one in sides]
     problem = CompletionProblem(x[2:3].numpy(), faces, np.zeros(0), sides)
     still = problem.whole.expand(3, -1, -1)
-    _, _, seen, *_ = compare(problem, problem.frames, still)
-    confidence = confidence_of(problem, problem.frames, still, seen)
-    by_others = (seen[1] < 0.2) & (seen[seen_at[0]] > 0.8)
-    assert int(by_others.sum()) > 50
-    assert float(confidence[1, by_others].min()) > 0.6
-    assert float(confidence[1, by_others].max()) < float(confidence[1, seen[1] > 0.9].max())
+    seen = compare(problem, problem.frames, still)[2]
+    by_modes = {float(t): one for t, one in enumerate(still)}
+    of_noise = expected_errors(problem, problem.frames, still, by_modes, seen)
+    assert torch.allclose(of_noise, torch.full_like(seen, OF_NOISE * problem.frames[0].seen[0].noise), atol=1e-9)
+    away = by_modes | {1.0: still[1] + torch.tensor([0.0, 2.0, 0.0])}
+    of_way = expected_errors(problem, problem.frames, still, away, seen) - of_noise
+    assert torch.allclose(of_way[1], torch.full_like(seen[1], 2 * OF_MODES)) and float(of_way[[0, 2]].max()) < 1e-9
+    bent = still.clone()
+    bent[1, ::2, 2] += 3.0
+    bent[1, 1::2, 2] -= 3.0
+    of_time = expected_errors(problem, problem.frames, bent, dict(zip(by_modes, bent, strict=True)), seen) - of_noise
+    hidden, visible = seen[1] < 0.1, seen[1] > 0.9
+    assert float(of_time[1, hidden].min()) > 2 * float(of_time[1, visible].max()) > 0
+
+
+@pytest.mark.parametrize("unit", [1.0, 1000.0])
+def test_errors_are_in_the_units_of_the_mesh_and_confidence_is_a_half_at_two_percent(tube, unit):
+    x, faces, diagonal = tube
+    seen = [
+        replace(scanned(x[i], faces, float(i), VIEWS[i], noise=4e-3 * diagonal), noise=4e-3 * diagonal) for i in (1, 3)
+    ]
+    seen = [replace(one, points=unit * one.points, noise=unit * one.noise) for one in seen]
+    found = tm.complete(unit * x[[0, 2, 4]], faces, seen, times=[0.0, 2.0, 4.0])
+    off = (found.shapes - unit * x[[1, 3]]).norm(dim=-1)
+    assert 0.85 < float((off <= found.errors).double().mean()) and float(found.errors.mean()) < 8 * float(off.mean())
+    size = unit * float((x[2].amax(0) - x[2].amin(0)).norm())
+    assert torch.allclose(found.confidence, torch.exp2(-found.errors / (0.02 * size)), rtol=0.2)
 
 
 # ----------------------------------------------------------------------------------------------------- time and borders

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from torch_modal.arrays import FloatArray
 from torch_modal.autograd import disable_compile, full_precision, outside_inference_mode
-from torch_modal.completion.confidence import DOUBTFUL, compare, confidence_of, size_of
+from torch_modal.completion.confidence import DOUBTFUL, HALF_AT, compare, expected_errors, size_of
 from torch_modal.completion.frames import CompletionProblem
 from torch_modal.completion.gradient import LastSolve, ShapesOfPoints
 from torch_modal.completion.observation import Observation, check_observations, refuse_transforms
@@ -41,9 +41,11 @@ class Completion(NamedTuple):
     """Of the observations, each once, ascending. *Shape:* ``(T,)``."""
     shapes: Tensor
     """The shapes then. *Shape:* ``(T, V, 3)``."""
+    errors: Tensor
+    """Distances from the truth within which nine of ten vertices are expected, in the caller's units, larger where the
+    surface was not seen, moves far, or was found far from its shape by modes; 0 of key-frames. *Shape:* ``(T, V)``."""
     confidence: Tensor
-    """Near 1 where the surface was seen, then or at times nearby, and moves little between its neighbours in time; low
-    where it moves far, above all unseen, or is inferred; 1 of key-frames. *Shape:* ``(T, V)``."""
+    """The same from 0 to 1: a half at an error of 2 % of the diagonal, 1 at none. *Shape:* ``(T, V)``."""
     misses: list[Tensor]
     """Of each observation, in the order given, the distance of its points from the shape. *Shape of each:* ``(n,)``."""
     trust: list[Tensor]
@@ -157,6 +159,7 @@ def _complete(
     exact = np.zeros(0) if is_template else check_times(times, len(shapes)).numpy()
     problem = CompletionProblem(shapes, torch.from_numpy(indices), exact, observations)
     shape_at, solve = dict(zip(exact.tolist(), problem.whole, strict=False)), None
+    poses = list[Tensor]()
     if problem.frames:
         with ProgressReport(len(problem.frames) * (3 + ROUNDS), "completing", progress) as report:
             poses = FramePoses(problem).search(report)
@@ -191,10 +194,14 @@ def _complete(
     order, moments = sorted(shape_at), [frame.time for frame in frames]
     whole_at = dict(zip(exact.tolist(), like, strict=False))  # bit for bit
     knots = torch.stack([whole_at[t] if t in whole_at else problem.to_caller(shape_at[t]).to(like) for t in order])
+    by_modes = dict(zip([frame.time for frame in problem.frames], poses, strict=True))
+    errors = expected_errors(problem, frames, x, by_modes, seen)
+    half = HALF_AT * (problem.template.amax(0) - problem.template.amin(0)).norm()
     completion = Completion(
         torch.tensor(moments, dtype=torch.float64, device=like.device),
         knots[[order.index(t) for t in moments]],
-        confidence_of(problem, frames, x, seen).to(like),
+        (errors / problem.scale).to(like),
+        torch.exp2(-errors / half).to(like),
         list((misses / problem.scale).to(like).split(sizes)),
         list(trust.to(like).split(sizes)),
         knots,

@@ -1,4 +1,4 @@
-"""Confidence of completed shapes: what was seen of them, what points count for, how far they move."""
+"""Completed shapes beside what was seen: distances, what points count for, doubts, and expected errors."""
 
 from collections.abc import Sequence
 
@@ -15,10 +15,10 @@ from torch_modal.geometry.rigid import best_fit
 
 SEEN_WITHIN = 2.5
 """Distance from an observed point within which a vertex counts as seen, at a size of 100."""
-NEIGHBOURS = 0.9
-"""Confidence of what a neighbour in time saw."""
-HALF_AFTER = 0.02
-"""Motion between neighbours in time, in parts of the diagonal, that halves the confidence of what is half seen."""
+OF_NOISE, OF_MODES, OF_TIME = 0.3, 1.6, 0.5
+"""Factors of the noise, of the way from the shape by modes, and of the distance from neighbours in time, in errors."""
+HALF_AT = 0.02
+"""Expected error, in parts of the template's diagonal, at which confidence is a half."""
 DOUBTFUL = 0.5
 """Part of the points that a shape has to explain."""
 OF_EDGES, OF_VOLUMES = 0.035, 0.05
@@ -85,26 +85,29 @@ def size_of(problem: CompletionProblem, x: Tensor) -> float:
     return ratios[int(np.argmax(beyond))] if max(beyond) > 1 else 1.0
 
 
-def confidence_of(problem: CompletionProblem, frames: Sequence[Frame], x: Tensor, seen: Tensor) -> Tensor:
-    """Confidence from what was seen at each time, there and nearby, and from the motion. *Shape:* ``(T, V)``.
+def expected_errors(
+    problem: CompletionProblem, frames: Sequence[Frame], x: Tensor, by_modes: dict[float, Tensor], seen: Tensor
+) -> Tensor:
+    """Distances from the truth within which nine of ten vertices are, at a size of 100; 0 of whole shapes.
 
-    What moves far between its neighbours in time is less certain; whole shapes are certain.
+    Three parts, with factors fitted to motions whose truth is at hand (``tests/benchmarks/completion.py``): the noise;
+    the way from the shape by modes, which is long where that was wrong; and the distance from the neighbours in time,
+    more of what was not seen. Shapes by modes are given by their times. *Shape:* ``(T, V, 3), (T, V) -> (T, V)``.
     """
-    whole = [(float(t), one, torch.ones_like(one[:, 0])) for t, one in zip(problem.times, problem.whole, strict=False)]
-    times = {frame.time for frame in frames}
-    found = [(frame.time, *one) for frame, *one in zip(frames, x, seen, strict=True) if frame.time not in problem.times]
-    every = sorted([*found, *whole], key=lambda one: one[0])
-    shapes, near = torch.stack([one[1] for one in every]), torch.stack([one[2] for one in every])
-    for order in (range(1, len(near)), range(len(near) - 2, -1, -1)):
-        for i in order:
-            near[i] = torch.maximum(near[i], NEIGHBOURS * near[i - order.step])
-    half = HALF_AFTER * float((problem.template.amax(0) - problem.template.amin(0)).norm())
-    confidence = torch.ones_like(seen)
-    for row, i in enumerate(i for i, one in enumerate(every) if one[0] in times):
-        if every[i][0] in problem.times:
+    whole = [(float(t), shape) for t, shape in zip(problem.times, problem.whole, strict=False)]
+    every = sorted([*whole, *((frame.time, one) for frame, one in zip(frames, x, strict=True))], key=lambda one: one[0])
+    errors = torch.zeros_like(seen)
+    for i, (frame, shape) in enumerate(zip(frames, x, strict=True)):
+        if frame.time in problem.times:
             continue
-        neighbours = [j for j in (i - 1, i + 1) if 0 <= j < len(shapes)]
-        others = shapes[neighbours] if neighbours else problem.whole[:1]
-        moved = (best_fit(others, shapes[i].expand_as(others)).apply(others) - shapes[i]).norm(dim=-1).mean(0)
-        confidence[row] = near[i] * torch.exp2(-(1.5 - seen[row]) * moved / half)
-    return confidence
+        before = [one for one in every if one[0] < frame.time][-1:]
+        after = [one for one in every if one[0] > frame.time][:1]
+        others = torch.stack([one for _, one in [*before, *after]] or [problem.whole[0]])
+        u = (frame.time - before[0][0]) / (after[0][0] - before[0][0]) if before and after else 0.0
+        others = best_fit(others, shape.expand_as(others)).apply(others)
+        off = (torch.lerp(others[0], others[-1], u) - shape).norm(dim=-1)
+        noise = min(one.noise for one in frame.seen)
+        errors[i] = (
+            OF_NOISE * noise + OF_MODES * (by_modes[frame.time] - shape).norm(dim=-1) + OF_TIME * (1.5 - seen[i]) * off
+        )
+    return errors
