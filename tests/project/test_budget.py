@@ -22,8 +22,8 @@ import torch
 import torch_modal as tm
 
 BOUNDS = {
-    "lines of code": 17210,
-    "functions": 1538,
+    "lines of code": 17600,
+    "functions": 1570,
     "docstrings that begin with no noun": 0,
     "functions of in-between": 88,
     "files of in-between": 22,
