@@ -79,8 +79,8 @@ def main(folder: Path, n_points: int = 1500) -> dict[str, float]:
         titles=[f"t = {time:g}" for time in times],
         keyframe_indices=[],
         view=sample.view,
-        colors={"completed": 1 - completion.confidence},
-        color_label="1 - confidence",
+        colors={"completed": 100 * completion.errors / diagonal},
+        color_label="expected error in % of the diagonal",
         points={"seen": [one.points for one in observations]},
     )
     return {

@@ -162,8 +162,8 @@ def test_picture_has_the_points_above_the_shapes(
     for time, cloud in zip(times, drawn["points"]["seen"], strict=True):
         assert len(cloud) == len(arrived["rests"]) * (2 if time == 9 else 1)
         assert float(cloud[:, 0].mean() - arrived["rests"][:, 0].mean()) == pytest.approx(0.3 * time, abs=1e-5)
-    confidence = 1 - drawn["colors"]["completed"]
-    assert confidence[:-1].min() == 1 > confidence[-1].min() and Image.open("p.png").format == "PNG"
+    errors = drawn["colors"]["completed"]
+    assert errors[:-1].max() == 0 < errors[-1].max() and Image.open("p.png").format == "PNG"
 
 
 def test_an_order_of_names_that_is_none_of_numbers_is_warned_of(

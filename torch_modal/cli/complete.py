@@ -28,7 +28,7 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
     add("--contact", action="store_true", help="keep parts from passing through each other (extra contact)")
     for name, text in (("--view", "direction to the camera, far away"), ("--camera", "place of the camera")):
         add(name, nargs="+", type=float, metavar="X", help=f"{text}: three numbers, or three for each cloud")
-    add_output(sub, "what was seen above the result, coloured by its confidence")
+    add_output(sub, "what was seen above the result, coloured by its expected error")
     add("--frames", type=int, metavar="N", help="evenly in time (default: 1 to 8 for each interval)")
     add("--fps", type=float, metavar="X", default=24.0, help="frames a second (default: %(default)g)")
 
@@ -87,6 +87,8 @@ def run(args: argparse.Namespace) -> None:
     frames, asset = welded.scatter(completion(when)), tm.open_asset(args.mesh)
     keys = [i for i, t in enumerate(when.tolist()) if t in (times or ())]
     write_sequence(args, animation, frames, faces, asset, keyframe_indices=keys, times=when.tolist())
+    used = welded.keyframes[0, welded.faces.unique()]
+    diagonal = (used.amax(0) - used.amin(0)).norm()
     if args.picture:
         chosen = torch.linspace(0, len(completion.times) - 1, min(8, len(completion.times))).round().long().tolist()
         moments = sorted({one.time for one in seen})  # in the order of completion.times, which may be estimated
@@ -98,13 +100,11 @@ def run(args: argparse.Namespace) -> None:
             columns=len(chosen),
             titles=[f"t = {t:.4g}" for t in completion.times[chosen].tolist()],
             keyframe_indices=[],
-            colors={"completed": 1 - completion.confidence[chosen]},
-            color_label="1 - confidence",
+            colors={"completed": 100 * completion.errors[chosen] / diagonal},
+            color_label="expected error in % of the diagonal",
             points={"seen": [torch.cat([o.points for o, n in zip(seen, at, strict=True) if n == i]) for i in chosen]},
         )
         args.report(f"picture:   {args.picture}")
-    used = welded.keyframes[0, welded.faces.unique()]
-    diagonal = (used.amax(0) - used.amin(0)).norm()
     miss, expected = (100 * x / diagonal for x in (torch.cat(completion.misses).mean(), completion.errors.mean(1)))
     args.report(f"points lie {miss:.2f} % of the diagonal off the surface, in the mean")
     most = f"most at t = {completion.times[expected.argmax()]:g} ({expected.max():.2f} %)"
