@@ -108,7 +108,7 @@ def test_when_the_command_ends_so_do_its_processes(ending: signal.Signals, scrat
         said = command.communicate(timeout=60)[0]
     finally:
         command.kill()
-    wait_until(lambda: not processes(str(scratch)), 30)
+    wait_until(lambda: not processes(str(scratch)), 120)
     assert not find_sets(out)
     if ending != signal.SIGKILL:
         assert command.returncode == 130 and said.endswith("torch-modal: interrupted\n")
@@ -127,12 +127,12 @@ def cluster(scratch: Path) -> Iterator[Any]:
 
 @pytest.mark.slow
 def test_cluster_does_all_sets_though_a_worker_is_killed(cluster: Any, scratch: Path, tmp_path: Path) -> None:
-    root, expected, out = make_tree(tmp_path / "shapes", 40), tmp_path / "expected", tmp_path / "out"
+    root, expected, out = make_tree(tmp_path / "shapes", 16), tmp_path / "expected", tmp_path / "out"
     assert {record.status for record in precompute_tree(root, expected, OPTIONS).values()} == {DONE}
     first = {worker.process.pid for worker in cluster.workers.values()}
 
     def kill() -> None:
-        wait_until(lambda: out.is_dir() and len(find_sets(out)) >= 5, 600)
+        wait_until(lambda: out.is_dir() and len(find_sets(out)) >= 3, 600)
         wait_until(lambda: processes(str(scratch)))
         os.kill(min(first), signal.SIGKILL)
 
@@ -141,7 +141,7 @@ def test_cluster_does_all_sets_though_a_worker_is_killed(cluster: Any, scratch: 
     records = precompute_tree(root, out, OPTIONS, scheduler=cluster.scheduler_address)
     killer.join()
     assert {worker.process.pid for worker in cluster.workers.values()} != first
-    assert [record.status for record in records.values()] == [DONE] * 40
+    assert [record.status for record in records.values()] == [DONE] * 16
     torch.testing.assert_close(tensors(out), tensors(expected), rtol=0, atol=0)
     wait_until(lambda: not processes(str(scratch)))
 
@@ -157,7 +157,7 @@ def test_ctrl_c_ends_the_sets_on_a_cluster_and_leaves_the_cluster(cluster: Any, 
     finally:
         command.kill()
     assert command.returncode == 130 and "torch-modal: interrupted" in said, said
-    wait_until(lambda: not processes(str(scratch)), 30)
+    wait_until(lambda: not processes(str(scratch)), 120)
     assert not find_sets(out)
     records = precompute_tree(root, out, OPTIONS, scheduler=cluster.scheduler_address)
     assert {record.status for record in records.values()} == {DONE}
