@@ -47,20 +47,6 @@ N_OUTWARD, N_BETWEEN, N_ALIKE = 2, 3, 2
 """Rounds in which frames that are not settled are searched again, outward from settled ones, then between their
 neighbours; starts of the former from shapes of any time.
 """
-N_COMPARED, N_FOLLOWED, FOLLOWED = 2, 8, (6.0, 1.5)
-"""Poses of a search that are compared after as-rigid-as-possible steps, these, and the largest distance of a pair in
-the first and in the last.
-"""
-TRUSTED, SETTLED, EXPLAINED = 0.34, 1.2, 0.2
-"""Part of the frames, those that explain most, that are settled; score over the least one below which others are, too;
-and score of a cloud below which turns of the template are not tried.
-"""
-N_OUTWARD, N_BETWEEN, N_ALIKE = 2, 3, 2
-"""Rounds in which frames that are not settled are searched again, outward from settled ones, then between their
-neighbours; starts of the former from shapes of any time.
-"""
-STAGES = 2 + N_OUTWARD + N_BETWEEN
-"""Visits to each frame, for a progress bar."""
 TIME_ROUNDS, LATEST, UNCHANGED = 6, 0.5, 10.0
 """Rounds in which times are estimated; the largest change, in parts of the gap between neighbours, and its weight."""
 
