@@ -65,14 +65,15 @@ def read_alembic(path: Path) -> tuple[FloatArray, IntArray, dict[str, Any]]:
     longest = max(schemas, key=lambda schema: schema.getNumSamples())
     times = [longest.getTimeSampling().getSampleTime(i) for i in range(max(longest.getNumSamples(), 1))]
     frames: list[FloatArray] = []
-    polygons: list[IntArray] = []
+    polygons: list[tuple[IntArray, IntArray]] = []
     for mesh, transforms in meshes:
         sample, first = mesh.getValue(0), sum(each.shape[1] for each in frames)
         sizes, corners = np.array(sample.getFaceCounts()), np.array(sample.getFaceIndices())
-        polygons += np.split(corners[_turned(sizes)] + first, np.cumsum(sizes)[:-1])
+        polygons.append((sizes, corners[_turned(sizes)] + first))
         frames.append(np.array([_positions(mesh, transforms, Abc.ISampleSelector(time)) for time in times]))
     options = {"fps": (len(times) - 1) / (times[-1] - times[0])} if times[-1] > times[0] else {}
-    return np.concatenate(frames, 1), fans(polygons), options
+    sizes, corners = map(np.concatenate, zip(*polygons, strict=True))
+    return np.concatenate(frames, 1), corners[fans(sizes)], options
 
 
 def _meshes(parent: Any, transforms: tuple[Any, ...]) -> Iterator[tuple[Any, tuple[Any, ...]]]:

@@ -3,8 +3,7 @@
 import io
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Iterable
-from itertools import pairwise
+from collections.abc import Collection
 from pathlib import Path
 from typing import NamedTuple
 
@@ -44,10 +43,16 @@ def linear_rgba(colors: FloatArray) -> FloatArray:
     return np.concatenate([rgb, alpha], axis=1)
 
 
-def fans(polygons: Iterable[IntArray]) -> IntArray:
-    """Triangles ``(F, 3)`` of polygons, from the first corner of each, so that they are the same in all frames."""
-    faces = [(polygon[0], *pair) for polygon in polygons for pair in pairwise(polygon[1:])]
-    return np.array(faces, dtype=np.int64).reshape(-1, 3)
+def fans(sizes: IntArray) -> IntArray:
+    """Corners of the triangles that polygons are cut into, from the first corner of each: the same in all frames.
+
+    Corners are numbered one polygon after the other. *Shape:* numbers of corners ``(P,)`` to ``(F, 3)``.
+    """
+    counts = np.maximum(sizes - 2, 0)
+    polygon = np.repeat(np.arange(len(sizes)), counts)
+    first = (np.cumsum(sizes) - sizes)[polygon]
+    second = first + 1 + np.arange(len(polygon)) - (np.cumsum(counts) - counts)[polygon]
+    return np.stack([first, second, second + 1], axis=1)
 
 
 class Material(NamedTuple):

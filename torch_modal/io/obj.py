@@ -9,7 +9,7 @@ import numpy as np
 
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.errors import MeshError
-from torch_modal.io.asset import CLAY, Asset, Material, Part, linear_rgba
+from torch_modal.io.asset import CLAY, Asset, Material, Part, fans, linear_rgba
 from torch_modal.io.mtl import read_libraries
 from torch_modal.io.normals import CarriedNormals
 
@@ -52,15 +52,13 @@ class ObjAsset(Asset):
         self._starts = np.cumsum(self._sizes) - self._sizes
         #: Vertex, texture coordinate and normal of each corner of the polygons; -1 where there is none.
         self._corners = self._read_corners(rows["f"])
-        # Polygons are fans of triangles, of corners of the file.
-        polygon = np.repeat(np.arange(len(self._sizes)), self._sizes - 2)
-        second = np.arange(len(polygon)) + 2 * polygon + 1
-        self._triangles = np.stack([self._starts[polygon], second, second + 1], axis=1)
+        self._triangles = fans(self._sizes)
         self.faces = self._corners[self._triangles, 0]
         # Faces have the material of the last line before them.
         self._materials = list(dict.fromkeys(["", *contents["usemtl"]]))
         numbers = np.array([self._materials.index(name) for name in ["", *contents["usemtl"]]])
-        self._material_of = numbers[np.searchsorted(self._line_of["usemtl"], self._line_of["f"])][polygon]
+        of_polygons = numbers[np.searchsorted(self._line_of["usemtl"], self._line_of["f"])]
+        self._material_of = np.repeat(of_polygons, self._sizes - 2)
         n_materials, groups = len({*contents["usemtl"]}), {(kind, row) for kind in "gos" for row in contents[kind]}
         self._libraries = contents["mtllib"]
         self._note("polygons", "quads" if (self._sizes <= 4).all() else "polygons", (self._sizes > 3).any())

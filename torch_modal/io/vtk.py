@@ -31,7 +31,9 @@ class VtkAsset(Asset):
         self._mesh = mesh
         self.positions = np.array(mesh.points, dtype=np.float64)
         polygons = mesh.irregular_faces
-        self.faces = fans(polygons)  # not by VTK, which cuts along the shorter diagonal of each frame
+        corners = np.concatenate([np.zeros(0, np.int64), *polygons])
+        # Not by VTK, which cuts along the shorter diagonal of each frame.
+        self.faces = corners[fans(np.array([len(polygon) for polygon in polygons], dtype=np.int64))]
         self._note("polygons", "polygons", len(self.faces) > len(polygons))
         self._note("normals", "normals", mesh.point_data.active_normals is not None)
         arrays = [*mesh.point_data, *mesh.cell_data]
