@@ -54,6 +54,7 @@ def run(args: argparse.Namespace) -> None:
 
     import torch_modal as tm
     from torch_modal.data.sequence import sequence_files, smooth_in_time
+    from torch_modal.io.read import SUFFIXES
 
     files = sequence_files(args.meshes)
     arguments.check_output(args, [args.out], files)
@@ -82,7 +83,7 @@ def run(args: argparse.Namespace) -> None:
             args.report(f"error:     {error((filled - frames)[left])} at the {len(left)} frames between key-frames")
         frames = filled
     skin = tm.bake(frames, faces, args.bones) if args.bones else None
-    asset = None if files[0].suffix.lower() in (".npz", ".abc") else tm.open_asset(files[0])
+    asset = tm.open_asset(files[0]) if files[0].suffix.lower() in SUFFIXES else None
     if asset is not None:
         asset.carries.pop("posing", None)  # it is what is written
     options = pick_options(args, "cyclic", "targets", "progress", "size")
