@@ -53,14 +53,13 @@ def textured(asset: Asset, n: int) -> PaintedFaces:
         paint = np.broadcast_to(np.array(part.material.color[:3]), (len(part.triangles) * len(pieces), 3, 3))
         if part.colors is not None:
             paint = paint * _interpolate(pieces, part.colors[part.triangles, :3])
-        picture = None
         if part.material.texture is not None and part.texcoords is not None:
             try:
                 picture = np.asarray(Image.open(io.BytesIO(part.material.texture)).convert("RGB")) / 255
             except Exception as error:  # damaged pictures may raise any exception
                 text = f"the texture of {part.material.name!r} cannot be read, and is not drawn: {error}"
                 warnings.warn(text, MeshWarning, stacklevel=5)
-        if picture is not None and part.texcoords is not None:
+                picture = np.ones((1, 1, 3))
             places = _interpolate(pieces, part.texcoords[part.triangles]) % 1 * picture.shape[1::-1]
             x, y = np.moveaxis(places.astype(np.int64), -1, 0)
             texels = picture[np.minimum(y, len(picture) - 1), np.minimum(x, picture.shape[1] - 1)]
