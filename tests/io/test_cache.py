@@ -164,6 +164,23 @@ def test_an_entry_above_the_limit_is_kept_alone_beside_files_of_others(tmp_path:
     assert kept(cache, 2) == [1]
 
 
+def test_an_entry_that_is_removed_while_it_is_opened_is_computed_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cache = Cache(tmp_path)
+    keep(cache, 0)
+    (entry,) = tmp_path.iterdir()
+    reopen = torch.UntypedStorage.from_file
+
+    def removed(*arguments: object, **options: object) -> object:  # safetensors opens the file, and then torch
+        entry.unlink(missing_ok=True)
+        return reopen(*arguments, **options)
+
+    monkeypatch.setattr(torch.UntypedStorage, "from_file", removed)
+    keep(cache, 0)
+    assert entry.exists()
+
+
 WRITER = """
 import sys, warnings
 import numpy as np
@@ -185,8 +202,8 @@ def test_several_processes_share_the_limit(tmp_path: Path) -> None:
         subprocess.Popen([*command, str(step)], env={**os.environ, "PYTHONPATH": root}, stderr=subprocess.PIPE)
         for step in (3, 5, 7)
     ]
-    for writer in writers:
-        assert writer.wait(timeout=120) == 0, writer.communicate()[1].decode()
+    failures = [writer.communicate(timeout=120)[1].decode() for writer in writers]
+    assert [writer.returncode for writer in writers] == [0, 0, 0], failures
     assert 0 < size_of(tmp_path) <= 5 * 2**17
 
 

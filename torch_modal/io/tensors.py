@@ -59,6 +59,8 @@ class TensorFile:
             digests = bytes_of(self._file.get_tensor(DIGESTS)) if DIGESTS in names else b""
         except SafetensorError as error:
             raise ValueError(f"{path} is no safetensors file, or a damaged one: {error}") from error
+        except RuntimeError as error:  # of torch, which opens the file a second time: another process may be quicker
+            raise OSError(f"{path} cannot be opened: {error}") from error
         try:
             self.metadata: dict[str, Any] = dict(json.loads(header))  # with what the writer added
         except (TypeError, ValueError, RecursionError):  # not of this package
