@@ -119,6 +119,19 @@ def test_a_template_follows_scans_of_two_sides(tube):
     assert error(found.shapes, x, diagonal) < 0.25 * error(x[2].expand_as(x), x, diagonal)
 
 
+def test_the_number_of_threads_changes_no_bit(tube):
+    x, faces, _ = tube
+    scans, found, before = [scanned(x[i], faces, i, VIEWS[i], i) for i in (1, 2)], [], torch.get_num_threads()
+    try:
+        for n in (1, 3):
+            torch.set_num_threads(n)
+            found.append(tm.complete(x[0], faces, scans, progress=False).shapes)
+            assert torch.get_num_threads() == n
+    finally:
+        torch.set_num_threads(before)
+    assert torch.equal(*found)
+
+
 def test_one_observation_is_one_shape(tube):
     x, faces, diagonal = tube
     seen = tm.Observation(3.0, x[1], vertices=torch.arange(len(x[1])))

@@ -21,6 +21,7 @@ from torch_modal.geometry.sparse import SparseSolver, graph_laplacian, solve_by
 from torch_modal.geometry.triangle_frames import (
     bend,
     bend_sides,
+    bend_slopes,
     edge_means,
     frames,
     mirror_sides,
@@ -92,6 +93,21 @@ def test_the_stretch_is_the_exponential_of_the_strain() -> None:
         found = bend_sides(torch.zeros_like(entries), entries, own)
         expected = torch.linalg.matrix_exp(given) @ corners[1:, :2].mT
         torch.testing.assert_close(torch.stack(found, 1)[:2, :, 0, 0], expected)
+
+
+def test_slopes_of_a_bend_are_those_of_autograd(bars: Shapes, generator: torch.Generator) -> None:
+    own = frames(sides(rows(bars.keyframes[0]), bars.faces))
+    n = len(bars.faces)
+    draw = partial(torch.randn, generator=generator, dtype=F64)
+    turn, strain, axes = draw(3, 1, n) * torch.logspace(-5, 0.3, n, dtype=F64), 0.5 * draw(3, 1, n), draw(3, 3, 1, n)
+    strain[..., :5], turn[..., :3] = 0, 0
+
+    def ends(change: torch.Tensor) -> torch.Tensor:  # of all triangles, summed: each depends on its own change
+        turned = turn + (axes * change[None, :3]).sum(1)
+        return torch.cat(bend_sides(turned, strain + change[3:], own)).sum((1, 2))
+
+    expected = torch.autograd.functional.jacobian(ends, torch.zeros(6, 1, n, dtype=F64))
+    torch.testing.assert_close(torch.cat(bend_slopes(turn, strain, own, axes)), expected, rtol=1e-12, atol=1e-13)
 
 
 def test_mirrored_sides_of_a_shear_follow_the_matrix_function() -> None:

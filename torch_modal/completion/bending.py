@@ -8,7 +8,7 @@ from torch import Tensor
 from torch_modal.geometry.poisson import Reconstruction
 from torch_modal.geometry.rigid import infinitesimal_motions
 from torch_modal.geometry.rotations import exp
-from torch_modal.geometry.triangle_frames import bend_sides, frames_of
+from torch_modal.geometry.triangle_frames import Frames, bend_sides, bend_slopes, frames_of
 from torch_modal.motion.decoder import bending_columns
 
 MOST_LOG_STRETCH = 1.0
@@ -42,15 +42,17 @@ class ModalBending:
         """No deformation."""
         return ModalPose(self.columns.new_zeros(len(self.columns)), torch.eye(3).double(), torch.zeros(3).double())
 
-    def _sides(self, base: Tensor, bending: Tensor, n_copies: int = 1) -> tuple[Tensor, Tensor]:
-        rest = frames_of(base[None], self.faces.repeat(n_copies, 1))
-        turn = bending[0] * rest.e1[:, 0] + bending[1] * rest.e2[:, 0] + bending[2] * rest.normal[:, 0]
-        return bend_sides(turn[:, None], bending[3:, None].clamp(-MOST_LOG_STRETCH, MOST_LOG_STRETCH), rest)
+    def _bending(self, base: Tensor, pose: ModalPose) -> tuple[Tensor, Tensor, Frames]:
+        """Rotation vectors, strains, and the frames of the shape. *Shape of both:* ``(3, 1, F)``."""
+        rest, bending = frames_of(base[None], self.faces), torch.einsum("k,kcf->cf", pose.amplitudes, self.columns)
+        turn = bending[0] * rest.e1 + bending[1] * rest.e2 + bending[2] * rest.normal
+        return turn, bending[3:, None], rest
 
     def shape(self, base: Tensor, pose: ModalPose) -> Tensor:
         """The deformed shape. *Shape:* ``(V, 3)``."""
-        bending = torch.einsum("k,kcf->cf", pose.amplitudes, self.columns)
-        return self.reconstruction(self._sides(base, bending), base[None])[0] @ pose.rotation.mT + pose.move
+        turn, strain, rest = self._bending(base, pose)
+        wanted = bend_sides(turn, strain.clamp(-MOST_LOG_STRETCH, MOST_LOG_STRETCH), rest)
+        return self.reconstruction(wanted, base[None])[0] @ pose.rotation.mT + pose.move
 
     def linearise(self, base: Tensor, pose: ModalPose, n: int | None = None) -> tuple[Tensor, Tensor]:
         """The deformed shape, and its derivatives in the first n amplitudes, a move and a turn about its centroid.
@@ -59,13 +61,12 @@ class ModalBending:
         """
         x = self.shape(base, pose)
         motions = infinitesimal_motions(x - x.mean(0)).movedim(0, -1)
-        # Six copies of all faces, in each of which another coordinate of the sides is differentiated: one backward.
-        copies = torch.einsum("k,kcf->cf", pose.amplitudes, self.columns).repeat(1, 6).requires_grad_()
-        with torch.enable_grad():
-            ends = torch.cat(self._sides(base, copies, 6))[:, 0].view(6, 6, -1).diagonal()
-            slopes = torch.autograd.grad(ends.sum(), copies)[0].view(6, 6, -1).permute(2, 1, 0)
+        turn, strain, rest = self._bending(base, pose)
+        bounded = strain.clamp(-MOST_LOG_STRETCH, MOST_LOG_STRETCH)
+        within = torch.cat([torch.ones_like(strain), (bounded == strain).to(strain)])
+        slopes = bend_slopes(turn, bounded, rest, torch.stack(rest[:3], 1))
         # The right-hand side of the Poisson problem at the corners of each face, by its bending: faster than by edges.
-        of_first, of_second = slopes.split(3, 1)  # (F, 3, 6) each
+        of_first, of_second = ((side * within)[:, :, 0].permute(2, 0, 1) for side in slopes)  # (F, 3, 6) each
         one, other, last = self.reconstruction.weights.view(3, -1)[..., None, None]
         corners = [
             -one * of_first - last * of_second,

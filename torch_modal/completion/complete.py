@@ -31,6 +31,7 @@ from torch_modal.inbetween.settings import Objective
 from torch_modal.keyframes.check import check_arrays
 from torch_modal.motion.path import Path
 from torch_modal.progress import Progress, ProgressReport
+from torch_modal.threads import alone
 from torch_modal.times import Times, check_times
 
 
@@ -143,6 +144,7 @@ def complete(
 
 @full_precision
 @outside_inference_mode
+@alone()
 def _complete(
     whole: Tensor,
     faces: Tensor,
@@ -178,19 +180,19 @@ def _complete(
             f"the shapes at {some} explain less than {100 * DOUBTFUL:.0f} % of the points seen then: those that are no "
             "key-frames are doubtful, and their confidence is low. Do the points show this body, in its units?",
             MeshWarning,
-            stacklevel=6,
+            stacklevel=7,
         )
     if (size := size_of(problem, x)) != 1:
         warnings.warn(
             f"the shapes are {size:.3g} times as large as the whole ones: are the points in another unit, or of "
             "another body? Scale the points, or the whole shapes, before",
             MeshWarning,
-            stacklevel=6,
+            stacklevel=7,
         )
     if stray:
         some = "; ".join(stray[:8])
         message = f"no shape explains {some}: leave them out if they are not of this body, else look at the shape there"
-        warnings.warn(message, MeshWarning, stacklevel=6)
+        warnings.warn(message, MeshWarning, stacklevel=7)
     order, moments = sorted(shape_at), [frame.time for frame in frames]
     whole_at = dict(zip(exact.tolist(), like, strict=False))  # bit for bit
     knots = torch.stack([whole_at[t] if t in whole_at else problem.to_caller(shape_at[t]).to(like) for t in order])

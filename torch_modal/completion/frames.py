@@ -118,7 +118,7 @@ class CompletionProblem:
         if not given or np.mean(given) >= INWARD:
             return 1
         message = "the normals of the clouds point into the body: they are turned over; pass -normals to be sure"
-        warnings.warn(message, MeshWarning, stacklevel=7)
+        warnings.warn(message, MeshWarning, stacklevel=8)
         return -1
 
     @staticmethod

@@ -32,6 +32,8 @@ N_SPACING, CELLS_OF_GAP = 1000, 6
 OUTLIERS = 4.0
 # Least noise, and the largest that is estimated, at a size of 100.
 NOISES = 0.1, 2.0
+# Trees that are asked once: made in half the time.
+QUICK = {"balanced_tree": False, "compact_nodes": False}
 # Steps in a factor of two, to which an estimated noise is rounded.
 NOISE_STEPS = 4
 
@@ -206,11 +208,11 @@ class SampledSurface(MeshSurface):
 
     @cached_property
     def _tree_of_places(self) -> cKDTree:
-        return cKDTree(self.samples)
+        return cKDTree(self.samples, **QUICK)
 
     @cached_property
     def _tree_with_normals(self) -> cKDTree:
-        return cKDTree(join_features(self.samples, self.face_normals[self.sample_faces]))
+        return cKDTree(join_features(self.samples, self.face_normals[self.sample_faces]), **QUICK)
 
     def visible(self, camera: Camera) -> IntArray:
         """The samples that a camera sees. *Shape:* ``(m,)``."""

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from functools import partial
 from hashlib import sha256
 from typing import NamedTuple
 
@@ -14,7 +15,7 @@ from torch import Tensor
 
 from torch_modal.completion.bending import ModalBending, ModalPose
 from torch_modal.completion.follow import follow
-from torch_modal.completion.frames import CompletionProblem
+from torch_modal.completion.frames import CompletionProblem, Frame
 from torch_modal.completion.pairs import SampledSurface
 from torch_modal.completion.search import AFTER_FIRST, FIRST, N_KEPT, N_SOFT, REST, PoseSearch
 from torch_modal.geometry.rigid import align, best_fit
@@ -24,6 +25,7 @@ from torch_modal.modes.extract import extract_bases
 from torch_modal.motion.decoder import scale_modes
 from torch_modal.motion.path import Path
 from torch_modal.progress import ProgressReport
+from torch_modal.threads import run
 
 N_MODES = 60
 """Modes of the template in which poses are searched, at most."""
@@ -102,12 +104,12 @@ class FramePoses:
                 if known and i not in settled:
                     fits[i] = self._again(i, self._starts(self.frames[i].time, known), fits[i])
                 report.update()
-        shapes = []
-        for i, frame in enumerate(self.frames):
-            pose = self.poses.stiffen(self._coarsen(fits[i].base), fits[i].pose, frame)
-            shapes.append(self.bending.shape(fits[i].base, pose))
-            report.update()
-        return shapes
+        return run([partial(self._stiffen, fits[i], frame, report) for i, frame in enumerate(self.frames)])
+
+    def _stiffen(self, fit: ModalFit, frame: Frame, report: ProgressReport) -> Tensor:
+        pose = self.poses.stiffen(self._coarsen(fit.base), fit.pose, frame)
+        report.update()
+        return self.bending.shape(fit.base, pose)
 
     def _settled(self, fits: dict[int, ModalFit]) -> dict[int, ModalFit]:
         """The fits that explain about as much as the best one, or the best third of all."""
@@ -122,14 +124,14 @@ class FramePoses:
         fit as well after some turns.
         """
         body, turns = self._surface(template), torch.from_numpy(Rotation.create_group("O").as_matrix())
-        placed = [self.poses.place(body, frame) for frame in self.frames]
+        placed = run([partial(self.poses.place, body, frame) for frame in self.frames])
         first = int(np.argmin([score for _, score in placed]))
         fit = self._search(first, [(template, placed[first][0])])
         if fit.score < EXPLAINED * len(self.frames[first].seen):
             return {first: fit}
-        turned = sorted((self.poses.place(body, self.frames[first], turn) for turn in turns), key=lambda one: one[1])
+        turned = run([partial(self.poses.place, body, self.frames[first], turn) for turn in turns])
         distinct = [placed[first][0]]
-        for pose, _ in turned:
+        for pose, _ in sorted(turned, key=lambda one: one[1]):
             # The trace of a rotation by an angle is 1 + 2 cos.
             if all(float((pose.rotation * other.rotation).sum()) < 1 + 2 * DISTINCT for other in distinct):
                 distinct.append(pose)
@@ -164,8 +166,9 @@ class FramePoses:
 
     def _alike(self, i: int, shapes: Sequence[Tensor]) -> list[tuple[Tensor, ModalPose]]:
         """The shapes that explain most of a frame after a rigid motion: motions repeat."""
-        placed = [(x, *self.poses.place(self._surface(x), self.frames[i])) for x in shapes]
-        return [(x, pose) for x, pose, _ in sorted(placed, key=lambda one: one[2])[:N_ALIKE]]
+        placed = run([partial(self.poses.place, self._surface(x), self.frames[i]) for x in shapes])
+        ranked = sorted(zip(shapes, placed, strict=True), key=lambda one: one[1][1])
+        return [(x, pose) for x, (pose, _) in ranked[:N_ALIKE]]
 
     def _starts(self, t: float, known: list[tuple[float, Tensor]]) -> list[tuple[Tensor, ModalPose]]:
         """Shapes from which a search at a time starts."""
@@ -199,22 +202,26 @@ class FramePoses:
         frame, poses, alone = self.frames[i], self.poses, not self.whole
         both = alone and any(one.camera is not None for one in frame.seen)
         ways, n_modes = [frame, frame.without_cameras()][: 1 + both], N_SOFT if alone else None
-        fits, begun = [], []
-        for base, start in starts:
+
+        def begin(base: Tensor, pose: ModalPose, way: Frame) -> tuple[Tensor, ModalPose, Frame, float]:
             coarse = self._coarsen(base)
-            fits.append((base, start, poses.score(coarse, start, frame)))
-            for way in ways:
-                pose = poses.descend(coarse, start, way, part=FIRST, n_modes=n_modes)
-                begun.append((base, pose, way, poses.score(coarse, pose, frame._replace(unit=AFTER_FIRST))))
-        for base, pose, way, _ in sorted(begun, key=lambda one: one[-1])[:N_KEPT]:
+            pose = poses.descend(coarse, pose, way, part=FIRST, n_modes=n_modes)
+            return base, pose, way, poses.score(coarse, pose, frame._replace(unit=AFTER_FIRST))
+
+        def finish(base: Tensor, pose: ModalPose, way: Frame | None) -> tuple[Tensor, ModalPose, float]:
             coarse = self._coarsen(base)
-            pose = poses.descend(coarse, pose, way, part=REST)
-            fits.append((base, pose, poses.score(coarse, pose, frame)))
+            pose = pose if way is None else poses.descend(coarse, pose, way, part=REST)
+            return base, pose, poses.score(coarse, pose, frame)
+
+        begun = run([partial(begin, *start, way) for start in starts for way in ways])
+        kept = [one[:-1] for one in sorted(begun, key=lambda one: one[-1])[:N_KEPT]]
+        fits = run([partial(finish, *one) for one in (*((*start, None) for start in starts), *kept)])
         fits.sort(key=lambda one: one[2])
         base, pose, score = fits[0]
         fits[0] = base, *poses.move_limbs(self._coarsen(base), pose, frame, score)
         if alone:
-            return min((self._follow(i, *one) for one in fits[:N_COMPARED]), key=lambda one: one.score)
+            followed = run([partial(self._follow, i, *one) for one in fits[:N_COMPARED]])
+            return min(followed, key=lambda one: one.score)
         base, pose, score = fits[0]
         return ModalFit(self.bending.shape(base, pose), base, pose, score)
 

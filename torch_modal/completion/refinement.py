@@ -1,5 +1,7 @@
 """The last stage: steps of all vertices of all frames, with new pairs and new neighbours in each round."""
 
+from functools import partial
+
 import numpy as np
 import torch
 from scipy.optimize import NoConvergence, anderson
@@ -19,6 +21,7 @@ from torch_modal.elastic.term import Mesh
 from torch_modal.elastic.volume import encloses
 from torch_modal.inbetween.settings import Objective, stiffnesses
 from torch_modal.progress import ProgressReport
+from torch_modal.threads import run
 
 OWN_OF_CLOUDS, OWN, WHOLE = 0.4, 0.1, 0.1
 """Weights of the shape by modes, where there are clouds and without, and of whole shapes, in Eq. 5; neighbours in
@@ -65,9 +68,8 @@ class Refinement:
         for i, pose in enumerate(poses):
             surface = SampledSurface(pose.numpy(), self.problem.mesh)
             frames[i] = frames[i]._replace(seen=[one.with_noise(surface) for one in frames[i].seen])
-        followed = torch.stack(
-            [follow(frame, pose, self.problem.mesh) for frame, pose in zip(frames, poses, strict=True)]
-        )
+        pairs = zip(frames, poses, strict=True)
+        followed = torch.stack(run([partial(follow, frame, pose, self.problem.mesh) for frame, pose in pairs]))
         (numbers, weights), x, of_known = self._rests(0.0 if smooth else OWN), followed, OF_KNOWN
 
         def rests_of(x: Tensor) -> list[RestShapes]:
@@ -77,7 +79,7 @@ class Refinement:
 
         def relax(x: Tensor, products: list[int]) -> LastSolve:
             rows = zip(frames, x.split(1), rests_of(x), strict=True)
-            every = [self._relax(frame, one, rests, products, of_known) for frame, one, rests in rows]
+            every = run([partial(self._relax, frame, one, rests, products, of_known) for frame, one, rests in rows])
             x, points = torch.cat([one for one, _ in every]), [p for _, p in every]
             return LastSolve(x, self.fine.energy, rests_of, points, smooth)
 

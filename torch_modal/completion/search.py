@@ -1,6 +1,7 @@
 """Poses and amplitudes of modes that bring a shape near to what was seen, from far to near."""
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import torch
@@ -14,6 +15,7 @@ from torch_modal.completion.frames import Frame
 from torch_modal.completion.pairs import SLIDE, ObservedPoints, SampledSurface
 from torch_modal.geometry.connectivity import Connectivity, edge_graph, farthest_apart
 from torch_modal.geometry.rigid import infinitesimal_motions
+from torch_modal.threads import run
 
 # Steps, and the distance from which on pairs lose weight at the first and the last; stiffness of the modes likewise.
 STEPS, FAR, NEAR = 12, 20.0, 2.0
@@ -147,11 +149,10 @@ class PoseSearch:
     def move_limbs(self, base: Tensor, pose: ModalPose, frame: Frame, best: float) -> tuple[ModalPose, float]:
         """The pose, and its score, after limbs were moved to points that nothing explained, where that helps."""
         for _ in range(ROUNDS):
-            others = [self._try_limb(base, pose, frame, *limb) for limb in self._limbs(base, pose, frame)]
-            scores = [self.score(base, other, frame) for other in others]
-            if not others or min(scores) > best - GAIN:
+            others = run([partial(self._try_limb, base, pose, frame, *limb) for limb in self._limbs(base, pose, frame)])
+            if not others or min(score for _, score in others) > best - GAIN:
                 break
-            best, pose = min(scores), others[int(np.argmin(scores))]
+            pose, best = min(others, key=lambda one: one[1])
         return pose, best
 
     def _limbs(self, base: Tensor, pose: ModalPose, frame: Frame) -> list[tuple[FloatArray, FloatArray, int]]:
@@ -169,8 +170,8 @@ class PoseSearch:
 
     def _try_limb(
         self, base: Tensor, pose: ModalPose, frame: Frame, points: FloatArray, weights: FloatArray, tip: int
-    ) -> ModalPose:
-        """A pose in which a limb explains points that nothing explained; its former pairs are released."""
+    ) -> tuple[ModalPose, float]:
+        """A pose, and its score, in which a limb explains points that nothing explained; its pairs are released."""
         extent = 2 * float(np.percentile(np.linalg.norm(points - points.mean(0), axis=1), 90))
         limb = self.from_tips[tip] < np.clip(extent, *LIMBS)
         vertices = np.flatnonzero(limb)
@@ -183,7 +184,8 @@ class PoseSearch:
 
         distances = MOST_AWAY, MOST_AWAY
         pose = self.descend(base, pose, frame, distances, frame.soft, STEPS // 2, released=limb, springs=springs)
-        return self.descend(base, pose, frame, (FAR / 3, NEAR), 10 * frame.soft, STEPS // 2)
+        pose = self.descend(base, pose, frame, (FAR / 3, NEAR), 10 * frame.soft, STEPS // 2)
+        return pose, self.score(base, pose, frame)
 
     def _rows(
         self,

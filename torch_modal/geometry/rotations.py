@@ -20,6 +20,8 @@ SMALL = 1e-3
 _COS = [(-1) ** k / factorial(2 * k) for k in range(4)]
 _SINC = [(-1) ** k / factorial(2 * k + 1) for k in range(4)]
 _ARC = [(-1) ** k / (2 * k + 1) for k in range(5)]
+_ONCE = [(-1) ** k / factorial(2 * k + 2) for k in range(4)]
+_TWICE = [(-1) ** k / factorial(2 * k + 3) for k in range(4)]
 
 # At half a turn the axis on this side is chosen. Hardly any axis that has a name lies between both sides.
 HALF_TURN_SIDE = (1.0, 1 / pi, 1 / pi**2)
@@ -98,6 +100,21 @@ def rotate(q: Tensor, v: Tensor) -> Tensor:
 def rotate_by(vector: Tensor, v: Tensor) -> Tensor:
     """Vectors rotated by rotation vectors. *Shape:* ``(3, ...), (3, ...) -> (3, ...)``."""
     return rotate(about(0.5 * vector), v)
+
+
+def turn_of_change(vector: Tensor, change: Tensor) -> Tensor:
+    """Turn that a small change of a rotation vector adds: the left Jacobian of the exponential, times the change.
+
+    *Shape:* ``(3, ...), (3, ...) -> (3, ...)``.
+    """
+    squared = (vector * vector).sum(0)
+    small = squared < SMALL
+    near, far = torch.where(small, squared, 0), torch.where(small, 1, squared)
+    angle = far.sqrt()
+    once = torch.where(small, _series(_ONCE, near), (1 - angle.cos()) / far)
+    twice = torch.where(small, _series(_TWICE, near), (1 - angle.sin() / angle) / far)
+    across = cross(vector, change)
+    return change + once * across + twice * cross(vector, across)
 
 
 def arc(q: Tensor) -> Tensor:

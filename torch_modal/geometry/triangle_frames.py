@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torch_modal.geometry.rotations import arc, product, rotate_by
+from torch_modal.geometry.rotations import arc, product, rotate_by, turn_of_change
 from torch_modal.geometry.vectors import cross, inverse, norm, pick, tiny
 
 # Smallest area relative to the squared sides; below, the normal is rounding, and divisions amplify noise.
@@ -176,6 +176,27 @@ def bend_sides(rotation: Tensor, strain: Tensor, reference: Frames) -> Sides:
     """
     first, second = stretch(strain, *reference[3:])
     return rotate_by(rotation, reference.world(*first)), rotate_by(rotation, reference.world(*second))
+
+
+def bend_slopes(rotation: Tensor, strain: Tensor, reference: Frames, axes: Tensor) -> Sides:
+    """Derivatives of :func:`bend_sides` in the rotation, along three axes, and in the three entries of the strain.
+
+    *Shape:* ``(3, B, F), (3, B, F)`` and, of the axes by column, ``(3, 3, B, F)``; ``(3, 6, B, F)`` of each side.
+    """
+    with torch.enable_grad():
+        # A copy for each of four coordinates: one backward of few numbers.
+        copies = strain.detach()[:, None].repeat(1, 4, 1, 1).requires_grad_()
+        first, second = stretch(copies, *reference[3:])
+        ends = torch.stack([*first, *second])
+        slopes = torch.autograd.grad(ends.diagonal().sum(), copies)[0]  # (3, 4, B, F)
+    turns = turn_of_change(rotation[:, None], axes)
+    e1, e2 = (rotate_by(rotation, axis)[:, None] for axis in reference[:2])
+    ends = ends.detach().diagonal().movedim(-1, 0)
+
+    def side(x: Tensor, y: Tensor, to_x: Tensor, to_y: Tensor) -> Tensor:
+        return torch.cat([cross(turns, x * e1 + y * e2), e1 * to_x + e2 * to_y], 1)
+
+    return side(ends[0], ends[1], slopes[:, 0], slopes[:, 1]), side(ends[2], ends[3], slopes[:, 2], slopes[:, 3])
 
 
 def bent_sides(turn: Tensor, strain: Tensor, shape: Frames) -> Sides:

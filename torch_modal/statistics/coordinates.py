@@ -8,7 +8,7 @@ from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.local_rotations import LocalRotations
 from torch_modal.geometry.poisson import Reconstruction
 from torch_modal.geometry.rigid import best_fit
-from torch_modal.geometry.triangle_frames import Sides, bend_sides, bending_between, frames_of
+from torch_modal.geometry.triangle_frames import Sides, bend_sides, bend_slopes, bending_between, frames_of
 
 # Only triangles without area have logarithmic strains beyond this, a factor of 3,000.
 MOST_STRAIN = 8.0
@@ -85,6 +85,13 @@ class BendingCoordinates:
         """Target sides of the triangles. *Shape:* ``(B, 6, E)``."""
         rows = coordinates[..., : len(self.faces)].movedim(1, 0)
         return bend_sides(rows[:3], rows[3:], self.frames)
+
+    def slopes(self, coordinates: Tensor) -> Sides:
+        """Derivatives of :meth:`sides` in the coordinates of each triangle. *Shape:* ``(1, 6, E) -> (3, 6, F)``."""
+        rows = coordinates[..., : len(self.faces)].movedim(1, 0)
+        axes = torch.eye(3).to(rows)[..., None, None]
+        first, second = bend_slopes(rows[:3], rows[3:], self.frames, axes)
+        return first[:, :, 0], second[:, :, 0]
 
     def shapes(self, coordinates: Tensor) -> Tensor:
         """The shapes of coordinates, in any pose. *Shape:* ``(B, 6, E) -> (B, V, 3)``."""

@@ -116,12 +116,7 @@ class LocalWeights:
         """Derivatives of the observed vertices, without loose pieces' rotations. *Shape:* ``(K n,) -> (3m, K n)``."""
         variation = self.variation
         bending = variation.bending(self.weights(factors))
-        # Each side depends on its triangle alone. By columns, forward mode would take five times as long.
-        with torch.enable_grad():
-            leaf = bending.detach().requires_grad_()
-            ends = torch.cat(variation.coordinates.sides(leaf[None]))[:, 0]
-            slopes = torch.stack([torch.autograd.grad(row.sum(), leaf, retain_graph=True)[0] for row in ends])
-        one, other = slopes[..., : len(variation.faces)].split(3)  # (3, 6, F) each
+        one, other = variation.coordinates.slopes(bending[None])
         fields = variation.coordinates.spread(variation.fields)
         moves = variation.coordinates.size * torch.eye(3, 6).to(bending)[..., None]
         carries = (variation.coordinates.centres[:, self.to.vertices].mT > 0).to(bending)
