@@ -14,6 +14,7 @@ import pytest
 import scipy.sparse as sp
 import torch
 import trimesh
+from browsers import NoBrowser, open_browser
 from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from solids import box, eigenmodes, element_hessian, lumped_mass, surface
 from timing import limit_threads
@@ -33,6 +34,7 @@ from torch_modal.modes.tetwild import TetWild
 from torch_modal.registration.load import load_keyframes
 
 COARSE = TetWild(edge_length_fac=0.08, epsilon=5e-3)
+Ball = tuple[np.ndarray, np.ndarray]
 
 limit_threads()  # small problems, and often several processes at once: threads would wait for each other
 
@@ -223,3 +225,28 @@ def random_rotation(generator: torch.Generator) -> torch.Tensor:
     """A rotation matrix, float64, uniform over all of them."""
     q = torch.randn(4, dtype=torch.float64, generator=generator)
     return quaternion_to_rotation_matrix(q / q.norm())
+
+
+@pytest.fixture(scope="module")
+def ball() -> tuple[np.ndarray, np.ndarray]:
+    """A sphere around (1, 2, 3), of radius 2, with one vertex straight towards +z: vertices (V, 3), faces (F, 3)."""
+    mesh = trimesh.creation.uv_sphere(radius=2.0, count=(16, 16))
+    assert np.isclose(mesh.vertices[:, 2].max(), 2.0)
+    return np.array(mesh.vertices) + np.array([1.0, 2.0, 3.0]), np.array(mesh.faces, dtype=np.int64)
+
+
+@pytest.fixture(scope="module")
+def growing(ball: Ball) -> np.ndarray:
+    """Seven frames of the ball: from its size to 1.6 times that, a tenth a frame."""
+    vertices, _ = ball
+    centre = np.array([1.0, 2.0, 3.0])
+    return np.stack([centre + (1 + 0.1 * n) * (vertices - centre) for n in range(7)])
+
+
+@pytest.fixture(scope="module")
+def chrome() -> Iterator[Any]:
+    try:
+        with open_browser() as browser:
+            yield browser
+    except NoBrowser as reason:
+        pytest.skip(f"no page can be opened: {reason}")

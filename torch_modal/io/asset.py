@@ -63,6 +63,7 @@ class Material(NamedTuple):
     metallic: float = 0.0
     roughness: float = 0.85
     texture: bytes | None = None  # a PNG or JPEG file
+    alpha: str = "OPAQUE"  # glTF's alphaMode: alpha is ignored; MASK: cut out below one half; BLEND: translucent
 
 
 class Part(NamedTuple):
@@ -99,6 +100,11 @@ class Asset(ABC):
         """Add a feature to :attr:`carries`, if the file has it."""
         if there:
             self.carries[feature] = name
+
+    @property
+    def is_painted(self) -> bool:
+        """True for a file with materials or vertex colours."""
+        return bool({"materials", "colors"} & self.carries.keys())
 
     @abstractmethod
     def with_positions(self, positions: FloatArray) -> bytes:

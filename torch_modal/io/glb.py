@@ -174,6 +174,6 @@ def _material(document: Document, material: Material) -> Json:
         texture = document.append("textures", {"source": image, "sampler": 0})
         surface["baseColorTexture"] = {"index": texture}
     made: Json = {"name": material.name, "doubleSided": True, "pbrMetallicRoughness": surface}
-    if material.color[3] < 1:
-        made["alphaMode"] = "BLEND"
+    if material.alpha != "OPAQUE":
+        made["alphaMode"] = material.alpha
     return made

@@ -194,7 +194,7 @@ class GltfAsset(Asset):
 
     # --------------------------------------------------------------------------------------------- for other formats
     def parts(self) -> list[Part]:
-        """One part for each primitive; of materials, colour, roughness and the texture of the colour."""
+        """One part for each primitive; of materials, colour, roughness, alpha and the texture of the colour."""
         parts = []
         for primitive in self._primitives:
             attributes, material, channel = primitive.json["attributes"], Material(), 0
@@ -205,7 +205,7 @@ class GltfAsset(Asset):
                 for name in ("COLOR_0", f"TEXCOORD_{channel}")
             )
             vertices = np.arange(primitive.points.start, primitive.points.stop)
-            parts.append(Part(vertices, primitive.triangles, material, texcoords, colors))
+            parts.append(Part(vertices, primitive.triangles, material, texcoords, colors, primitive.normals))
         return parts
 
     def _material(self, index: int) -> tuple[Material, int]:
@@ -218,4 +218,5 @@ class GltfAsset(Asset):
             texture = as_png_or_jpeg(self.document.image(source))
         color = tuple(map(float, surface.get("baseColorFactor", (1, 1, 1, 1))))
         numbers = float(surface.get("metallicFactor", 1)), float(surface.get("roughnessFactor", 1))
-        return Material(material.get("name", f"material-{index}"), color, *numbers, texture), used.get("texCoord", 0)
+        name, alpha = material.get("name", f"material-{index}"), material.get("alphaMode", "OPAQUE")
+        return Material(name, color, *numbers, texture, alpha), used.get("texCoord", 0)

@@ -77,7 +77,8 @@ def _with_property(material: Material, key: str, words: list[str]) -> Material:
         case "kd", [r, g, b, *_]:
             return material._replace(color=(r, g, b, alpha))
         case (("d" | "tr"), [x, *_]):
-            return material._replace(color=(*rgb, min(max(x if key == "d" else 1 - x, 0.0), 1.0)))
+            alpha = min(max(x if key == "d" else 1 - x, 0.0), 1.0)
+            return material._replace(color=(*rgb, alpha), alpha="BLEND" if alpha < 1 else "OPAQUE")
         case "ns", [x, *_]:  # of a Blinn-Phong exponent, the roughness whose highlight has the same width
             return material._replace(roughness=min(1.0, (2 / (max(x, 0.0) + 2)) ** 0.25))
         case "pr", [x, *_]:

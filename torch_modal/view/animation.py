@@ -153,7 +153,7 @@ def _pictures(animation: Animation) -> list[ByteArray]:
     # H.264 stores colour for blocks of two by two.
     size = np.maximum((animation.size * half / half.max() / 2).round() * 2, 2).astype(np.int64)
     surface, asset = plain(np.broadcast_to(BETWEEN_COLOR, points[0, 0].shape), faces), animation.asset
-    if asset is not None and {"materials", "colors"} & asset.carries.keys():
+    if asset is not None and asset.is_painted:
         corners = points[0, 0][faces] * float(size.max() / half.max() / 2)
         side = float(np.quantile(np.linalg.norm(corners - np.roll(corners, 1, 1), axis=-1), 0.9))
         most = (MOST_PIECES / len(faces)) ** 0.5

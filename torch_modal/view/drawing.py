@@ -1,8 +1,10 @@
 """Shapes and points drawn by matplotlib into cells of a figure, in view coordinates, a cell centred at the origin."""
 
+from __future__ import annotations
+
 import io
 import warnings
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +13,9 @@ from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.errors import MeshWarning
 from torch_modal.geometry.vectors import vertex_normals
 from torch_modal.io.asset import Asset, linear_rgba
+
+if TYPE_CHECKING:
+    from PIL import Image
 
 ByteArray = NDArray[np.uint8]
 
@@ -41,8 +46,6 @@ def plain(colors: FloatArray, faces: IntArray) -> PaintedFaces:
 
 def textured(asset: Asset, n: int) -> PaintedFaces:
     """Faces with the materials, textures and vertex colours of a file; each is cut into ``n²`` pieces."""
-    from PIL import Image
-
     at = [np.array([(i, j), (i + 1, j), (i, j + 1)]) for i in range(n) for j in range(n - i)]
     at += [np.array([(i, j + 1), (i + 1, j), (i + 1, j + 1)]) for i in range(n) for j in range(n - 1 - i)]
     steps = np.array(at) / n
@@ -54,18 +57,26 @@ def textured(asset: Asset, n: int) -> PaintedFaces:
         if part.colors is not None:
             paint = paint * _interpolate(pieces, part.colors[part.triangles, :3])
         if part.material.texture is not None and part.texcoords is not None:
-            try:
-                picture = np.asarray(Image.open(io.BytesIO(part.material.texture)).convert("RGB")) / 255
-            except Exception as error:  # damaged pictures may raise any exception
-                text = f"the texture of {part.material.name!r} cannot be read, and is not drawn: {error}"
-                warnings.warn(text, MeshWarning, stacklevel=5)
-                picture = np.ones((1, 1, 3))
+            picture = np.asarray(open_texture(part.material.name, part.material.texture).convert("RGB")) / 255
             places = _interpolate(pieces, part.texcoords[part.triangles]) % 1 * picture.shape[1::-1]
             x, y = np.moveaxis(places.astype(np.int64), -1, 0)
             texels = picture[np.minimum(y, len(picture) - 1), np.minimum(x, picture.shape[1] - 1)]
             paint = paint * linear_rgba(texels.reshape(-1, 3))[:, :3].reshape(texels.shape)
         colors.append(np.where(paint <= 0.0031308, 12.92 * paint, 1.055 * paint ** (1 / 2.4) - 0.055))
     return PaintedFaces(np.concatenate(faces), pieces, np.concatenate(colors))
+
+
+def open_texture(name: str, texture: bytes) -> Image.Image:
+    """Picture of the texture of a material; one white pixel, with a warning, if it cannot be read."""
+    from PIL import Image
+
+    try:
+        picture = Image.open(io.BytesIO(texture))
+        picture.load()
+    except Exception as error:  # damaged pictures may raise any exception
+        warnings.warn(f"the texture of {name!r} cannot be read, and is white: {error}", MeshWarning, stacklevel=6)
+        return Image.new("RGB", (1, 1), "white")
+    return picture
 
 
 def _interpolate(pieces: FloatArray, corners: FloatArray) -> FloatArray:

@@ -19,6 +19,7 @@ from typing import Any, Literal
 import numpy as np
 
 from torch_modal.arrays import Array
+from torch_modal.io.asset import FEATURES, Asset
 from torch_modal.io.files import write_files
 from torch_modal.io.formats import PAGES
 from torch_modal.io.write import check_frames, check_indices, check_suffix, refuse_existing, to_numpy
@@ -79,6 +80,7 @@ def show(
     cyclic: bool = False,
     view: tuple[float, float] | None = None,
     up: Literal["y", "z"] | None = None,
+    asset: Asset | None = None,
     title: str = "torch_modal",
     height: int = 600,
 ) -> Page:
@@ -99,6 +101,8 @@ def show(
         cyclic: Add the step from the last frame back to the first, unless the two are equal already.
         view: Azimuth and elevation of the first view in degrees, as for :func:`torch_modal.render_sequence`.
         up: ``"y"`` or ``"z"``; by default Y, unless the first shape is flat in Y.
+        asset: The mesh file that the shapes come from (:func:`torch_modal.open_asset`), with whose materials, textures
+            and vertex colours all sequences are shown. Textures are at most 2,048 pixels wide and high.
         title: Of the page.
         height: In pixels, in a notebook.
 
@@ -107,6 +111,9 @@ def show(
 
     Raises:
         ValueError: An argument cannot be used; the message says why.
+
+    Warns:
+        MeshWarning: A texture cannot be read, and is white.
     """
     check_view(view, up)
     by_name = sequences if isinstance(sequences, Mapping) else {"shapes": sequences}
@@ -115,12 +122,14 @@ def show(
     checked, triangles = check_sequences({str(name): frames for name, frames in by_name.items()}, faces, "sequences")
     shapes = list(checked.values())
     n = len(shapes[0])
+    if asset is not None:
+        asset.check(shapes[0], Path("page.html"), FEATURES)
     keyframes = check_indices([0, n - 1] if keyframe_indices is None else keyframe_indices, n, "keyframe_indices")
     stamps = check_times(times, n, of="frame").numpy()
     if cyclic and n > 1 and not all(np.array_equal(frames[0], frames[-1]) for frames in shapes):
         stamps = np.append(stamps, stamps[-1] + (stamps[-1] - stamps[0]) / (n - 1))  # when the first comes again
     data = {"n_frames": n, "times": stamps.tolist(), "has_times": times is not None, "fps": float(fps)}
-    return _page([pack_group(checked, triangles, view, up)], title, height, **data, keyframes=keyframes)
+    return _page([pack_group(checked, triangles, view, up, asset)], title, height, **data, keyframes=keyframes)
 
 
 def show_landmarks(

@@ -1,4 +1,8 @@
-// Positions and faces from the data of the page (the inverse of page_data.py, which describes the format); edges, normals.
+// Positions, faces and materials from the data of the page (the inverse of page_data.py, which describes the format);
+// edges, normals.
+
+const GRID_STEPS = 65535; // a coordinate from 0 to 1, or a part of a colour
+const TEXEL_STEPS = 65536; // a texture coordinate from 0 to 1
 
 /** The bytes that base64 text stands for. */
 function bytesOfBase64(text) {
@@ -17,17 +21,58 @@ async function inflate(bytes) {
 /** 0, 1, 2, 3, ... as 0, -1, 1, -2, ... */
 const signed = (number) => (number >>> 1) ^ -(number & 1);
 
-/** Faces: a Uint32Array of 3F vertex indices. */
-async function unpackFaces(text, nFaces) {
+/** An Int32Array of n whole numbers, such as the 3F vertex indices of faces. */
+async function unpackIntegers(text, n) {
   const planes = await inflate(bytesOfBase64(text));
-  const n = 3 * nFaces;
   if (planes.length !== 4 * n) throw new Error("the faces of this page are damaged");
-  const faces = new Uint32Array(n);
+  const numbers = new Int32Array(n);
   for (let i = 0, last = 0; i < n; i++) {
     const word = planes[i] | (planes[n + i] << 8) | (planes[2 * n + i] << 16) | (planes[3 * n + i] << 24);
-    faces[i] = last += signed(word);
+    numbers[i] = last += signed(word);
   }
-  return faces;
+  return numbers;
+}
+
+/** As indices of WebGL. */
+const unpackIndices = async (text, n) => new Uint32Array((await unpackIntegers(text, n)).buffer);
+
+/** Columns of numbers as rows, divided. */
+function rowsOf(columns, width, divisor) {
+  const n = columns.length / width;
+  return Float32Array.from(columns, (_, i) => columns[(i % width) * n + Math.floor(i / width)] / divisor);
+}
+
+/** A picture of a data URI; white if the browser cannot read it. */
+async function pictureOf(uri) {
+  const picture = new Image();
+  picture.src = uri;
+  try {
+    await picture.decode();
+    return picture;
+  } catch {
+    return new ImageData(new Uint8ClampedArray(4).fill(255), 1);
+  }
+}
+
+/**
+ * What is drawn of a group: points, each of one vertex, and triangles of them in parts of one material. Points of the
+ * same number in `normals` share a normal. Without materials, the points are the vertices.
+ */
+async function unpackSurface({ surface, faces, n_vertices }) {
+  if (!surface) {
+    const vertices = Uint32Array.from({ length: n_vertices }, (_, i) => i);
+    return { vertices, normals: vertices, triangles: faces, parts: [] };
+  }
+  const { n_points, parts } = surface;
+  return {
+    parts,
+    vertices: await unpackIndices(surface.vertices, n_points),
+    normals: await unpackIndices(surface.normals, n_points),
+    triangles: await unpackIndices(surface.triangles, parts.reduce((sum, { n_corners }) => sum + n_corners, 0)),
+    texcoords: rowsOf(await unpackIntegers(surface.texcoords, 2 * n_points), 2, TEXEL_STEPS),
+    colors: rowsOf(await unpackIntegers(surface.colors, 4 * n_points), 4, GRID_STEPS),
+    textures: await Promise.all(surface.textures.map((uri) => uri && pictureOf(uri))),
+  };
 }
 
 /** Shapes: for each frame a Uint16Array of 3V numbers x, y, z, x, y, z, ... in steps of the grid. */
@@ -68,13 +113,13 @@ function edgesOf(faces) {
   return edges;
 }
 
-/** Normals of the vertices, weighted by area and not of unit length, into `out`. */
-function normalsOf(points, faces, out) {
+/** Normals of points, weighted by area and not of unit length: of each triangle, added to those of `numbers`. */
+function normalsOf(points, triangles, numbers, out) {
   out.fill(0);
-  for (let f = 0; f < faces.length; f += 3) {
-    const a = 3 * faces[f];
-    const b = 3 * faces[f + 1];
-    const c = 3 * faces[f + 2];
+  for (let f = 0; f < triangles.length; f += 3) {
+    const a = 3 * triangles[f];
+    const b = 3 * triangles[f + 1];
+    const c = 3 * triangles[f + 2];
     const ux = points[b] - points[a];
     const uy = points[b + 1] - points[a + 1];
     const uz = points[b + 2] - points[a + 2];
@@ -84,10 +129,21 @@ function normalsOf(points, faces, out) {
     const nx = uy * vz - uz * vy;
     const ny = uz * vx - ux * vz;
     const nz = ux * vy - uy * vx;
-    for (const corner of [a, b, c]) {
-      out[corner] += nx;
-      out[corner + 1] += ny;
-      out[corner + 2] += nz;
+    for (let corner = f; corner < f + 3; corner++) {
+      const to = 3 * numbers[triangles[corner]];
+      out[to] += nx;
+      out[to + 1] += ny;
+      out[to + 2] += nz;
     }
+  }
+}
+
+/** Rows of three numbers, in the order of indices, into `out`. */
+function gather(rows, indices, out) {
+  for (let i = 0, to = 0; i < indices.length; i++) {
+    const from = 3 * indices[i];
+    out[to++] = rows[from];
+    out[to++] = rows[from + 1];
+    out[to++] = rows[from + 2];
   }
 }

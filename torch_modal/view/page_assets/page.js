@@ -57,6 +57,7 @@ class Viewer {
     this.clock = new Clock(data.times);
     this.closed = data.times.length > data.n_frames;
     this.picksLandmarks = data.landmarks !== null;
+    this.hasMaterials = actors.some(({ materials }) => materials.length);
     this.rows = data.landmarks ?? []; // picked vertices, one of each actor; null where it is still missing
     this.undone = []; // the rows before each change
     this.hidden = new Set();
@@ -206,7 +207,10 @@ class Viewer {
   layOut() {
     const shown = this.actors.filter((actor) => !this.hidden.has(actor));
     this.stage.layOut(shown, this.overlaid);
-    shown.forEach((actor, order) => actor.setOpacity(this.overlaid && order ? 0.45 : 1, order));
+    shown.forEach((actor, order) => {
+      const over = this.overlaid && order > 0; // in the sequence's colour, to tell it from the first
+      actor.setLook(find("materials").checked && this.hasMaterials && !over, over ? 0.45 : 1, order);
+    });
     for (const cell of this.stage.cells) {
       const names = cell.actors.map((actor) => {
         const name = make("div", { class: "name" }, actor.name);
@@ -310,6 +314,7 @@ class Viewer {
     on("time", "input", () => this.#scrub(Number(find("time").value)));
     on("reset", "click", () => this.resetView());
     on("wireframe", "change", () => this.#showWires());
+    on("materials", "change", () => this.layOut());
     on("trails", "change", () => this.#showTrails());
     on("undo", "click", () => this.undo());
     on("clear", "click", () => this.setRows([]));
@@ -334,6 +339,7 @@ class Viewer {
       find("keyframes").append(tick);
     }
     find("sequences").hidden = find("layout").hidden = this.actors.length < 2 || this.picksLandmarks;
+    find("materials").parentElement.hidden = !this.hasMaterials;
     find("player").hidden = this.clock.last === 0;
     find("trails").parentElement.hidden = this.picksLandmarks;
     find("save").hidden = !this.picksLandmarks;
@@ -379,6 +385,7 @@ class Viewer {
       Home: () => show(0),
       End: () => show(this.data.n_frames - 1),
       Backspace: () => this.undo(),
+      m: () => this.hasMaterials && find("materials").click(),
       r: () => this.resetView(),
     };
     if (!(key in acts)) return;
@@ -389,8 +396,10 @@ class Viewer {
 
 /** The actors of a group, out of the page's data. */
 async function actorsOf(group, nFrames) {
-  group.faces = await unpackFaces(group.faces, group.n_faces);
+  group.faces = await unpackIndices(group.faces, 3 * group.n_faces);
   group.edges = edgesOf(group.faces);
+  group.surface = await unpackSurface(group);
+  group.textures = (group.surface.textures ?? []).map((picture) => picture && textureOf(picture));
   group.orbit = new Orbit(group.view);
   const sequences = group.sequences.map(async ({ name, frames }) => {
     return new Actor(group, name, await unpackFrames(frames, nFrames, group.n_vertices));

@@ -1,13 +1,23 @@
 // Drawing: a mesh with wires, trails and marks for each sequence, in cells over one canvas.
 
 const FIELD_OF_VIEW = 26; // degrees, upright
-const TO_SCENE = 1 / 65535; // the longest side of the box around the shapes of a group is 1 in the scene
+const TO_SCENE = 1 / GRID_STEPS; // the longest side of the box around the shapes of a group is 1 in the scene
 
-// The lights of the package's pictures: directions as the viewer sees them, and brightness.
+// The lights of the package's pictures: directions as the viewer sees them, and brightness. Materials are linear RGBA;
+// as in the pictures, the lights multiply their colours of the screen, sRGB.
 const SURFACE_SHADER = {
   vertexShader: `
     varying vec3 vNormal, vView;
+    #ifdef PAINTED
+      attribute vec4 paint;
+      varying vec4 vPaint;
+      varying vec2 vUv;
+    #endif
     void main() {
+      #ifdef PAINTED
+        vPaint = paint;
+        vUv = uv;
+      #endif
       vec4 seen = modelViewMatrix * vec4(position, 1.0);
       vNormal = normalMatrix * normal;
       vView = -seen.xyz;
@@ -17,6 +27,12 @@ const SURFACE_SHADER = {
     uniform vec3 tint;
     uniform float opacity;
     varying vec3 vNormal, vView;
+    #ifdef PAINTED
+      uniform vec4 color;
+      uniform sampler2D picture;
+      varying vec4 vPaint;
+      varying vec2 vUv;
+    #endif
     float lit(vec3 n, vec3 place, float brightness) { return brightness * max(dot(n, normalize(place)), 0.0); }
     void main() {
       vec3 view = normalize(vView);
@@ -26,7 +42,21 @@ const SURFACE_SHADER = {
                   + lit(n, vec3(0.0, -3.0, 2.0), 0.14);
       float rim = 0.8 + 0.2 * sqrt(max(dot(n, view), 0.0)); // darker outlines separate what overlaps
       float shine = 0.07 * pow(max(dot(n, normalize(normalize(vec3(-2.0, 3.0, 4.0)) + view)), 0.0), 24.0);
-      gl_FragColor = vec4(tint * (0.25 + 0.77 * light) * rim + shine, opacity);
+      vec4 base = vec4(tint, opacity);
+      #ifdef PAINTED
+        base = color * vPaint;
+        #ifdef TEXTURED
+          base *= texture2D(picture, vUv);
+        #endif
+        base.rgb = mix(12.92 * base.rgb, 1.055 * pow(base.rgb, vec3(1.0 / 2.4)) - 0.055, step(0.0031308, base.rgb));
+        #ifdef CUT_OUT
+          if (base.a < 0.5) discard;
+        #endif
+        #ifndef TRANSLUCENT
+          base.a = 1.0;
+        #endif
+      #endif
+      gl_FragColor = vec4(base.rgb * (0.25 + 0.77 * light) * rim + shine, base.a);
     }`,
 };
 
@@ -59,30 +89,61 @@ function dotMaterial(size, tint, opacity, depthTest) {
 const lineMaterial = (color, opacity, depthTest = true) =>
   new THREE.LineBasicMaterial({ color, opacity, depthTest, depthWrite: false, transparent: true });
 
-/** One sequence. A group holds what its sequences share: faces, edges, and the orbit of the camera. */
+/** A texture that repeats. Filters work on linear colours. */
+function textureOf(picture) {
+  const texture = new THREE.Texture(picture);
+  texture.colorSpace = THREE.SRGBColorSpace;
+  texture.wrapS = texture.wrapT = THREE.RepeatWrapping;
+  texture.flipY = false; // coordinates begin at the upper left
+  texture.anisotropy = 8;
+  texture.needsUpdate = true;
+  return texture;
+}
+
+/** The material of a part of a surface. */
+function paintedMaterial(look, { color, alpha }, texture) {
+  const blend = alpha === "BLEND";
+  const used = { PAINTED: true, TEXTURED: texture, CUT_OUT: alpha === "MASK", TRANSLUCENT: blend };
+  const defines = Object.fromEntries(Object.keys(used).filter((name) => used[name]).map((name) => [name, 1]));
+  const uniforms = { ...look.uniforms, color: { value: color }, picture: { value: texture } };
+  return new THREE.ShaderMaterial({ ...look, defines, uniforms, transparent: blend, depthWrite: !blend });
+}
+
+/** One sequence. A group holds what its sequences share: faces, edges, surface, and the orbit of the camera. */
 class Actor {
   constructor(group, name, frames) {
     Object.assign(this, { group, name, frames });
-    const indices = (array) => new THREE.BufferAttribute(array, 1);
-    const vectors = () => new THREE.BufferAttribute(new Float32Array(3 * group.n_vertices), 3);
-    const { centre } = group.view;
-    this.position = vectors();
-    this.normal = vectors();
+    const attribute = (array, width) => new THREE.BufferAttribute(array, width);
+    const vectors = (n) => attribute(new Float32Array(3 * n), 3);
+    const { surface, view: { centre } } = group;
+    this.position = vectors(group.n_vertices);
+    this.normals = new Float32Array(3 * surface.vertices.length);
     const geometry = new THREE.BufferGeometry();
-    geometry.setIndex(indices(group.faces));
-    geometry.setAttribute("position", this.position);
-    geometry.setAttribute("normal", this.normal);
+    geometry.setIndex(attribute(surface.triangles, 1));
+    geometry.setAttribute("position", vectors(surface.vertices.length));
+    geometry.setAttribute("normal", vectors(surface.vertices.length));
+    if (surface.parts.length) {
+      geometry.setAttribute("uv", attribute(surface.texcoords, 2));
+      geometry.setAttribute("paint", attribute(surface.colors, 4));
+    }
     // Holds all shapes: rays are tried against it first, and it need not be computed for each.
     geometry.boundingSphere = new THREE.Sphere(new THREE.Vector3(...centre), 2 / TO_SCENE);
     const wires = new THREE.BufferGeometry();
     wires.setAttribute("position", this.position);
-    wires.setIndex(indices(group.edges));
+    wires.setIndex(attribute(group.edges, 1));
     this.uniforms = { tint: { value: [1, 1, 1] }, opacity: { value: 1 } };
     const behindWires = { polygonOffset: true, polygonOffsetFactor: 1, polygonOffsetUnits: 1 };
-    const surface = { ...SURFACE_SHADER, ...behindWires, uniforms: this.uniforms, side: THREE.DoubleSide };
-    this.mesh = new THREE.Mesh(geometry, new THREE.ShaderMaterial(surface));
+    const look = { ...SURFACE_SHADER, ...behindWires, uniforms: this.uniforms, side: THREE.DoubleSide };
+    this.plain = new THREE.ShaderMaterial(look);
+    this.materials = surface.parts.map((part) => paintedMaterial(look, part, group.textures[part.texture]));
+    let start = 0;
+    surface.parts.forEach(({ n_corners }, i) => {
+      geometry.addGroup(start, n_corners, i);
+      start += n_corners;
+    });
+    this.mesh = new THREE.Mesh(geometry, this.plain);
     // A translucent shape first fills the depth alone, so that only its nearest side shows.
-    this.depth = new THREE.Mesh(geometry, new THREE.ShaderMaterial({ ...surface, colorWrite: false }));
+    this.depth = new THREE.Mesh(geometry, new THREE.ShaderMaterial({ ...look, colorWrite: false }));
     this.wires = new THREE.LineSegments(wires, lineMaterial(0x22303c, 0.32));
     this.wires.renderOrder = 100;
     for (const drawn of [this.mesh, this.depth, this.wires]) drawn.frustumCulled = false;
@@ -102,17 +163,22 @@ class Actor {
     const second = this.frames[(low + 1) % this.frames.length];
     const points = this.position.array;
     for (let i = 0; i < points.length; i++) points[i] = first[i] + part * (second[i] - first[i]);
-    normalsOf(points, this.group.faces, this.normal.array);
-    this.position.needsUpdate = this.normal.needsUpdate = true;
+    const { vertices, normals, triangles } = this.group.surface;
+    const { position, normal } = this.mesh.geometry.attributes;
+    gather(points, vertices, position.array);
+    normalsOf(position.array, triangles, normals, this.normals);
+    gather(this.normals, normals, normal.array);
+    this.position.needsUpdate = position.needsUpdate = normal.needsUpdate = true;
   }
 
-  /** Opaque, or translucent in the given place of the order. */
-  setOpacity(opacity, order) {
+  /** With its materials, or plain: opaque, or translucent in the given place of the order. */
+  setLook(painted, opacity, order) {
     const clear = opacity < 1;
+    this.mesh.material = painted ? this.materials : this.plain;
     this.uniforms.opacity.value = opacity;
     this.depth.visible = clear;
     // Both are sorted among the translucent ones, by the order alone.
-    this.mesh.material.transparent = this.depth.material.transparent = clear;
+    this.plain.transparent = this.depth.material.transparent = clear;
     this.depth.renderOrder = 2 * order;
     this.mesh.renderOrder = 2 * order + 1;
   }
@@ -225,7 +291,8 @@ class Cell {
     const actor = this.actors.find(({ mesh }) => mesh === hit.object);
     const place = hit.object.worldToLocal(hit.point.clone());
     const away = (v) => place.distanceToSquared(new THREE.Vector3().fromBufferAttribute(actor.position, v));
-    const [vertex] = [hit.face.a, hit.face.b, hit.face.c].sort((a, b) => away(a) - away(b));
+    const corners = [hit.face.a, hit.face.b, hit.face.c].map((point) => actor.group.surface.vertices[point]);
+    const [vertex] = corners.sort((a, b) => away(a) - away(b));
     return { actor, vertex };
   }
 
