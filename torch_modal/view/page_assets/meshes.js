@@ -39,7 +39,9 @@ const unpackIndices = async (text, n) => new Uint32Array((await unpackIntegers(t
 /** Columns of numbers as rows, divided. */
 function rowsOf(columns, width, divisor) {
   const n = columns.length / width;
-  return Float32Array.from(columns, (_, i) => columns[(i % width) * n + Math.floor(i / width)] / divisor);
+  const rows = new Float32Array(columns.length);
+  for (let i = 0; i < columns.length; i++) rows[(i % n) * width + Math.floor(i / n)] = columns[i] / divisor;
+  return rows;
 }
 
 /** A picture of a data URI; white if the browser cannot read it. */

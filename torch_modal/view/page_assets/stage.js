@@ -106,7 +106,9 @@ function paintedMaterial(look, { color, alpha }, texture) {
   const used = { PAINTED: true, TEXTURED: texture, CUT_OUT: alpha === "MASK", TRANSLUCENT: blend };
   const defines = Object.fromEntries(Object.keys(used).filter((name) => used[name]).map((name) => [name, 1]));
   const uniforms = { ...look.uniforms, color: { value: color }, picture: { value: texture } };
-  return new THREE.ShaderMaterial({ ...look, defines, uniforms, transparent: blend, depthWrite: !blend });
+  // Translucent back sides are drawn before the front sides.
+  const passes = { transparent: blend, depthWrite: !blend, forceSinglePass: !blend };
+  return new THREE.ShaderMaterial({ ...look, ...passes, defines, uniforms });
 }
 
 /** One sequence. A group holds what its sequences share: faces, edges, surface, and the orbit of the camera. */
