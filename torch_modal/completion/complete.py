@@ -21,10 +21,11 @@ from torch_modal.arrays import FloatArray
 from torch_modal.autograd import disable_compile, full_precision, outside_inference_mode
 from torch_modal.completion.confidence import DOUBTFUL, HALF_AT, compare, expected_errors, size_of
 from torch_modal.completion.frames import CompletionProblem
-from torch_modal.completion.gradient import LastSolve, ShapesOfPoints
+from torch_modal.completion.gradient import LastSolve
 from torch_modal.completion.observation import Observation, check_observations, refuse_transforms
 from torch_modal.completion.poses import FramePoses, times_between
 from torch_modal.completion.refinement import ROUNDS, Refinement
+from torch_modal.elastic.implicit import minimiser_of
 from torch_modal.errors import MeshWarning
 from torch_modal.geometry.crossings import require_contact
 from torch_modal.inbetween.settings import Objective
@@ -137,7 +138,14 @@ def complete(
     if solve is not None and not solve.smooth:
         message = "gradients of clouds and noisy meshes leave out pairs and poses: even their sign may be wrong"
         warnings.warn(f"{message}; those of markers are exact", MeshWarning, stacklevel=3)
-    knots = ShapesOfPoints.apply(solve, rows, axes, completion.knots, points)
+
+    def pull_back(grad: Tensor) -> Tensor:
+        slopes, turn = grad.cpu().double()[rows], torch.from_numpy(axes)
+        if solve is None or not slopes.any():
+            return torch.zeros_like(points)
+        return solve.pull_back(slopes @ turn.mT, len(points)) @ turn
+
+    knots = minimiser_of(points, completion.knots, pull_back)
     when = sorted({*completion.times.tolist(), *([] if completion.path is None else completion.path.times.tolist())})
     return completion._replace(knots=knots, shapes=knots[[when.index(t) for t in completion.times.tolist()]])
 

@@ -1,7 +1,7 @@
 """Gradients of completed shapes in the observed points, by the implicit function theorem."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -9,7 +9,6 @@ from scipy.sparse.linalg import LinearOperator, gmres
 from torch import Tensor
 
 from torch_modal.arrays import FloatArray
-from torch_modal.autograd import is_double_backward
 from torch_modal.completion.energy import PointEnergy
 from torch_modal.elastic.energy import Energy, RestShapes
 from torch_modal.elastic.steps import TermsTowards, inverse_of_symmetric
@@ -74,31 +73,7 @@ class LastSolve(NamedTuple):
         ]
         return 2 * torch.cat(forces)
 
-
-class ShapesOfPoints(torch.autograd.Function):
-    """Shapes as functions of all observed points; pairs and shapes by modes are constants.
-
-    Arguments are how the shapes of some rows were found, None where all are constants; these rows; the matrix that
-    turns the caller's coordinates into those of the solve, *shape* ``(3, 3)``; the shapes, *shape* ``(K, V, 3)``; and
-    the points, *shape* ``(n, 3)``.
-    """
-
-    @staticmethod
-    def forward(
-        ctx: Any, solve: LastSolve | None, rows: list[int], axes: FloatArray, shapes: Tensor, points: Tensor
-    ) -> Tensor:
-        """The shapes."""
-        ctx.solve, ctx.rows, ctx.axes, ctx.like = solve, rows, axes, points.detach()
-        return shapes.clone()
-
-    @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        """Gradient in the points."""
-        if is_double_backward(grad):
-            raise RuntimeError("completed shapes have first derivatives only; take the gradient without create_graph")
-        total, axes = torch.zeros(ctx.like.shape, dtype=torch.float64), torch.from_numpy(ctx.axes)
-        slopes = grad.detach().cpu().double()[ctx.rows]
-        if slopes.any():
-            numbers = np.concatenate([points.numbers for points in ctx.solve.points])
-            total.index_add_(0, torch.from_numpy(numbers), ctx.solve.adjoint(slopes @ axes.mT) @ axes)
-        return None, None, None, None, total.to(ctx.like)
+    def pull_back(self, slopes: Tensor, n: int) -> Tensor:
+        """:meth:`adjoint`, added up over the pairs of each of n observed points. *Shape:* ``(T, V, 3) -> (n, 3)``."""
+        numbers = np.concatenate([points.numbers for points in self.points])
+        return slopes.new_zeros(n, 3).index_add(0, torch.from_numpy(numbers), self.adjoint(slopes))

@@ -109,6 +109,32 @@ def _adjoint(ctx: Context) -> Callable[[Tensor], tuple[Tensor, ...]]:
     return pull_back
 
 
+class _Minimiser(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Context, minimiser: Tensor, points: Tensor, pull_back: Callable[[Tensor], Tensor]) -> Tensor:
+        ctx.pull_back = pull_back
+        return minimiser.clone()
+
+    @staticmethod
+    def backward(ctx: Context, grad: Tensor) -> tuple[None, Tensor, None]:
+        if is_double_backward(grad):
+            raise RuntimeError(
+                "shapes that were found from points have first derivatives only; take the gradient without create_graph"
+            )
+        return None, ctx.pull_back(grad), None
+
+
+def minimiser_of(points: Tensor, minimiser: Tensor, pull_back: Callable[[Tensor], Tensor]) -> Tensor:
+    """A minimiser as a function of points, with first derivatives.
+
+    Args:
+        points: They may require a gradient. *Shape:* ``(n, 3)``.
+        minimiser: A constant.
+        pull_back: The gradient in the points, from the gradient in the minimiser, by the implicit function theorem.
+    """
+    return _Minimiser.apply(minimiser.detach(), points, pull_back)  # type: ignore[no-any-return]
+
+
 def dense_inverse(
     energy: AmplitudeEnergy[Placed], amplitudes: Tensor, placement: Placed, converged: Tensor
 ) -> Callable[[Tensor], Tensor]:

@@ -6,9 +6,8 @@ from typing import NamedTuple
 import torch
 from scipy.optimize import least_squares
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
-from torch_modal.autograd import Context
+from torch_modal.elastic.implicit import minimiser_of
 from torch_modal.elastic.steps import conjugate_gradients
 from torch_modal.geometry.rigid import RigidMotion, best_fit, centroid, infinitesimal_motions
 from torch_modal.statistics.variation import Variation
@@ -82,8 +81,28 @@ class LocalWeights:
             factors = self._descend(factors, to, self.noise, MOST_STEPS)
         to = to._replace(points=self.points)
         if torch.is_grad_enabled() and self.points.requires_grad:
-            factors = _FactorsOfPoints.apply(factors, self.points, self, to)
+            factors = minimiser_of(self.points, factors, lambda grad: self._pull_back(factors.detach(), to, grad))
         return factors, to
+
+    @torch.no_grad()
+    def _pull_back(self, factors: Tensor, to: Observations, grad: Tensor) -> Tensor:
+        """Gradient in the points, from the gradient in the factors. *Shape:* ``(K n,) -> (m, 3)``."""
+        leaf, places = (x.detach().requires_grad_() for x in (factors, to.points))
+        slopes = self.slopes(leaf.detach(), to._replace(points=places.detach()), self.noise)
+        matrix = slopes.mT @ slopes
+        matrix.diagonal().add_(len(matrix) * torch.finfo(matrix.dtype).eps * matrix.diagonal().max())  # its rounding
+        factor = torch.linalg.cholesky_ex(matrix).L
+        with torch.enable_grad():
+            cost = 0.5 * self.residuals(leaf, to._replace(points=places), self.noise).square().sum()
+            (slope,) = torch.autograd.grad(cost, leaf, create_graph=True)
+        adjoint = conjugate_gradients(
+            lambda x: torch.autograd.grad(slope, leaf, x, retain_graph=True)[0],
+            lambda x: torch.cholesky_solve(x[:, None], factor)[:, 0],
+            torch.dot,
+            grad,
+            PRODUCTS,
+        )
+        return -torch.autograd.grad(slope, places, adjoint)[0]
 
     def _descend(self, factors: Tensor, to: Observations, noise: float, n_steps: int) -> Tensor:
         """Take steps of Levenberg and Marquardt. *Shape:* ``(K n,) -> (K n,)``."""
@@ -144,34 +163,3 @@ class LocalWeights:
             response = reconstruction.fit((first, second), parts.new_zeros(n, v, 1))
             of_first, of_second = torch.autograd.grad((response[..., 0] * parts).sum(), (first, second))
         return of_first[0], of_second[0]
-
-
-class _FactorsOfPoints(torch.autograd.Function):
-    """Factors of least cost, with their derivatives in the observed points by the implicit function theorem."""
-
-    @staticmethod
-    def forward(ctx: Context, factors: Tensor, points: Tensor, problem: LocalWeights, to: Observations) -> Tensor:
-        ctx.problem, ctx.to = problem, to._replace(points=points.detach())
-        ctx.save_for_backward(factors, points)
-        return factors.clone()
-
-    @staticmethod
-    @once_differentiable  # second derivatives lack the elastic steps, which are constants of the graph
-    def backward(ctx: Context, grad: Tensor) -> tuple[Tensor | None, ...]:
-        (factors, points), problem = ctx.saved_tensors, ctx.problem
-        slopes = problem.slopes(factors, ctx.to, problem.noise)
-        matrix = slopes.mT @ slopes
-        matrix.diagonal().add_(len(matrix) * torch.finfo(matrix.dtype).eps * matrix.diagonal().max())  # its rounding
-        factor = torch.linalg.cholesky_ex(matrix).L
-        with torch.enable_grad():
-            leaf, places = (x.detach().requires_grad_() for x in (factors, points))
-            cost = 0.5 * problem.residuals(leaf, ctx.to._replace(points=places), problem.noise).square().sum()
-            (slope,) = torch.autograd.grad(cost, leaf, create_graph=True)
-        adjoint = conjugate_gradients(
-            lambda x: torch.autograd.grad(slope, leaf, x, retain_graph=True)[0],
-            lambda x: torch.cholesky_solve(x[:, None], factor)[:, 0],
-            torch.dot,
-            grad,
-            PRODUCTS,
-        )
-        return None, -torch.autograd.grad(slope, places, adjoint)[0], None, None
