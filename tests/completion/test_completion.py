@@ -332,7 +332,7 @@ def test_gradients_in_points_of_a_cloud(tube):
     assert torch.allclose(slope, same, rtol=1e-6, atol=1e-9)
 
     last, step = solves[-1], 1e-3
-    (pairs,), (rests,) = last.points, last.rests(last.x)
+    (pairs,), (rests,) = last.points, last.rests(last.x, last.own)
     axes = torch.linalg.lstsq(  # of the solve, from the coordinates of points there and here
         seen.points.detach()[pairs.numbers] - seen.points.detach()[pairs.numbers[0]],
         pairs.points - pairs.points[0],

@@ -101,7 +101,7 @@ def test_gradients_are_those_of_weights_and_pose(
     move = torch.randn(points.shape, generator=generator, dtype=DOUBLE)
 
     def assembled(points: Tensor) -> Tensor:
-        to = Observations(points[seen], picked[seen], weights[seen])
+        to = Observations.at_vertices(points[seen], picked[seen], weights[seen])
         given = LocalWeights(variation, to, about, noise)
         x = given.shape(given.solve(False)[0])
         return (to.pose(x).apply(x) * taken).sum()
@@ -150,8 +150,8 @@ def test_a_weight_of_two_counts_as_two_points(space: tm.ShapeSpace, bars: Shapes
     weights, about = torch.ones(10, dtype=DOUBLE), torch.full((3,), 1 / 3, dtype=DOUBLE)
     weights[4] = 2
     twice = torch.cat([torch.arange(10), torch.tensor([4])])
-    one = LocalWeights(variation, Observations(points, picked, weights), about).solve(False)[0]
-    doubled = Observations(points[twice], picked[twice], torch.ones(11, dtype=DOUBLE))
+    one = LocalWeights(variation, Observations.at_vertices(points, picked, weights), about).solve(False)[0]
+    doubled = Observations.at_vertices(points[twice], picked[twice], torch.ones(11, dtype=DOUBLE))
     torch.testing.assert_close(one, LocalWeights(variation, doubled, about).solve(False)[0], rtol=0, atol=1e-6)
 
 

@@ -85,7 +85,7 @@ class CompletionProblem:
         self.faces, self.times = faces, times
         self.mesh = Connectivity(faces.numpy(), shapes.shape[1])
         # Not the first: reversed times give the same motion reversed.
-        largest = find_largest(shapes, faces.numpy())
+        self.largest = largest = find_largest(shapes, faces.numpy())
         _, self.axes, self.centre, self.scale = to_canonical(shapes[largest], faces.numpy())
         self.whole = torch.from_numpy((shapes - self.centre) @ self.axes.T * self.scale)
         self.template = self.whole[largest]

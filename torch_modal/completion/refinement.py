@@ -11,6 +11,7 @@ from torch_modal.completion.energy import PointEnergy
 from torch_modal.completion.follow import follow
 from torch_modal.completion.frames import CompletionProblem, Frame
 from torch_modal.completion.gradient import LastSolve
+from torch_modal.completion.markers import MarkerShape, shape_of_markers
 from torch_modal.completion.pairs import OUTLIERS, SampledSurface, robust_weights
 from torch_modal.contact.active import ContactSearch
 from torch_modal.contact.separate import separate
@@ -21,11 +22,12 @@ from torch_modal.elastic.term import Mesh
 from torch_modal.elastic.volume import encloses
 from torch_modal.inbetween.settings import Objective, stiffnesses
 from torch_modal.progress import ProgressReport
+from torch_modal.statistics.variation import Variation
 from torch_modal.threads import run
 
-OWN_OF_CLOUDS, OWN, WHOLE = 0.4, 0.1, 0.1
-"""Weights of the shape by modes, where there are clouds and without, and of whole shapes, in Eq. 5; neighbours in
-time have the rest."""
+OWN_OF_CLOUDS, OWN, OWN_OF_MARKERS, WHOLE = 0.4, 0.1, 0.5, 0.1
+"""Weights of the shape by modes, where there are clouds and without, of the shape that markers show, and of whole
+shapes, in Eq. 5; neighbours in time have the rest."""
 STIFFNESS, OF_KNOWN, STIFFNESSES = 6.0, 2.0, (0.5, 15.0)
 """Of a point with a noise of 1, at a size of 100, in a cloud and at a known place; bounds within which that is adapted.
 """
@@ -70,18 +72,21 @@ class Refinement:
             frames[i] = frames[i]._replace(seen=[one.with_noise(surface) for one in frames[i].seen])
         pairs = zip(frames, poses, strict=True)
         followed = torch.stack(run([partial(follow, frame, pose, self.problem.mesh) for frame, pose in pairs]))
-        (numbers, weights), x, of_known = self._rests(0.0 if smooth else OWN), followed, OF_KNOWN
+        markers: list[MarkerShape | None] = self._markers(followed) if smooth else [None] * len(frames)
+        own = torch.stack([x if one is None else one.x.detach() for one, x in zip(markers, followed, strict=True)])
+        shares = [OWN_OF_MARKERS if one else OWN * (not smooth) for one in markers]
+        (numbers, weights), x, of_known = self._rests(shares), followed, OF_KNOWN
 
-        def rests_of(x: Tensor) -> list[RestShapes]:
-            shapes = torch.cat([followed, self.problem.whole, x])[numbers]
+        def rests_of(x: Tensor, own: Tensor) -> list[RestShapes]:
+            shapes = torch.cat([own, self.problem.whole, x])[numbers]
             rows = zip(shapes.split(1), weights.split(1), strict=True)
             return [RestShapes(*row, self.stiffness, self.anchors) for row in rows]
 
         def relax(x: Tensor, products: list[int]) -> LastSolve:
-            rows = zip(frames, x.split(1), rests_of(x), strict=True)
+            rows = zip(frames, x.split(1), rests_of(x, own), strict=True)
             every = run([partial(self._relax, frame, one, rests, products, of_known) for frame, one, rests in rows])
             x, points = torch.cat([one for one, _ in every]), [p for _, p in every]
-            return LastSolve(x, self.fine.energy, rests_of, points, smooth)
+            return LastSolve(x, own, self.fine.energy, rests_of, points, markers, smooth)
 
         for _ in range(ROUNDS):
             x = relax(x, STEPS * [PRODUCTS]).x
@@ -131,7 +136,7 @@ class Refinement:
         """
         problem, shapes = self.problem, []
         search = ContactSearch(self.backend, problem.mesh, problem.whole, problem.template, 1)
-        for x, rests, points in zip(solve.x.split(1), solve.rests(solve.x), solve.points, strict=True):
+        for x, rests, points in zip(solve.x.split(1), solve.rests(solve.x, solve.own), solve.points, strict=True):
 
             def relax(
                 x: Tensor, _: Tensor, extra: ExtraEnergies, rests: RestShapes = rests, points: PointEnergy = points
@@ -142,20 +147,30 @@ class Refinement:
             shapes.append(separate(x, relax, search)[0])
         return torch.cat(shapes)
 
-    def _rests(self, own: float) -> tuple[Tensor, Tensor]:
-        """Rest shapes of each frame, and their weights: its own by modes, whole ones, and neighbours in time.
+    def _markers(self, by_modes: Tensor) -> list[MarkerShape | None]:
+        """The shape that the markers of each frame show, between the key-frames."""
+        whole, frames = self.problem.whole, self.problem.frames
+        if len(whole) < 2:
+            return [None] * len(frames)
+        first = self.problem.largest  # whatever the order
+        variation = Variation(torch.cat([whole[first:], whole[:first]]), self.problem.faces)
+        pairs = zip(frames, by_modes, strict=True)
+        return run([partial(shape_of_markers, variation, frame, x) for frame, x in pairs])
 
-        Numbers count frames by modes, then whole shapes, then frames as they are. *Shape of each:* ``(T, 5)``.
+    def _rests(self, own: list[float]) -> tuple[Tensor, Tensor]:
+        """Rest shapes of each frame, and their weights: its own, whole ones, and neighbours in time.
+
+        Numbers count the frames' own shapes, then whole ones, then frames as they are. *Shape of each:* ``(T, 5)``.
         """
         frames, exact = self.problem.frames, self.problem.times
         n, n_whole, times = len(frames), len(self.problem.whole), np.array([frame.time for frame in frames])
         whole, completed = np.arange(n, n + len(exact)), np.arange(n + n_whole, 2 * n + n_whole)
         rows, weights = [], []
         for i, frame in enumerate(frames):
-            by_modes = OWN_OF_CLOUDS if any(one.places is None for one in frame.seen) else own
+            alone = OWN_OF_CLOUDS if any(one.places is None for one in frame.seen) else own[i]
             every = np.append(whole, np.delete(completed, i)), np.append(exact, np.delete(times, i))
-            row, shares = [i], [by_modes]
-            for share, numbers, when in ((WHOLE, whole, exact), (1 - by_modes - WHOLE, *every)):
+            row, shares = [i], [alone]
+            for share, numbers, when in ((WHOLE, whole, exact), (1 - alone - WHOLE, *every)):
                 if not len(when):  # the template, of no time
                     numbers, when = np.array([n]), np.zeros(1)
                 order = np.argsort(when, kind="stable")

@@ -37,10 +37,11 @@ class Fitted(NamedTuple):
 
 
 def point_springs(to: Observations, stiffness: float, n_vertices: int) -> Pull:
-    """``stiffness sum_i weights_i |x_i - p_i|^2`` of one shape, but for a constant where points share a vertex."""
-    weights = to.weights.new_zeros(n_vertices).index_add(0, to.vertices, stiffness * to.weights)
+    """``stiffness sum_i weights_i |x_i - p_i|^2`` of vertices, but for a constant where points share one."""
+    vertices = to.corners[:, 0]
+    weights = to.weights.new_zeros(n_vertices).index_add(0, vertices, stiffness * to.weights)
     weighted = stiffness * to.weights[:, None] * to.points
-    sums = weighted.new_zeros(n_vertices, 3).index_add(0, to.vertices, weighted)
+    sums = weighted.new_zeros(n_vertices, 3).index_add(0, vertices, weighted)
     return Pull((sums / weights.clamp_min(torch.finfo(weights.dtype).tiny)[:, None])[None], weights)
 
 
@@ -71,10 +72,10 @@ def fit(
     if not 0 <= noise < torch.inf:
         raise ValueError(f"noise is a standard deviation, zero or more, in the units of the points; got {noise}")
     k, v = variation.shapes.shape[:2]
-    about, every = _check_near(near, k), _check_points(points, vertices, weights, v)
-    lead, n, fits = every.points.shape[:-2], len(every.vertices), []
-    for one, counts in zip(every.points.reshape(-1, n, 3), every.weights.reshape(-1, n), strict=True):
-        to = Observations(one.to("cpu", torch.float64), every.vertices, counts)
+    about, (every, vertices, trust) = _check_near(near, k), _check_points(points, vertices, weights, v)
+    lead, n, fits = every.shape[:-2], len(vertices), []
+    for one, counts in zip(every.reshape(-1, n, 3), trust.reshape(-1, n), strict=True):
+        to = Observations.at_vertices(one.to("cpu", torch.float64), vertices, counts)
         fits.append(_fit_one(variation, to, about, robust, noise))
     if not fits:
         return Fitted(*(points.new_zeros(*lead, *shape) for shape in ((v, 3), (k, v), (n,), (n,))))
@@ -89,7 +90,7 @@ def _fit_one(variation: Variation, every: Observations, about: Tensor, robust: b
     observed = every.weights > 0
     to = Observations(*(column[observed] for column in every))
     same = "the same vertices of the key-frames"
-    require_units("the points", to.points.detach(), same, variation.shapes[:, to.vertices])
+    require_units("the points", to.points.detach(), same, variation.shapes[:, to.corners[:, 0]])
     local = LocalWeights(variation, to, about, noise)
     factors, to = local.solve(robust)
     weights = local.weights(factors)
@@ -118,8 +119,13 @@ def _fit_one(variation: Variation, every: Observations, about: Tensor, robust: b
     return Fitted(shape, mixed, misses, trust)
 
 
-def _check_points(points: Tensor, vertices: Tensor, weights: Tensor | None, n_vertices: int) -> Observations:
-    """All sets, with vertices and weights on the CPU, *shape* ``(..., n)``; raises for what does not fit."""
+def _check_points(
+    points: Tensor, vertices: Tensor, weights: Tensor | None, n_vertices: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Points of all sets, with vertices and weights on the CPU; raises for what does not fit.
+
+    *Shape:* ``(..., n, 3), (n,), (..., n)``.
+    """
     check_tensor("points", points, "...", "n", 3)
     numbers = torch.as_tensor(vertices).cpu()
     n = points.shape[-2]
@@ -131,14 +137,14 @@ def _check_points(points: Tensor, vertices: Tensor, weights: Tensor | None, n_ve
     lead = (*broadcast_leading(points=points.shape[:-2], weights=trust.shape[:-1]), n)
     if not bool(((trust >= 0) & trust.isfinite()).all()):
         raise ValueError(f"weights are finite and none below zero; got {float(trust.min())} to {float(trust.max())}")
-    every = Observations(points.expand(*lead, 3), numbers.long(), trust.expand(lead).clone())
-    seen = every.weights > 0
-    if not bool(every.points.detach()[seen.to(points.device)].isfinite().all()):
+    points, trust = points.expand(*lead, 3), trust.expand(lead).clone()
+    seen = trust > 0
+    if not bool(points.detach()[seen.to(points.device)].isfinite().all()):
         raise ValueError("points hold numbers that are not finite; give those that were not observed a weight of zero")
     fewest = min((len(numbers[row].unique()) for row in seen.view(-1, n)), default=3)
     if fewest < 3:
         raise ValueError(f"a pose follows from three vertices or more with weights above zero; a set has {fewest}")
-    return every
+    return points, numbers.long(), trust
 
 
 def _check_near(near: int | Tensor | None, n: int) -> Tensor:

@@ -26,19 +26,31 @@ ROWS_AT_ONCE = 32
 
 
 class Observations(NamedTuple):
-    """Points with the vertices that should be there, and weights. *Shape:* ``(n, 3), (n,), (n,)``."""
+    """Points with their places on the surface, and weights. *Shape:* ``(n, 3), (n, m), (n, m), (n,)``."""
 
     points: Tensor
-    vertices: Tensor
+    corners: Tensor
+    """The vertices between which each place is."""
+    shares: Tensor
+    """Barycentric coordinates."""
     weights: Tensor
+
+    @classmethod
+    def at_vertices(cls, points: Tensor, vertices: Tensor, weights: Tensor) -> "Observations":
+        """Points of vertices. *Shape:* ``(n, 3), (n,), (n,)``."""
+        return cls(points, vertices[:, None], torch.ones_like(weights)[:, None], weights)
+
+    def seen(self, x: Tensor) -> Tensor:
+        """The places on a shape. *Shape:* ``(V, 3) -> (n, 3)``."""
+        return (self.shares[..., None] * x[self.corners]).sum(1)
 
     def pose(self, x: Tensor) -> RigidMotion:
         """Rigid motion of a shape on to the points. *Shape:* ``(V, 3)``."""
-        return best_fit(x[self.vertices], self.points, self.weights)
+        return best_fit(self.seen(x), self.points, self.weights)
 
     def distances(self, x: Tensor) -> Tensor:
-        """Distances of the points from their vertices. *Shape:* ``(V, 3) -> (n,)``."""
-        return (x[self.vertices] - self.points).norm(dim=-1)
+        """Distances of the points from their places. *Shape:* ``(V, 3) -> (n,)``."""
+        return (self.seen(x) - self.points).norm(dim=-1)
 
     def distances_after_fit(self, x: Tensor) -> Tensor:
         """Distances after the best rigid motion. *Shape:* ``(V, 3) -> (n,)``."""
@@ -118,13 +130,13 @@ class LocalWeights:
 
     def residuals(self, factors: Tensor, to: Observations, noise: float) -> Tensor:
         """Numbers whose squares add up to the cost. *Shape:* ``(K n,) -> (3m + K n,)``."""
-        seen = self.shape(factors)[to.vertices]
+        seen = to.seen(self.shape(factors))
         off = seen - best_fit(seen, to.points, to.weights).inverse().apply(to.points)
         return torch.cat([((to.weights.sqrt() / noise)[:, None] * off).flatten(), factors])
 
     def slopes(self, factors: Tensor, to: Observations, noise: float) -> Tensor:
         """Their derivatives, without the rigid motion. *Shape:* ``(K n,) -> (3m + K n, K n)``."""
-        seen = self.shape(factors)[to.vertices]
+        seen = to.seen(self.shape(factors))
         rigid = infinitesimal_motions(seen - centroid(seen, to.weights)).flatten(1).mT
         root = (to.weights.sqrt() / noise).repeat_interleave(3)[:, None]
         q = torch.linalg.qr(root * rigid)[0]
@@ -138,7 +150,7 @@ class LocalWeights:
         one, other = variation.coordinates.slopes(bending[None])
         fields = variation.coordinates.spread(variation.fields)
         moves = variation.coordinates.size * torch.eye(3, 6).to(bending)[..., None]
-        carries = (variation.coordinates.centres[:, self.to.vertices].mT > 0).to(bending)
+        carries = ((variation.coordinates.centres[:, self.to.corners] * self.to.shares).sum(-1).mT > 0).to(bending)
         rows = []
         for first, second, carried in zip(
             *(column.split(ROWS_AT_ONCE) for column in (*self.influence, carries)), strict=True
@@ -153,7 +165,7 @@ class LocalWeights:
         """Part of both sides of each triangle in each observed place. *Shape:* ``(n, F)`` each."""
         variation, to = self.variation, self.to
         n, v = len(to.points), len(variation.coordinates.mean)
-        parts = to.weights.new_zeros(n, v).scatter(1, to.vertices[:, None], 1)
+        parts = to.weights.new_zeros(n, v).scatter_add(1, to.corners, to.shares)
         reconstruction = variation.coordinates.reconstruction
         for piece, anchors in reconstruction.loose:
             # A loose piece goes where the vertices go that it follows.
