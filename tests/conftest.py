@@ -15,8 +15,8 @@ import scipy.sparse as sp
 import torch
 import trimesh
 from browsers import NoBrowser, open_browser
+from helpers.solids import box, eigenmodes, element_hessian, lumped_mass, surface
 from kornia.geometry.conversions import quaternion_to_rotation_matrix
-from solids import box, eigenmodes, element_hessian, lumped_mass, surface
 from timing import limit_threads
 
 from torch_modal.data.space import ShapeSpace

@@ -16,7 +16,7 @@ from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.io.read import SUFFIXES
 
 sys.path.append(str(Path(__file__).parents[1]))  # beside the tests
-from bodies import body
+from helpers.bodies import body
 
 DATA = Path(__file__).parents[2].parent / "shared" / "data"
 HALF = 0.5

@@ -9,9 +9,9 @@ Popovic 2004).
 import numpy as np
 import torch
 from full_space import full_space
+from helpers.shapes import rigid_blend
 from scipy import sparse
 from scipy.spatial import cKDTree
-from shapes import rigid_blend
 from torch import Tensor
 
 from torch_modal.geometry.connectivity import Connectivity

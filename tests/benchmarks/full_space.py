@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from helpers.shapes import fraction
 from scipy import sparse
-from shapes import fraction
 from torch import Tensor
 
 from torch_modal.elastic.bend import SquaredBend

@@ -16,10 +16,10 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from decimated_pair import ReducedPair
+from helpers.shapes import fraction
 from numpy.typing import NDArray
 from scipy import sparse
 from scipy.optimize import minimize
-from shapes import fraction
 from torch import Tensor
 
 from torch_modal.geometry.canonical import CANONICAL_SIZE

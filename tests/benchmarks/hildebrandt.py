@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from shapes import fraction
+from helpers.shapes import fraction
 from torch import Tensor
 
 import torch_modal as tm

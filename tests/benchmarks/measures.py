@@ -5,8 +5,8 @@ from importlib.util import find_spec
 import numpy as np
 import torch
 from cases import Case
+from helpers.shapes import edge_lengths
 from numpy.typing import NDArray
-from shapes import edge_lengths
 from torch import Tensor
 
 import torch_modal as tm

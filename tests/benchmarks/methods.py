@@ -22,7 +22,7 @@ from cases import HALF, Case
 from decimated_pair import ReducedPair, froehlich_botsch
 from full_space import full_space
 from geodesic import geodesic
-from shapes import rigid_blend
+from helpers.shapes import rigid_blend
 from timing import timed
 
 import torch_modal as tm

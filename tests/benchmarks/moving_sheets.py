@@ -9,10 +9,10 @@ from collections.abc import Callable
 from functools import cache, partial
 
 import numpy as np
-from bodies import Body, FloatArray, IntArray, bend
+from helpers.bodies import Body, FloatArray, IntArray, bend
+from helpers.sheets import cylinder, folded, pattern, rectangle, rolled
 from scipy.sparse import coo_matrix
 from scipy.sparse.linalg import spsolve
-from sheets import cylinder, folded, pattern, rectangle, rolled
 
 from torch_modal.geometry.connectivity import Connectivity, half_cotangents
 

@@ -10,9 +10,9 @@ Without one, pairs of the samples and of the data beside the repository are comp
 the fine mesh. Means are geometric, over the pairs that both methods have. Times are processor seconds of one call on
 one thread. Morphomatics joins where it is installed (``pip install morphomatics``), or with ``--peer-python``.
 
-``--bodies`` compares bodies in closed form (tests/bodies.py) with their true shapes. *Folds* are hinges bent by more
-than a right angle beyond both key-frames. ``--presets`` compares the presets, on pairs of frames of animated animals
-and on bodies that modes know better: *vertices* is the mean distance from the truth.
+``--bodies`` compares bodies in closed form (tests/helpers/bodies.py) with their true shapes. *Folds* are hinges bent by
+more than a right angle beyond both key-frames. ``--presets`` compares the presets, on pairs of frames of animated
+animals and on bodies that modes know better: *vertices* is the mean distance from the truth.
 """
 
 import argparse

@@ -9,10 +9,10 @@ from collections.abc import Iterator
 
 import numpy as np
 from cases import keyframes_of
+from helpers.solids import eigenmodes
 from known_motions import make_samples  # noqa: F401 (the examples are found from here on)
 from quadratic_tetrahedra import quadratic_modes
 from results import Table, add_keep, wanted
-from solids import eigenmodes
 from timing import limit_threads
 
 from torch_modal.geometry.surface import Surface

@@ -50,8 +50,8 @@ from typing import Any
 
 import numpy as np
 import torch
+from helpers.shapes import rigid_blend
 from results import geometric_mean, number, wanted
-from shapes import rigid_blend
 from timing import limit_threads
 from tqdm import tqdm
 from wild_bodies import bent_and_twisted

@@ -3,13 +3,13 @@
 import re
 from pathlib import Path
 
-import gltf_validator
 import numpy as np
 import pygltflib
 import pytest
 import torch
+from helpers import gltf_validator
+from helpers.textured import bend, textured_obj, triangles_of_tube
 from test_cli import fails
-from textured import bend, textured_obj, triangles_of_tube
 
 import torch_modal as tm
 from torch_modal.cli.main import main

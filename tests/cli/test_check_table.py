@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from solids import as_mesh, box
+from helpers.solids import as_mesh, box
 
 from torch_modal.cli.main import main
 from torch_modal.io.write import save_mesh

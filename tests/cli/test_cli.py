@@ -8,12 +8,12 @@ import time
 from pathlib import Path
 from types import SimpleNamespace
 
-import gltf_validator
 import numpy as np
 import pygltflib
 import pytest
 import torch
 from conftest import listen_to_ctrl_c
+from helpers import gltf_validator
 
 import torch_modal as tm
 from torch_modal.cli import main as cli

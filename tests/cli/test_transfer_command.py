@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from shapes import apart
+from helpers.shapes import apart
 from test_cli import fails
 
 import torch_modal as tm

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 import torch
 from conftest import Shapes, random_rotation
-from shapes import edge_lengths
+from helpers.shapes import edge_lengths
 from torch import Tensor
 
 import torch_modal as tm

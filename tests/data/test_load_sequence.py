@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers.textured import bend, triangles_of_tube
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
-from textured import bend, triangles_of_tube
 
 import torch_modal as tm
 from torch_modal.data.sequence import sequence_files

@@ -11,8 +11,8 @@ from typing import Any
 
 import pytest
 import torch
-from bodies import sheet_surface
 from conftest import Shapes
+from helpers.bodies import sheet_surface
 from terms import Area, Slopes, Spring, fibres
 from torch import Tensor
 from torch.func import functional_call, grad, vmap

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import Shapes
-from solids import box, surface
+from helpers.solids import box, surface
 from torch import Tensor
 from torch.autograd import gradcheck
 

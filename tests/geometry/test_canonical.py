@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from helpers.sheets import cylinder, folded, rectangle
 from scipy.spatial.transform import Rotation
-from sheets import cylinder, folded, rectangle
 
 import torch_modal as tm
 from torch_modal.geometry.canonical import QUANTUM, in_order, size, to_canonical

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 from conftest import Shapes
-from sheets import cylinder as cylinder_of
-from sheets import rectangle, rolled
+from helpers.sheets import cylinder as cylinder_of
+from helpers.sheets import rectangle, rolled
 from torch import Tensor
 
 import torch_modal as tm

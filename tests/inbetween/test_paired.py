@@ -3,7 +3,7 @@
 import pytest
 import torch
 from conftest import Shapes, modal, placement_of
-from shapes import rigid_blend
+from helpers.shapes import rigid_blend
 from torch import Tensor
 from torch.func import hessian, jacrev
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import Shapes
-from shapes import edge_error, largest
+from helpers.shapes import edge_error, largest
 from torch import Tensor
 
 from torch_modal.elastic.bend import NEEDLE, SquaredBend, fullness

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from bodies import body
 from conftest import Shapes, modal
-from shapes import edge_lengths
+from helpers.bodies import body
+from helpers.shapes import edge_lengths
 
 import torch_modal as tm
 from torch_modal.elastic.term import Mesh

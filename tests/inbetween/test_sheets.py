@@ -8,8 +8,8 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
-from shapes import edge_error, edge_lengths, rigid_blend
-from sheets import cylinder, folded, rectangle, rolled
+from helpers.shapes import edge_error, edge_lengths, rigid_blend
+from helpers.sheets import cylinder, folded, rectangle, rolled
 from torch import Tensor
 
 import torch_modal as tm

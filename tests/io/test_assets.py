@@ -6,15 +6,15 @@ import warnings
 from pathlib import Path
 from typing import Any
 
-import gltf_validator
 import numpy as np
 import pygltflib
 import pytest
 import torch
 import trimesh
+from helpers import gltf_validator
+from helpers.textured import BLUE, RED, bend, png, textured_glb, textured_obj, triangles_of_tube, tube
 from PIL import Image
 from scipy.spatial.transform import Rotation
-from textured import BLUE, RED, bend, png, textured_glb, textured_obj, triangles_of_tube, tube
 
 import torch_modal as tm
 from torch_modal.errors import MeshError, MeshWarning

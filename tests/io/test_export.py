@@ -11,8 +11,8 @@ import pygltflib
 import pytest
 import torch
 import trimesh
-from gltf_validator import accessor
-from textured import textured_obj
+from helpers.gltf_validator import accessor
+from helpers.textured import textured_obj
 
 from torch_modal.io.read import open_asset
 from torch_modal.io.write import save_mesh

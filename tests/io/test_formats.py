@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from textured import bend, textured_obj
+from helpers.textured import bend, textured_obj
 
 import torch_modal as tm
 from torch_modal.cli import main as cli

@@ -14,7 +14,7 @@ import torch_modal as tm
 if sys.platform != "linux":
     pytest.skip("memory and opened files are measured on Linux", allow_module_level=True)
 
-from hostile_files import CASES, RIGHT
+from helpers.hostile_files import CASES, RIGHT
 
 TESTS = Path(__file__).parents[1]
 SECONDS, MEGABYTES = 4.0, 200.0
@@ -25,7 +25,7 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, An
     """All cases, by their names."""
     path = os.pathsep.join([str(Path(tm.__file__).parents[1]), str(TESTS)])
     run = subprocess.run(
-        [sys.executable, str(TESTS / "hostile_files.py"), str(tmp_path_factory.mktemp("files"))],
+        [sys.executable, "-m", "helpers.hostile_files", str(tmp_path_factory.mktemp("files"))],
         capture_output=True,
         text=True,
         timeout=300,

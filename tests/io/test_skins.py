@@ -3,13 +3,13 @@
 import tracemalloc
 from pathlib import Path
 
-import gltf_validator
 import numpy as np
 import pygltflib
 import pytest
-from gltf_validator import accessor
+from helpers import gltf_validator
+from helpers.gltf_validator import accessor
+from helpers.textured import bend, textured_glb, textured_obj, triangles_of_tube
 from scipy.spatial.transform import Rotation, Slerp
-from textured import bend, textured_glb, textured_obj, triangles_of_tube
 
 import torch_modal as tm
 from torch_modal.cli.main import main

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from bodies import twisted_plate
+from helpers.bodies import twisted_plate
 
 from torch_modal import open_asset, save_animation
 from torch_modal.geometry import inspect

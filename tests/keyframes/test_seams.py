@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from textured import bend, split_at_seams, textured_glb, triangles_of_tube
+from helpers.textured import bend, split_at_seams, textured_glb, triangles_of_tube
 
 import torch_modal as tm
 from torch_modal.cli import main as cli

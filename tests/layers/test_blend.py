@@ -8,9 +8,9 @@ from typing import Literal
 import numpy as np
 import pytest
 import torch
-from bodies import sheet_surface
 from conftest import Shapes, modal, random_rotation
-from shapes import apart
+from helpers.bodies import sheet_surface
+from helpers.shapes import apart
 from torch import Tensor
 
 import torch_modal as tm

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import Shapes
-from shapes import apart, diagonal
+from helpers.shapes import apart, diagonal
 from torch import Tensor
 
 import torch_modal as tm

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from bodies import bend, twisted_plate
 from conftest import Shapes, modal
-from shapes import diagonal
+from helpers.bodies import bend, twisted_plate
+from helpers.shapes import diagonal
 from torch import Tensor
 
 import torch_modal as tm

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 import torch
 from conftest import Shapes, modal
-from shapes import diagonal, edge_error, largest, rigid_blend
+from helpers.shapes import diagonal, edge_error, largest, rigid_blend
 from torch import Tensor
 
 from torch_modal.elastic.bend import Bend

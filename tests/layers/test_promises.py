@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import Shapes, random_rotation
-from every_layer import CASES, FUNCTIONS, LAYERS, TRANSFORMS, Step, in_between
+from helpers.every_layer import CASES, FUNCTIONS, LAYERS, TRANSFORMS, Step, in_between
 from torch import Tensor, nn
 from torch._dynamo.testing import CompileCounterWithBackend
 from torch.func import functional_call, grad, jvp, vmap
@@ -99,7 +99,7 @@ def tensors_of(value: Any, seen: set[int]) -> Iterator[Tensor]:
     elif isinstance(value, dict | list | tuple):
         for part in list(value.values()) if isinstance(value, dict) else value:
             yield from tensors_of(part, seen)
-    elif type(value).__module__.startswith(("torch_modal", "every_layer")) and hasattr(value, "__dict__"):
+    elif type(value).__module__.startswith(("torch_modal", "helpers.every_layer")) and hasattr(value, "__dict__"):
         yield from tensors_of(vars(value), seen)
 
 

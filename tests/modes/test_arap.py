@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 import torch
-from solids import box, element_hessian, lumped_mass, together
+from helpers.solids import box, element_hessian, lumped_mass, together
 
 from torch_modal.modes.stiffness import HESSIAN_FORMS, WEIGHT_FLOOR, arap_hessian, mass_matrix
 from torch_modal.modes.tetrahedra import Tetrahedra, tet_volumes

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 import torch
-from bodies import bend
-from solids import as_mesh, box, eigenmodes
+from helpers.bodies import bend
+from helpers.solids import as_mesh, box, eigenmodes
 
 from torch_modal.errors import ModalAnalysisError
 from torch_modal.geometry.surface import Surface

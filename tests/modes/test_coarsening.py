@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from bodies import body
 from conftest import Shapes
+from helpers.bodies import body
 
 from torch_modal.elastic.shell import ShellEnergy
 from torch_modal.keyframes.check import Keyframes

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from solids import box, embed_surface, surface
+from helpers.solids import box, embed_surface, surface
 
 from torch_modal.modes.embedding import closest_tetrahedra
 from torch_modal.modes.tetrahedra import Tetrahedra

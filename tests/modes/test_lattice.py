@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from bodies import body
+from helpers.bodies import body
+from helpers.solids import as_mesh, box, eigenmodes, lumped_mass, surface
 from scipy.spatial import cKDTree
-from solids import as_mesh, box, eigenmodes, lumped_mass, surface
 
 from torch_modal.modes import lattice as lattice_module
 from torch_modal.modes.extract import extract_modes

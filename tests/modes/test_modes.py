@@ -11,7 +11,7 @@ import scipy.sparse as sp
 import torch
 from benchmarks.quadratic_tetrahedra import quadratic_modes
 from conftest import COARSE
-from solids import as_mesh, box, eigenmodes, lumped_mass, surface, together
+from helpers.solids import as_mesh, box, eigenmodes, lumped_mass, surface, together
 
 from torch_modal import threads
 from torch_modal.errors import ModalAnalysisError

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from bodies import sheet_surface
-from sheets import rectangle
+from helpers.bodies import sheet_surface
+from helpers.sheets import rectangle
 
 import torch_modal as tm
 from torch_modal.data.samples import load_sample

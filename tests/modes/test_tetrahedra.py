@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 from conftest import COARSE
-from solids import box, together
+from helpers.solids import box, together
 
 from torch_modal.data.samples import load_sample
 from torch_modal.errors import ModalAnalysisError

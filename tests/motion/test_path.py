@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 from conftest import Shapes
+from helpers.shapes import diagonal, edge_error, largest
+from helpers.sheets import cylinder, rectangle, rolled
 from scipy.interpolate import CubicSpline
-from shapes import diagonal, edge_error, largest
-from sheets import cylinder, rectangle, rolled
 from terms import Area
 from torch import Tensor, nn
 

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 import torch
 from conftest import Shapes, modal, random_rotation
-from shapes import edge_lengths, largest
+from helpers.shapes import edge_lengths, largest
 from torch import Tensor
 
 import torch_modal as tm

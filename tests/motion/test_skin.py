@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from textured import bend, triangles_of_tube
+from helpers.textured import bend, triangles_of_tube
 from torch import Tensor
 
 import torch_modal as tm

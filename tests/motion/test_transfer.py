@@ -5,8 +5,8 @@ import warnings
 import numpy as np
 import pytest
 import torch
-from bodies import bar_surface, bend
-from shapes import apart, diagonal, edge_lengths, largest
+from helpers.bodies import bar_surface, bend
+from helpers.shapes import apart, diagonal, edge_lengths, largest
 from torch import Tensor
 
 import torch_modal as tm

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from bodies import sheet_surface
 from conftest import Shapes
+from helpers.bodies import sheet_surface
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 from torch import Tensor

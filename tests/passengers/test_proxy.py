@@ -6,7 +6,7 @@ import pytest
 import torch
 import trimesh
 from conftest import Shapes
-from shapes import edge_lengths
+from helpers.shapes import edge_lengths
 from torch import Tensor
 
 import torch_modal as tm

@@ -14,8 +14,8 @@ from types import ModuleType
 
 import nbformat
 import pytest
+from helpers.snippets import PAGES, ROOT, blocks, run_python
 from nbclient import NotebookClient
-from snippets import PAGES, ROOT, blocks, run_python
 from test_examples import load_example
 
 import torch_modal as tm

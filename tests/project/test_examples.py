@@ -8,8 +8,8 @@ from types import ModuleType
 import pytest
 import torch
 import trimesh
-from bodies import limbs, twist
-from shapes import apart, edge_lengths
+from helpers.bodies import limbs, twist
+from helpers.shapes import apart, edge_lengths
 
 from torch_modal.data.samples import load_sample
 from torch_modal.geometry.rigid import align

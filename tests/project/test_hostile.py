@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import torch
 from conftest import listen_to_ctrl_c, processes, wait_until
-from hostile_inputs import CASES, EITHER, ERROR
+from helpers.hostile_inputs import CASES, EITHER, ERROR
 from torch.utils.data import DataLoader, Dataset
 
 import torch_modal as tm
@@ -28,7 +28,7 @@ IN_EVERY_RUN = ("nan", "half-flipped")
     "name", [name if name in IN_EVERY_RUN else pytest.param(name, marks=pytest.mark.slow) for name in CASES]
 )
 def test_error_or_right_result(name: str, tmp_path: Path) -> None:
-    command = [sys.executable, str(TESTS / "hostile_inputs.py"), name]
+    command = [sys.executable, "-m", "helpers.hostile_inputs", name]
     run = subprocess.run(command, capture_output=True, text=True, timeout=240, cwd=tmp_path, env=ENVIRONMENT)
     assert run.returncode == 0, run.stderr
     said, wanted = run.stdout.strip(), CASES[name][2]
@@ -45,7 +45,7 @@ CALL = """
 import sys, numpy as np, torch_modal as tm
 from torch_modal.modes.lattice import Lattice
 from torch_modal.modes.tetwild import TetWild
-from hostile_inputs import capsule
+from helpers.hostile_inputs import capsule
 v, f = capsule()
 for basis in tm.extract_bases(np.stack([v, v * (1, 1, 1.2)]), f, 10, mesher="tetwild"):
     print(basis.eigenvalues.sum().item())
@@ -119,7 +119,7 @@ class Bars(Dataset):  # type: ignore[type-arg]
         return 2
 
     def __getitem__(self, index: int) -> torch.Tensor:
-        from hostile_inputs import capsule
+        from helpers.hostile_inputs import capsule
 
         vertices, faces = capsule()
         return tm.extract_modes(vertices * (1, 1, 1 + index), faces, 5, mesher="tetwild", cache=False).eigenvalues

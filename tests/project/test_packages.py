@@ -4,7 +4,7 @@ import re
 
 import pytest
 import torch
-from snippets import ROOT, Block, blocks, run_python
+from helpers.snippets import ROOT, Block, blocks, run_python
 
 PAGE = ROOT / "docs" / "packages.md"
 BLOCKS = {match[1]: block for block in blocks(PAGE) if (match := re.search(r"needs `(\w+)`", block.before))}

@@ -12,7 +12,7 @@ from pathlib import Path
 from unittest.mock import patch
 
 import pytest
-from snippets import COMMAND, LANGUAGES, NOT_RUN, PAGES, ROOT, Block, blocks, commands, expanded, run_python
+from helpers.snippets import COMMAND, LANGUAGES, NOT_RUN, PAGES, ROOT, Block, blocks, commands, expanded, run_python
 from test_examples import load_example
 
 from torch_modal.cli import main as cli

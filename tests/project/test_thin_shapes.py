@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from shapes import edge_error, edge_lengths
-from sheets import cylinder, rectangle, rolled
+from helpers.shapes import edge_error, edge_lengths
+from helpers.sheets import cylinder, rectangle, rolled
 from torch import Tensor
 
 import torch_modal as tm

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from bodies import limbs
+from helpers.bodies import limbs
 from scipy.spatial.transform import Rotation
 
 import torch_modal as tm

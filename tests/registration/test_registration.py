@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from bodies import limbs
+from helpers.bodies import limbs
 from scipy.spatial import cKDTree
 
 import torch_modal as tm

@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 import torch
 from conftest import Shapes
-from shapes import edge_lengths
+from helpers.shapes import edge_lengths
 
 import torch_modal as tm
 from torch_modal.data.samples import load_sample

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import pytest
 import torch
 from conftest import Shapes, seeded
-from shapes import edge_error, edge_lengths
+from helpers.shapes import edge_error, edge_lengths
 from test_coordinates import far
 
 import torch_modal as tm

@@ -6,8 +6,8 @@ import sys
 import numpy as np
 import pygltflib
 import pytest
+from helpers.textured import bend, textured_obj, triangles_of_tube
 from PIL import Image
-from textured import bend, textured_obj, triangles_of_tube
 
 import torch_modal as tm
 from torch_modal.errors import MeshWarning, MissingPackageError

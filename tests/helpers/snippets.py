@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 from markdown_it import MarkdownIt
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 COMMAND = re.compile(r"^(\S*/)?(torch-modal|python|python3|pip|sh|sbatch)\s")
 """What a command to be typed begins with."""

@@ -13,8 +13,8 @@ from typing import NamedTuple
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
-from solids import as_mesh, box
 
+from helpers.solids import as_mesh, box
 from torch_modal.geometry.inspect import volume_of
 
 FloatArray = NDArray[np.float64]

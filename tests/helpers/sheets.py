@@ -3,10 +3,11 @@
 from collections.abc import Callable
 
 import numpy as np
-from bodies import FloatArray, IntArray
 from matplotlib.path import Path
 from scipy.interpolate import CubicSpline
 from scipy.spatial import Delaunay, cKDTree
+
+from helpers.bodies import FloatArray, IntArray
 
 Direction = Callable[[FloatArray], FloatArray]
 

@@ -1,4 +1,4 @@
-"""One hostile mesh through the whole pre-computation: ``python hostile_inputs.py NAME``, in a process of its own.
+"""One hostile mesh through the whole pre-computation, in the process ``python -m helpers.hostile_inputs NAME``.
 
 Prints ``error: TYPE: MESSAGE``, or ``right`` after checking what a right result has. Whatever else happens (a signal,
 another exception, a NaN) fails the test that started it.

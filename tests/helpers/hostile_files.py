@@ -1,4 +1,4 @@
-"""Crafted mesh files, each read and written again in a process of its own: ``python hostile_files.py FOLDER``.
+"""Crafted mesh files, each read and written again, in a process that runs ``python -m helpers.hostile_files FOLDER``.
 
 Prints a line of JSON for each: what came of it, seconds, megabytes of memory beyond those of the package, and the files
 that were opened outside of the mesh's folder. A file of another's stands beside that folder.
