@@ -6,6 +6,7 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,6 +20,7 @@ from helpers.solids import box, eigenmodes, element_hessian, lumped_mass, surfac
 from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from timing import limit_threads
 
+from torch_modal.data.samples import load_sample
 from torch_modal.data.space import ShapeSpace
 from torch_modal.elastic.backend import WarpBackend
 from torch_modal.elastic.energy import RestShapes
@@ -119,6 +121,22 @@ def small_bars() -> Shapes:
 
 
 @pytest.fixture(scope="session")
+def layer_named(small_bars: Shapes) -> Callable[[str], Any]:
+    """Layers of the table in helpers/every_layer.py, each made once for all checks that leave it as it is."""
+    from helpers.every_layer import Made  # it imports this file
+
+    return cache(lambda name: Made(name, small_bars))
+
+
+@pytest.fixture
+def made(name: str, layer_named: Callable[[str], Any]) -> Any:
+    """The layer with the test's ``name``."""
+    if "contact" in name:
+        pytest.importorskip("igl")
+    return layer_named(name)
+
+
+@pytest.fixture(scope="session")
 def space(bars: Shapes) -> ShapeSpace:
     """The space of the bars, in float64."""
     return ShapeSpace(bars.bases, bars.faces, dtype=torch.float64)
@@ -134,6 +152,14 @@ def hand_path(data_dir: Path) -> Keyframes:
 def hands(hand_path: Keyframes) -> Shapes:
     """The hand with 30 modes of each frame, by the real mesher (half a minute)."""
     return Shapes(*hand_path, extract_bases(*hand_path, 30, progress=False))
+
+
+@pytest.fixture(scope="session")
+def hand() -> Shapes:
+    """The sample, open and closed, 20 modes each: on the way, fingers go through each other."""
+    sample = load_sample("hand")
+    bases = extract_bases(sample.keyframes, sample.faces, 20, mesher="lattice", progress=False)
+    return Shapes(sample.keyframes, sample.faces, bases)
 
 
 @pytest.fixture(scope="session")

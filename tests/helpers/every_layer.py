@@ -5,6 +5,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, Literal, NamedTuple
 
+import pytest
 import torch
 from conftest import Shapes
 from terms import Edges
@@ -200,3 +201,37 @@ FUNCTIONS: dict[str, Case] = {
     "components": Case(space, lambda space, x: space.components().coordinates(x)),
     "self_contacts": Case(lambda s: s, lambda s, x: tm.self_contacts(x, s.faces).number),
 }
+
+CONTACT = {"InBetween, contact", "Path, contact"}
+
+every_layer = pytest.mark.parametrize("name", CASES)
+
+
+class Made:
+    """A layer, made once for all checks that leave it as it is."""
+
+    def __init__(self, name: str, shapes: Shapes) -> None:
+        self.case, self.shapes, self.x = {**CASES, **FUNCTIONS}[name], shapes, shapes.keyframes
+        self.layer = self.case.make(shapes)
+        self.truth = self.call(self.x)
+
+    def call(self, x: Tensor, layer: Any = None) -> Tensor:
+        return self.case.call(self.layer if layer is None else layer, x)
+
+
+def assert_near(found: Tensor, truth: Tensor, part: float = 1e-12) -> None:
+    """Within a part of the largest number."""
+    assert found.shape == truth.shape and bool(truth.any())
+    torch.testing.assert_close(found, truth, rtol=0, atol=part * float(truth.detach().abs().max()), check_dtype=False)
+
+
+def loss(x: Tensor) -> Tensor:
+    """Squares with weights: of unit quaternions, those without add up to a constant."""
+    return (torch.linspace(1, 2, x.numel()).to(x).view_as(x) * x.square()).sum()
+
+
+def gradient(call: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:
+    """Gradient of that loss of a call."""
+    leaf = x.clone().requires_grad_()
+    (found,) = torch.autograd.grad(loss(call(leaf)), leaf)
+    return found
