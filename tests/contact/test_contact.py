@@ -212,15 +212,15 @@ def test_the_round_with_the_fewest_crossings_is_kept(hand: Shapes, monkeypatch: 
 
 def test_a_sample_does_not_depend_on_its_batch(hand: Shapes) -> None:
     x_a, x_b = hand.keyframes
-    t = torch.tensor([0.7, 0.875, 0.1, 0.8, 0.85, 0.9, 0.95], dtype=DOUBLE)
+    t = torch.tensor([0.7, 0.875, 0.1, 0.9], dtype=DOUBLE)
     layer = tm.InBetween(hand.bases, hand.faces, contact=True)
     size = float((x_a.amax(0) - x_a.amin(0)).norm())
     with torch.no_grad():
         alone = torch.stack([layer(x_a, x_b, own) for own in t])
         batches = [
-            layer(x_a.expand(7, -1, -1), x_b.expand(7, -1, -1), t),
+            layer(x_a.expand(4, -1, -1), x_b.expand(4, -1, -1), t),
             layer(x_a, x_b, t),
-            torch.cat([layer(x_a, x_b, t[i : i + 2]) for i in range(0, 7, 2)]),
+            torch.cat([layer(x_a, x_b, some) for some in t.split(3)]),
         ]
         twice = layer(x_a, x_b, t[[1, 1]])
         noise = size * 1e-13 * torch.cos(1e4 * hand.keyframes)

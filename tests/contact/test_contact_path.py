@@ -132,6 +132,7 @@ def test_pairs_that_a_displacement_adds_in_between_are_counted(hand: Shapes, mon
     assert bool((after > far(plain, hand)).all()) and solution.n_crossing.tolist() == after.tolist()
 
 
+@pytest.mark.slow
 def test_few_shapes_stay_beside_keyframes_that_intersect_themselves(data_dir: Path) -> None:
     """Shapes that contact would make worse stay nearly as they are; the others are separated all the same.
 

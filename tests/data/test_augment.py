@@ -464,7 +464,7 @@ def test_draws_of_bars(bars: Shapes) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "n"), [("hands", 1000), ("women", 100)])
+@pytest.mark.parametrize(("name", "n"), [("hands", 400), ("women", 50)])
 def test_many_draws(name: str, n: int, request: pytest.FixtureRequest) -> None:
     """More of each mesh."""
     check_draws(request.getfixturevalue(name), n)

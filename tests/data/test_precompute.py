@@ -239,30 +239,28 @@ def test_real_sets(capsule: tuple[np.ndarray, np.ndarray], tmp_path: Path, capsy
     vertices, faces = capsule
     root, out = tmp_path / "shapes", tmp_path / "out"
     shapes = np.stack([vertices * (1, 1, 1 + 0.1 * i) for i in range(11)])
-    save_mesh(shapes[:2], faces, root / "good", fmt="obj", stem="key")
     save_mesh(shapes, faces, tmp_path / "all", fmt="obj", stem="f")
-    (root / "order").mkdir(parents=True)
+    (root / "good").mkdir(parents=True)
     for i in (9, 10):
-        (tmp_path / "all" / f"f-{i:03d}.obj").rename(root / "order" / f"frame-{i}.obj")
+        (tmp_path / "all" / f"f-{i:03d}.obj").rename(root / "good" / f"frame-{i}.obj")
     save_mesh(shapes[:1], faces, root / "differs", fmt="obj", stem="a")
     save_mesh(shapes[:1], faces[1:], root / "differs", fmt="obj", stem="b")
     save_mesh(shapes[:1], faces, root / "twice", fmt="obj")
     save_mesh(shapes[:1], faces, root / "twice", fmt="ply")
-    (root / "good" / "key-001.mtl").write_text("")
+    (root / "good" / "frame-9.mtl").write_text("")
     argv = ["precompute", str(root), "--out", str(out), "--modes", "4", "--mesher", "lattice"]
     assert cli.main(argv) == 3
     said = capsys.readouterr().out.splitlines()[-2:]
     assert said[0].startswith("  failed differs: ") and "faces" in said[0] and "b-000.obj" in said[0]
     assert said[1].endswith("(two files have the same name; a shape must be there in one format only)")
-    assert [path.name for path in find_sets(out)] == ["good", "order"]
+    assert [path.name for path in find_sets(out)] == ["good"]
 
     stored = StoredSet(out / "good")
     assert json.loads(stored.note)["status"] == "done"
-    keyframes, own_faces = tm.load_keyframes(sorted((root / "good").glob("*.obj")))
+    keyframes, own_faces = tm.load_keyframes([root / "good" / f"frame-{i}.obj" for i in (9, 10)])
     assert torch.equal(stored.keyframes, keyframes) and torch.equal(stored.faces, own_faces)
-    assert stored.names == ("key-000.obj", "key-001.obj")
-    assert StoredSet(out / "order").names == ("frame-9.obj", "frame-10.obj")
-    torch.testing.assert_close(StoredSet(out / "order").keyframes, torch.from_numpy(shapes[9:]), rtol=1e-7, atol=1e-9)
+    assert stored.names == ("frame-9.obj", "frame-10.obj")
+    torch.testing.assert_close(stored.keyframes, torch.from_numpy(shapes[9:]), rtol=1e-7, atol=1e-9)
     for mine, its in zip(tm.extract_bases(keyframes, own_faces, 4, mesher="lattice"), stored.bases, strict=True):
         torch.testing.assert_close(its.eigenvalues, mine.eigenvalues)
         torch.testing.assert_close(its.modes, mine.modes, rtol=1e-6, atol=1e-9)

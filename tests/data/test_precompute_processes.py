@@ -97,7 +97,11 @@ def n_meshers(scratch: Path) -> int:
     return sum("_tetwild_worker" in line for line in processes(str(scratch)).values())
 
 
-@pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL], ids=lambda s: s.name)
+@pytest.mark.parametrize(
+    "ending",
+    [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow), signal.SIGKILL],
+    ids=["SIGINT", "SIGTERM", "SIGKILL"],
+)
 def test_when_the_command_ends_so_do_its_processes(ending: signal.Signals, scratch: Path, tmp_path: Path) -> None:
     """Ctrl-C, the request of a batch system, and the one that no process can answer, while the mesher runs."""
     root, out = make_tree(tmp_path / "shapes", 2), tmp_path / "out"
@@ -127,12 +131,12 @@ def cluster(scratch: Path) -> Iterator[Any]:
 
 @pytest.mark.slow
 def test_cluster_does_all_sets_though_a_worker_is_killed(cluster: Any, scratch: Path, tmp_path: Path) -> None:
-    root, expected, out = make_tree(tmp_path / "shapes", 16), tmp_path / "expected", tmp_path / "out"
+    root, expected, out = make_tree(tmp_path / "shapes", 6), tmp_path / "expected", tmp_path / "out"
     assert {record.status for record in precompute_tree(root, expected, OPTIONS).values()} == {DONE}
     first = {worker.process.pid for worker in cluster.workers.values()}
 
     def kill() -> None:
-        wait_until(lambda: out.is_dir() and len(find_sets(out)) >= 3, 600)
+        wait_until(lambda: out.is_dir() and find_sets(out), 600)
         wait_until(lambda: processes(str(scratch)))
         os.kill(min(first), signal.SIGKILL)
 
@@ -141,7 +145,7 @@ def test_cluster_does_all_sets_though_a_worker_is_killed(cluster: Any, scratch: 
     records = precompute_tree(root, out, OPTIONS, scheduler=cluster.scheduler_address)
     killer.join()
     assert {worker.process.pid for worker in cluster.workers.values()} != first
-    assert [record.status for record in records.values()] == [DONE] * 16
+    assert [record.status for record in records.values()] == [DONE] * 6
     torch.testing.assert_close(tensors(out), tensors(expected), rtol=0, atol=0)
     wait_until(lambda: not processes(str(scratch)))
 

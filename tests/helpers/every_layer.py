@@ -166,7 +166,7 @@ LAYERS: dict[str, Case] = {
     "InBetween, own term": Case(with_own_term, pair_in_time),
     "InBetween, contact": Case(partial(in_between, contact=True), pair_in_time),
     "InBetween, bodies": Case(of_two_bodies, lambda layer, x: pair_in_time(layer, two_bodies(x))),
-    "MidShape, paper": Case(lambda s: tm.MidShape(s.bases[:2], s.faces, preset="paper"), pair),
+    "MidShape, paper": Case(lambda s: tm.MidShape(s.bases[:2], s.faces, preset="paper", regions=3), pair),
     "Blend": Case(lambda s: tm.Blend(s.bases, s.faces), blended),
     "Path": Case(lambda s: tm.Path(s.bases, s.faces), set_in_time),
     "Path, pairs": Case(lambda s: tm.Path(s.bases, s.faces, smooth=False), set_in_time),

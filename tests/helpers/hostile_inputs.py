@@ -53,7 +53,7 @@ CASES: dict[str, tuple[Mesh, int, str]] = {
     "open": ((V, F[:-20]), 10, RIGHT),
     "two components": (pieces(2), 12, RIGHT),
     "forty components": (pieces(40), 30, RIGHT),
-    "forty components, many modes": (pieces(40), 260, RIGHT),
+    "ten components, many modes": (pieces(10), 70, RIGHT),
     "flipped": ((V, F[:, ::-1]), 10, RIGHT),
     "half-flipped": ((V, np.where(np.arange(len(F))[:, None] % 2 == 0, F, F[:, ::-1])), 10, RIGHT),
     "non-manifold fins": (with_fins(), 10, RIGHT),

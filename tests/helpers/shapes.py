@@ -1,10 +1,12 @@
-"""Measures of shapes that tests compare."""
+"""Measures of shapes that tests compare, and coarser shapes."""
 
 import numpy as np
 import torch
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from torch_modal.geometry.connectivity import Connectivity
+from torch_modal.geometry.decimation import decimate
 from torch_modal.geometry.rigid import RigidMotion, best_fit
 from torch_modal.geometry.rotations import exp, log
 
@@ -49,3 +51,12 @@ def rigid_blend(x: Tensor, y: Tensor, t: Tensor, weights: Tensor) -> Tensor:
     """
     back = best_fit(y, x, weights)
     return fraction(back.inverse(), t).apply(torch.lerp(x, back.apply(y), t[..., None, None]))
+
+
+def coarsened(shapes: Tensor, faces: Tensor, n_faces: int) -> tuple[Tensor, Tensor]:
+    """Some of the vertices of all shapes, and faces of them. *Shape:* ``(K, V, 3), (F, 3) -> (K, V', 3), (F', 3)``."""
+    points, coarse, _ = decimate(shapes[0].numpy(), faces.numpy(), n_faces)
+    corners = cKDTree(shapes[0].numpy()).query(points)[1][coarse]
+    corners = corners[(corners != np.roll(corners, 1, axis=1)).all(1)]  # a vertex may be the nearest one twice
+    kept, own = np.unique(corners, return_inverse=True)
+    return shapes[:, kept], torch.from_numpy(own.reshape(-1, 3))

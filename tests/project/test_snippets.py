@@ -55,36 +55,33 @@ def test_every_block_says_what_it_is(page: Path) -> None:
 
 @pytest.mark.parametrize("page", WITH_CODE)
 def test_blocks_run_in_their_order(page: Path, meshes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(shutil.copytree(meshes, tmp_path / "work"))
+    """The first in an empty folder: it needs no file that the page makes, or names, later."""
+    monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("webbrowser.open", lambda url: True)
     names: dict[str, object] = {"__name__": "__main__"}
-    for block in blocks(page):
-        if block.is_run and block.language == "python":
-            run_python(block, names)
-        elif block.is_run and block.language == "sh":
-            for words in commands(block):
-                run_command(block, words)
-
-
-@pytest.mark.parametrize("page", WITH_CODE)
-def test_the_first_block_runs_alone(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In an empty folder: it needs no file that the page makes, or names, later."""
-    monkeypatch.chdir(tmp_path)
-    first = next(block for block in blocks(page) if block.language in {"python", "sh"})
+    first, *others = (block for block in blocks(page) if block.language in {"python", "sh"})
     assert first.is_run
-    if first.language == "python":
-        run_python(first, {"__name__": "__main__"})
-    for words in commands(first) if first.language == "sh" else ():
-        if words[-1].endswith("write_meshes.py"):
-            load_example("write_meshes").main(tmp_path)
-        else:
-            run_command(first, words)
+    run_block(first, names, meshes)
+    shutil.copytree(meshes, tmp_path, dirs_exist_ok=True)
+    for block in others:
+        if block.is_run:
+            run_block(block, names, meshes)
 
 
-def run_command(block: Block, words: list[str]) -> None:
-    """Run ``torch-modal``; of all else, check that it could be."""
+def run_block(block: Block, names: dict[str, object], meshes: Path) -> None:
+    if block.language == "python":
+        run_python(block, names)
+        return
+    for words in commands(block):
+        run_command(block, words, meshes)
+
+
+def run_command(block: Block, words: list[str], meshes: Path) -> None:
+    """Run ``torch-modal``, and copy what ``write_meshes.py`` has written; of all else, check that it could be run."""
     program, *arguments = words
-    if Path(program).name == "torch-modal":
+    if words[-1].endswith("write_meshes.py"):
+        shutil.copytree(meshes, Path(), dirs_exist_ok=True)
+    elif Path(program).name == "torch-modal":
         try:
             status = cli.main(expanded(arguments))
         except SystemExit as end:  # --help

@@ -77,6 +77,7 @@ def test_truth_is_met_without_landmarks(pair: tuple[Mesh, Mesh, np.ndarray], fou
     assert found.flipped_area < 0.01
 
 
+@pytest.mark.slow
 def test_missing_parts_have_low_confidence(found: Registration) -> None:
     assert float((found.vertex_confidence > 0.5).double().mean()) > 0.99
     sample = load_sample("hand")
@@ -91,7 +92,10 @@ def test_missing_parts_have_low_confidence(found: Registration) -> None:
     assert float(low[missing].double().mean()) > 0.8 and float(low[kept].double().mean()) < 0.05
 
 
-@pytest.mark.parametrize("direction", [(1, 0.2, 0.1), (0.6, -0.5, -0.6)], ids=["tip", "side"])
+@pytest.mark.parametrize(
+    "direction",
+    [pytest.param((1, 0.2, 0.1), id="tip"), pytest.param((0.6, -0.5, -0.6), id="side", marks=pytest.mark.slow)],
+)
 def test_a_hole_is_not_covered_and_what_is_left_is_as_good(
     pair: tuple[Mesh, Mesh, np.ndarray], found: Registration, direction: tuple[float, float, float]
 ) -> None:
@@ -170,6 +174,7 @@ def test_the_second_time_is_from_the_cache(
     assert calls == [0, 1, 2, 3]
 
 
+@pytest.mark.slow
 def test_results_are_repeatable(pair: tuple[Mesh, Mesh, np.ndarray], found: Registration) -> None:
     again = register(*pair[0], *pair[1], cache=False, progress=False)
     assert torch.equal(again.positions, found.positions) and again.confidence == found.confidence
@@ -200,7 +205,7 @@ def test_seams_are_no_cuts(pair: tuple[Mesh, Mesh, np.ndarray], found: Registrat
     assert len(result.sample(torch.from_numpy(target[0]))) == len(result.positions)
 
 
-@pytest.mark.parametrize("flaw", ["hole", "noise", "fins and dust, inside out"])
+@pytest.mark.parametrize("flaw", [pytest.param("hole", marks=pytest.mark.slow), "noise", "fins and dust, inside out"])
 def test_flaws_of_the_target(pair: tuple[Mesh, Mesh, np.ndarray], flaw: str) -> None:
     (rest, faces), (there, there_faces), truth = pair
     random = np.random.default_rng(0)
@@ -417,12 +422,16 @@ def test_each_mesh_is_registered_from_the_one_before(
         np.testing.assert_array_equal(landmarks, np.stack(places, axis=1))
 
 
-def test_doubtful_key_frames_are_refused(files: list[Path], tmp_path: Path) -> None:
-    ball = trimesh.creation.icosphere(subdivisions=2)
-    points, faces, _ = shuffled(np.array(ball.vertices), np.array(ball.faces))
-    (other,) = save_mesh(points, faces, tmp_path / "ball.obj")
+@pytest.fixture(scope="module")
+def ball(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A mesh that is nothing like the template."""
+    mesh = trimesh.creation.icosphere(subdivisions=2)
+    return save_mesh(np.array(mesh.vertices), np.array(mesh.faces), tmp_path_factory.mktemp("ball") / "ball.ply")[0]
+
+
+def test_doubtful_key_frames_are_refused(files: list[Path], ball: Path) -> None:
     with pytest.raises(tm.MeshError, match=r"doubtful.*landmarks"):
-        tm.load_keyframes([files[0], other], register=True, progress=False)
+        tm.load_keyframes([files[0], ball], register=True, progress=False)
 
 
 def test_register_command_writes_the_registered_mesh(
@@ -438,13 +447,13 @@ def test_register_command_writes_the_registered_mesh(
 
 
 def test_register_command_of_a_folder_writes_a_table(
-    files: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str], found: Registration
+    files: list[Path], ball: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], found: Registration
 ) -> None:
     """The one of the pair is trusted; a ball is no pose of it, and is left out."""
     scans, out = tmp_path / "scans", tmp_path / "out"
-    ball = trimesh.creation.icosphere(subdivisions=2)
-    save_mesh(np.array(ball.vertices), np.array(ball.faces), scans / "ball.ply")
-    shutil.copy(files[1], scans / files[1].name)
+    scans.mkdir()
+    for file in (ball, files[1]):
+        shutil.copy(file, scans)
     assert cli.main(["register", str(files[0]), str(scans), "--out", str(out), "--quiet"]) == 3
     result = out / files[1].with_suffix(files[0].suffix).name
     assert float((tm.load_keyframes([result]).keyframes[0] - found.positions).abs().mean()) < 1e-3
