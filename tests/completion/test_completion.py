@@ -5,7 +5,7 @@ import copy
 import numpy as np
 import pytest
 import torch
-from terms import Spring
+from helpers.terms import Spring
 
 import torch_modal as tm
 from torch_modal.completion.bending import ModalBending

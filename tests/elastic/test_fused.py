@@ -13,7 +13,7 @@ import pytest
 import torch
 from conftest import Shapes
 from helpers.bodies import sheet_surface
-from terms import Area, Slopes, Spring, fibres
+from helpers.terms import Area, Slopes, Spring, fibres
 from torch import Tensor
 from torch.func import functional_call, grad, vmap
 

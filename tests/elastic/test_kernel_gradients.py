@@ -48,7 +48,7 @@ def _options(function: ast.FunctionDef) -> list[ast.keyword]:
 def test_compiling_them_says_nothing(tmp_path: Path) -> None:
     """Warp warns of kernels that use ``wp.grad`` when it compiles them: not to users."""
     code = (
-        "import sys, torch; sys.path.append('tests'); from terms import fibres; "
+        "import sys, torch; sys.path.append('tests'); from helpers.terms import fibres; "
         "from torch_modal.elastic.kernels import launch; "
         "kind = fibres(); kind.linearised = None; "
         "kernel = launch.of_elements('elements', 'linearise', kind(1.0).kernel_formulas(1), None); "

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import torch
 from conftest import Shapes, modal
-from terms import Area, Pull, Spring
+from helpers.terms import Area, Pull, Spring
 from torch import Tensor, nn
 
 import torch_modal as tm

@@ -8,10 +8,10 @@ from typing import Any, Literal, NamedTuple
 import pytest
 import torch
 from conftest import Shapes
-from terms import Edges
 from torch import Tensor
 
 import torch_modal as tm
+from helpers.terms import Edges
 from torch_modal.data.augmentation import ShapeAugmentation
 from torch_modal.inbetween.settings import PRESETS
 

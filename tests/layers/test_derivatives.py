@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import pytest
 import torch
 from conftest import Shapes, bent_bar, random_rotation
-from terms import Area, Spring
+from helpers.terms import Area, Spring
 from torch import Tensor
 from torch.autograd import forward_ad
 from torch.func import functional_call, grad, jacfwd, jvp

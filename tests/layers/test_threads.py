@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import torch
 from conftest import Shapes
-from terms import Edges
+from helpers.terms import Edges
 from torch import Tensor
 
 import torch_modal as tm

@@ -10,8 +10,8 @@ import torch
 from conftest import Shapes
 from helpers.shapes import diagonal, edge_error, largest
 from helpers.sheets import cylinder, rectangle, rolled
+from helpers.terms import Area
 from scipy.interpolate import CubicSpline
-from terms import Area
 from torch import Tensor, nn
 
 import torch_modal as tm
