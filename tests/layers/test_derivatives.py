@@ -128,6 +128,12 @@ CASES: dict[str, Callable[[Shapes], Case]] = {
     "path of pairs": lambda bars: path(bars, smooth=False, preset="fast"),
 }
 
+HEAVY = {"strained, torch", "strained, all vertices", "blend, torch", "blend, one below zero", "paper"}
+"""Not in the default run: other cases take most of their ways through the code."""
+each_case = pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in HEAVY)) for name in CASES]
+)
+
 
 def dual(
     layer: Callable[..., Tensor], given: tuple[Tensor, ...], tangents: tuple[Tensor, ...]
@@ -159,7 +165,7 @@ def require_transposed(case: Case, run: Callable[..., tuple[Tensor, Tensor]] = j
     assert float((weights * tangent).sum()) == pytest.approx(sum(each), rel=rtol, abs=rtol * max(map(abs, each)))
 
 
-@pytest.mark.parametrize("name", CASES)
+@each_case
 def test_forward_is_the_transpose_of_backward(name: str, small_bars: Shapes) -> None:
     """In all arguments, and in each alone: the others are no dual tensors, so kernels and torch meet."""
     case = CASES[name](small_bars)
@@ -175,7 +181,7 @@ def test_forward_is_the_transpose_of_backward(name: str, small_bars: Shapes) -> 
         require_transposed(Case(of_one, (own,), (tangent,)), (dual, jvp)[i % 2])
 
 
-@pytest.mark.parametrize("name", CASES)
+@each_case
 def test_backward_is_the_limit_of_differences(name: str, small_bars: Shapes) -> None:
     """Of fourth order; in each argument. The Hessian of steps of all vertices has kinks: changes are small."""
     case, h = CASES[name](small_bars), 3e-6
@@ -226,7 +232,7 @@ def test_no_tangent_goes_through_amplitudes_that_did_not_converge(bars: Shapes) 
         require_transposed(case)
 
 
-@pytest.mark.parametrize("preset", ["accurate", "modal"])
+@pytest.mark.parametrize("preset", ["accurate", pytest.param("modal", marks=pytest.mark.slow)])
 def test_second_derivatives(small_bars: Shapes, preset: Any) -> None:
     case = in_between(small_bars, preset=preset)
     x_a, x_b, _ = small_bars.keyframes

@@ -124,7 +124,7 @@ class TestValues:
 
 
 class TestGradients:
-    @pytest.mark.parametrize("space", ["joint", "paired"])
+    @pytest.mark.parametrize("space", ["joint", pytest.param("paired", marks=pytest.mark.slow)])
     def test_gradcheck_and_gradgradcheck(self, small_bars: Shapes, space: str) -> None:
         layer = InBetween(small_bars.bases[1:], small_bars.faces, **modal(space=space, tolerance=1e-14))
         x_a, x_b = (x.clone().requires_grad_() for x in small_bars.keyframes[1:])

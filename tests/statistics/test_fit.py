@@ -86,7 +86,7 @@ def test_a_rigid_motion_of_the_points_moves_the_shape(space: tm.ShapeSpace, bars
     torch.testing.assert_close(batch.shape[0].double(), one.shape, rtol=0, atol=1e-4)
 
 
-@pytest.mark.parametrize("weighted", [False, True])
+@pytest.mark.parametrize("weighted", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_gradients_are_those_of_weights_and_pose(
     space: tm.ShapeSpace, bars: Shapes, generator: torch.Generator, weighted: bool
 ) -> None:
