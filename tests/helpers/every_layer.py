@@ -1,6 +1,6 @@
 """Every layer and random transform, with a call of it: for what must hold of all of them, in worker processes too."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import partial
 from typing import Any, Literal, NamedTuple
@@ -204,7 +204,20 @@ FUNCTIONS: dict[str, Case] = {
 
 CONTACT = {"InBetween, contact", "Path, contact"}
 
-every_layer = pytest.mark.parametrize("name", CASES)
+ALIKE = {
+    *("InBetween, torch", "InBetween, modal, torch", "InBetween, own term", "InBetween, bodies", "Path, pairs"),
+    *("Passengers, rotations", "Passengers, gradients", "ShellEnergy"),
+}
+"""Not in the default run: another layer of the table takes most of their ways through the code."""
+
+
+def each(names: Iterable[str]) -> pytest.MarkDecorator:
+    """A test of each of these layers."""
+    params = [pytest.param(name, marks=[pytest.mark.slow] * (name in ALIKE)) for name in names]
+    return pytest.mark.parametrize("name", params)
+
+
+every_layer = each(CASES)
 
 
 class Made:

@@ -206,7 +206,10 @@ def test_mu_and_regions_are_of_the_paired_space(bars: Shapes) -> None:
     assert MidShape(*given, preset="paper", mu=2.0).in_between.objective.mu == 2.0
 
 
-@pytest.mark.parametrize(("ends", "truth"), [((0, 2), 1), ((0, 4), 2)], ids=["0-4", "0-8"])
+@pytest.mark.parametrize(
+    ("ends", "truth"),
+    [pytest.param((0, 2), 1, id="0-4"), pytest.param((0, 4), 2, id="0-8", marks=pytest.mark.slow)],
+)
 def test_local_interpolation_comes_closer_to_a_known_hand(ends: tuple[int, int], truth: int, hands: Shapes) -> None:
     """Measured with 30 modes: 0.16 and 0.30 of linear's edge error; in the regions, 0.30 and 0.33 of that without."""
     pair, wanted = hands.pick(*ends), hands.keyframes[truth]

@@ -64,7 +64,7 @@ every_preset = pytest.mark.parametrize("preset", ["accurate", "fast"])
 
 
 @every_preset
-@pytest.mark.parametrize("name", ["hand", "trex"])
+@pytest.mark.parametrize("name", ["hand", pytest.param("trex", marks=pytest.mark.slow)])
 @torch.no_grad()
 def test_shapes_do_not_jump_in_time(name: str, preset: Any, request: pytest.FixtureRequest) -> None:
     """The minimiser that is not anchored jumps by 5 % of the diagonal at 0.5679 of the hand."""

@@ -21,6 +21,7 @@ from helpers.every_layer import (
     Made,
     Step,
     assert_near,
+    each,
     every_layer,
     gradient,
     in_between,
@@ -214,7 +215,7 @@ def test_no_array_is_a_view_of_a_tensor(name: str, made: Made) -> None:
 # -------------------------------------------------------------------------------------------- times, compile and export
 
 
-@pytest.mark.parametrize("name", ["Path", "Path, pairs", "ModalDecoder"])
+@each(["Path", "Path, pairs", "ModalDecoder"])
 def test_mapped_times(name: str, small_bars: Shapes) -> None:
     layer, x = CASES[name].make(small_bars), small_bars.keyframes
     if name == "ModalDecoder":
@@ -281,7 +282,7 @@ def test_compiled_network_around_a_layer(backend: str, small_bars: Shapes) -> No
     assert counter.frame_count == 2, "other numbers are compiled again"
 
 
-@pytest.mark.parametrize("name", ["Passengers", pytest.param("ShellEnergy", marks=pytest.mark.slow), "ShellLoss"])
+@each(["Passengers", "ShellEnergy", "ShellLoss"])
 def test_export_of_what_reads_no_numbers(name: str, small_bars: Shapes) -> None:
     layer, x = CASES[name].make(small_bars), small_bars.keyframes
     n = 1 if name == "Passengers" else 2

@@ -20,6 +20,7 @@ from helpers.every_layer import (
     TRANSFORMS,
     Made,
     assert_near,
+    each,
     every_layer,
     gradient,
     loss,
@@ -50,7 +51,7 @@ def bar_space(bars: Shapes) -> tm.ShapeSpace:
 # ------------------------------------------------------------------------------------------------------------ numbers
 
 
-@pytest.mark.parametrize("name", [*CASES, *FUNCTIONS])
+@each([*CASES, *FUNCTIONS])
 def test_result_is_the_same_each_time_and_nothing_given_changes(name: str, made: Made) -> None:
     before, state = made.x.clone(), torch.get_rng_state()
     assert torch.equal(made.call(made.x), made.truth)
@@ -117,7 +118,7 @@ def test_a_gpu_gives_the_same(name: str, made: Made) -> None:
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
-@pytest.mark.parametrize("name", [name for name in CASES if name != "GaussNewtonStep"])  # made of another module
+@each(name for name in CASES if name != "GaussNewtonStep")  # made of another module
 def test_gpu_made_there(name: str, made: Made) -> None:
     """Of key-frames, faces and bases that are on the GPU, and differentiated there."""
     x, faces, bases = made.shapes
@@ -132,7 +133,7 @@ def test_gpu_made_there(name: str, made: Made) -> None:
 
 
 @pytest.mark.parametrize("factor", [1e-6, 1.0, 1e3])
-@pytest.mark.parametrize("name", [name for name, case in CASES.items() if case.result != "other"])
+@each(name for name, case in CASES.items() if case.result != "other")
 def test_units_and_rigid_motions(name: str, factor: float, made: Made, generator: torch.Generator) -> None:
     """Micrometres and kilometres, turned and moved away: everything moves along, bases too."""
     turn, move = random_rotation(generator), torch.tensor([50.0, -60.0, 70.0], dtype=DOUBLE)
@@ -155,7 +156,7 @@ def test_units_and_rigid_motions(name: str, factor: float, made: Made, generator
 # ------------------------------------------------------------------------------------------------------------ batches
 
 
-@pytest.mark.parametrize("name", BATCHED)
+@each(BATCHED)
 def test_batch_is_a_loop(name: str, made: Made) -> None:
     both = torch.stack([made.x, 1.01 * made.x + 0.01 * made.x.sin()])
     truth = torch.stack([made.call(x) for x in both])
@@ -163,7 +164,7 @@ def test_batch_is_a_loop(name: str, made: Made) -> None:
     assert made.call(both[:0, None]).numel() == 0
 
 
-@pytest.mark.parametrize("name", [name for name in BATCHED if name not in CONTACT])
+@each(name for name in BATCHED if name not in CONTACT)
 def test_vmap_is_a_loop(name: str, made: Made) -> None:
     """A transform may be the first that uses a layer."""
     both, new = torch.stack([made.x, 1.01 * made.x + 0.01 * made.x.sin()]), made.case.make(made.shapes)

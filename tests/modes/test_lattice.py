@@ -69,6 +69,7 @@ print(total.hexdigest())
 """
 
 
+@pytest.mark.slow
 def test_the_same_in_every_process_with_any_threads() -> None:
     """Bit by bit; the capsule's modes come in pairs of nearly equal eigenvalues, which rounding would turn."""
     root = str(Path(lattice_module.__file__).parents[2])

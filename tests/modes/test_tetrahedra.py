@@ -75,10 +75,10 @@ def worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     [
         ("os.kill(os.getpid(), signal.SIGKILL)", r"signal SIGKILL \(perhaps memory ran out\)"),
         ("os.kill(os.getpid(), signal.SIGXCPU)", r"signal SIGXCPU \(its processor_time is over\)"),
-        ("os.kill(os.getpid(), signal.SIGSEGV)", "signal SIGSEGV"),
+        pytest.param("os.kill(os.getpid(), signal.SIGSEGV)", "signal SIGSEGV", marks=pytest.mark.slow),
         ("print('RuntimeError: no envelope'); sys.exit(3)", r"exit code 3 \(RuntimeError: no envelope\)"),
         ("pass", "No such file"),
-        ("open(result, 'wb').write(b'PK\\x03\\x04')", "File is not a zip file"),
+        pytest.param("open(result, 'wb').write(b'PK\\x03\\x04')", "File is not a zip file", marks=pytest.mark.slow),
         ("np.savez(result, vertices=np.zeros((0, 3)), tets=np.zeros((0, 4), int))", "the result is empty"),
         (
             "np.savez(result, vertices=np.eye(4)[:, :3] * 1e-3, tets=np.arange(4)[None])",

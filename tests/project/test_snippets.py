@@ -5,16 +5,20 @@ one namespace, ``torch-modal`` in this process. Of other commands it is checked 
 that is not run says so, and why, in the line before it: ``*Not run by the tests: it needs Blender.*``
 """
 
+import inspect
 import re
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 from unittest.mock import patch
 
 import pytest
+import torch
 from helpers.snippets import COMMAND, LANGUAGES, NOT_RUN, PAGES, ROOT, Block, blocks, commands, expanded, run_python
 from test_examples import load_example
 
+import torch_modal as tm
 from torch_modal.cli import main as cli
 from torch_modal.io.formats import ANIMATION_FORMATS, MESH_FORMATS
 
@@ -41,6 +45,30 @@ def registered() -> Iterator[None]:
         yield
 
 
+def content(value: Any) -> Any:
+    """What tells arguments of a call apart."""
+    if isinstance(value, torch.Tensor):
+        return value.dtype, value.tolist()
+    if isinstance(value, (list, tuple)):
+        return [content(each) for each in value]
+    return [content(each) for each in vars(value).items()] if isinstance(value, tm.Observation) else value
+
+
+def computed_once(call: Callable[..., Any]) -> Callable[..., Any]:
+    """A function that keeps its results: commands of a page, and its Python, ask for the same ones."""
+    known: dict[str, Any] = {}
+
+    def keeping(*given: Any, **options: Any) -> Any:
+        bound = inspect.signature(call).bind(*given, **options)
+        given_ones = {name: content(value) for name, value in bound.arguments.items() if name != "progress"}
+        key = repr({name: value for name, value in given_ones.items() if value not in (None, False)})
+        if key not in known:
+            known[key] = call(*given, **options)
+        return known[key]
+
+    return keeping
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_every_block_says_what_it_is(page: Path) -> None:
     """So that none is left out by its form."""
@@ -58,6 +86,7 @@ def test_blocks_run_in_their_order(page: Path, meshes: Path, tmp_path: Path, mon
     """The first in an empty folder: it needs no file that the page makes, or names, later."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("webbrowser.open", lambda url: True)
+    monkeypatch.setattr(tm, "complete", computed_once(tm.complete))  # a minute each
     names: dict[str, object] = {"__name__": "__main__"}
     first, *others = (block for block in blocks(page) if block.language in {"python", "sh"})
     assert first.is_run
