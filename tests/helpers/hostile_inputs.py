@@ -52,7 +52,7 @@ CASES: dict[str, tuple[Mesh, int, str]] = {
     "degenerate faces": ((V, np.concatenate([F, F[:30][:, [0, 1, 1]]])), 10, RIGHT),
     "open": ((V, F[:-20]), 10, RIGHT),
     "two components": (pieces(2), 12, RIGHT),
-    "forty components": (pieces(40), 30, RIGHT),
+    "twenty components": (pieces(20), 15, RIGHT),
     "ten components, many modes": (pieces(10), 70, RIGHT),
     "flipped": ((V, F[:, ::-1]), 10, RIGHT),
     "half-flipped": ((V, np.where(np.arange(len(F))[:, None] % 2 == 0, F, F[:, ::-1])), 10, RIGHT),

@@ -117,14 +117,6 @@ def test_new_shapes_are_drawn_and_poses_follow_their_markers(tmp_path: Path) -> 
 
 
 @pytest.mark.slow
-def test_figures_of_the_paper_are_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One of them, with its cheapest row; their numbers are compared with the page (test_results.py)."""
-    monkeypatch.setattr(sys, "argv", ["run", str(tmp_path), "--parts", "5", "--only", "Eq. 4"])
-    load_example("paper/run").main()
-    assert (tmp_path / "paper-figure5.png").stat().st_size > 30_000
-
-
-@pytest.mark.slow
 def test_train_motion_learns_more_in_amplitudes() -> None:
     """A short run: the stride that is told from its first two shapes."""
     found = {name: errors for name, (errors, _) in load_example("train_motion").main(2, steps=48, n_modes=16).items()}

@@ -66,15 +66,18 @@ def test_cells_are_compared_by_their_last_digit() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CHECKED)
 def test_a_row_is_measured_again(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A figure of the paper is also drawn."""
     table = results.load(name)
     script = table["command"].split()[1]
-    arguments = [script, *shlex.split(table["check"]), "--keep", str(tmp_path)]
+    pictures = [str(tmp_path)] * (name == "paper-figure5")
+    arguments = [script, *pictures, *shlex.split(table["check"]), "--keep", str(tmp_path)]
     monkeypatch.setattr(sys, "argv", arguments)
     monkeypatch.setenv(REPEATS, "0")  # times are not compared
     load_example(f"../{script.removesuffix('.py')}").main()
     expected = rows_by_labels(table)
     again = rows_by_labels(json.loads((tmp_path / f"{name}.json").read_text(encoding="utf-8")))
     assert again
+    assert not pictures or (tmp_path / f"{name}.png").stat().st_size > 30_000
     for labels, cells in again.items():
         for name, cell in cells.items():
             assert close(cell, expected[labels][name]), (labels, name, cell, expected[labels][name])
