@@ -283,7 +283,14 @@ def test_kernels_and_torch_step_alike(hand: Shapes) -> None:
         corner = distance <= distance.kthvalue(40).values
         pull = Pull(x + torch.tensor([0.5, 0, 0], dtype=DOUBLE), 40.0 * corner * search.areas)
         steps = contact_layer._steps(core, RestShapes(shapes, weights, layer.stiffness_of(t, t.shape)))
-        y, beside = x, separate._energies(active, pull, search.areas)
+
+        def beside(
+            some: slice, like: Tensor, active: Contacts = active, pull: Pull = pull, areas: Tensor = search.areas
+        ) -> list[ContactEnergy | Pull]:
+            contact = ContactEnergy(active.rows(torch.arange(2)[some]), areas, like)
+            return [contact, Pull(pull.to[some].to(like), pull.weights.to(like))]
+
+        y = x
         for _ in range(2):
             y = steps(y, torch.arange(2), beside)
         contact = ContactEnergy(active, search.areas, x)
