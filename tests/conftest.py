@@ -15,7 +15,7 @@ import pytest
 import scipy.sparse as sp
 import torch
 import trimesh
-from browsers import NoBrowser, open_browser
+from helpers.browsers import NoBrowser, open_browser
 from helpers.solids import box, eigenmodes, element_hessian, lumped_mass, surface
 from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from timing import limit_threads

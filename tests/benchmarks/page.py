@@ -21,7 +21,7 @@ from PIL import Image
 from results import Table, add_keep
 
 sys.path.append(str(Path(__file__).parents[1]))  # beside the tests
-from browsers import open_browser, open_page
+from helpers.browsers import open_browser, open_page
 
 import torch_modal as tm
 from torch_modal.data.samples import SAMPLES, load_sample

@@ -9,7 +9,7 @@ import pytest
 import torch
 import trimesh
 from conftest import Ball
-from pages import NASTY, data_of, unpacked
+from helpers.pages import NASTY, data_of, unpacked
 
 import torch_modal as tm
 from torch_modal.cli.main import main

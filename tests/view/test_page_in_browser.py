@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
-from browsers import NoBrowser, console, open_browser, open_page, requests
 from conftest import Ball
-from pages import NASTY, Opened, data_of
+from helpers.browsers import NoBrowser, console, open_browser, open_page, requests
+from helpers.pages import NASTY, Opened, data_of
 
 import torch_modal as tm
 from torch_modal.cli.main import main

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
-from browsers import console
 from conftest import Ball
-from pages import Opened, data_of, unpacked
+from helpers.browsers import console
+from helpers.pages import Opened, data_of, unpacked
+from helpers.textured import RED, bend, textured_glb, textured_obj
 from PIL import Image
-from textured import RED, bend, textured_glb, textured_obj
 from trimesh.visual.material import PBRMaterial
 
 import torch_modal as tm

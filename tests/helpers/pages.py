@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from browsers import console, open_page, requests
 from PIL import Image
 
+from helpers.browsers import console, open_page, requests
 from torch_modal.view.page import Page
 
 NASTY = "</script><script>document.title='broken'</script><img src=x onerror=\"document.title='broken'\">&amp;'"
