@@ -194,7 +194,7 @@ def main() -> None:
         "rank",
         "s",
     ]
-    check = "--samples markers --motions creature"
+    check = "--samples markers --motions mh-hand-path"
     with Table("completion", columns, options.keep, columns[-1:], check, labels=2) as table:
         for samples in options.samples:
             for name in SAMPLES[samples]:

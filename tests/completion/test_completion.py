@@ -10,13 +10,16 @@ from helpers.terms import Spring
 import torch_modal as tm
 from torch_modal.completion.bending import ModalBending
 from torch_modal.completion.energy import PointEnergy
+from torch_modal.completion.frames import CompletionProblem
 from torch_modal.completion.gradient import LastSolve
+from torch_modal.completion.markers import shape_of_markers
 from torch_modal.completion.pairs import ObservedPoints, SampledSurface
 from torch_modal.elastic.steps import FineEnergy
 from torch_modal.elastic.term import Mesh
 from torch_modal.geometry.rigid import best_fit
 from torch_modal.motion.decoder import scale_modes
 from torch_modal.registration.surface import places_between
+from torch_modal.statistics.variation import Variation
 
 
 def bending_tube(n, m):
@@ -176,6 +179,35 @@ def test_markers_within_triangles_are_met(tube):
     assert error(found.shapes, x[1:2], diagonal) < 1.0
 
 
+def test_markers_show_a_mixture_of_the_keyframes(tube):
+    """Nearer than the path by far; without a marker of another place; its derivatives are those of differences."""
+    x, faces, diagonal = tube
+    generator = torch.Generator().manual_seed(0)
+    corners = faces[::12]
+    weights = torch.rand(len(corners), 3, generator=generator, dtype=x.dtype)
+    weights = weights / weights.sum(1, keepdim=True)
+    places = (weights[..., None] * x[1][corners]).sum(1)
+    places[3] += 0.3 * diagonal
+    seen = tm.Observation(1.0, places, corners=corners, barycentric=weights, noise=0.001 * diagonal)
+    problem = CompletionProblem(x[::2].numpy(), faces, np.array([0.0, 2.0, 4.0]), [seen])
+    truth, variation = torch.from_numpy(problem.to_canonical(x[1])), Variation(problem.whole, faces)
+    found = shape_of_markers(variation, problem.frames[0], truth)
+    path = tm.Path(problem.whole, faces, times=[0.0, 2.0, 4.0])(problem.whole, 1.0)
+    assert error(found.x, truth, 100) < 0.1 * error(path, truth, 100)
+    assert sorted(found.numbers) == [i for i in range(len(corners)) if i != 3]
+
+    probe, move = (torch.randn(y.shape, generator=generator, dtype=x.dtype) for y in (found.x, found.points))
+    (slope,) = torch.autograd.grad((found.x * probe).sum(), found.points)
+    (one,), ends = problem.frames[0].seen, []
+    for sign in (1, -1):
+        points = one.points.copy()
+        points[found.numbers] += sign * 1e-3 * move.numpy()
+        frame = problem.frames[0]._replace(seen=[one._replace(points=points)])
+        ends.append(shape_of_markers(variation, frame, truth).x.detach())
+    difference = float(((ends[0] - ends[1]) * probe).sum()) / 2e-3
+    assert float((slope * move).sum()) == pytest.approx(difference, rel=1e-3)
+
+
 def test_a_motion_and_other_units_change_nothing(tube):
     x, faces, _ = tube
     turn = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(1), dtype=x.dtype)).Q
@@ -285,7 +317,7 @@ def test_points_of_weight_zero_do_not_count_in_a_score(tube):
         assert cloud.score(surface, 1.0) == pytest.approx(score, abs=1e-3)
 
 
-@pytest.mark.parametrize("given", [True, False])
+@pytest.mark.parametrize("given", [pytest.param(True, marks=pytest.mark.slow), False])
 def test_gradients_of_markers_are_those_of_differences(given):
     """Through robust weights and neighbours in time, also where the noise is estimated."""
     x, faces, diagonal = bending_tube(10, 8)
