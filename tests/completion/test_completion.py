@@ -191,7 +191,8 @@ def test_markers_show_a_mixture_of_the_keyframes(tube):
     seen = tm.Observation(1.0, places, corners=corners, barycentric=weights, noise=0.001 * diagonal)
     problem = CompletionProblem(x[::2].numpy(), faces, np.array([0.0, 2.0, 4.0]), [seen])
     truth, variation = torch.from_numpy(problem.to_canonical(x[1])), Variation(problem.whole, faces)
-    found = shape_of_markers(variation, problem.frames[0], truth)
+    about = torch.tensor([0.5, 0.5, 0.0], dtype=x.dtype)
+    found = shape_of_markers(variation, problem.frames[0], about, truth, differentiable=True)
     path = tm.Path(problem.whole, faces, times=[0.0, 2.0, 4.0])(problem.whole, 1.0)
     assert error(found.x, truth, 100) < 0.1 * error(path, truth, 100)
     assert sorted(found.numbers) == [i for i in range(len(corners)) if i != 3]
@@ -203,9 +204,18 @@ def test_markers_show_a_mixture_of_the_keyframes(tube):
         points = one.points.copy()
         points[found.numbers] += sign * 1e-3 * move.numpy()
         frame = problem.frames[0]._replace(seen=[one._replace(points=points)])
-        ends.append(shape_of_markers(variation, frame, truth).x.detach())
+        ends.append(shape_of_markers(variation, frame, about, truth).x)
     difference = float(((ends[0] - ends[1]) * probe).sum()) / 2e-3
     assert float((slope * move).sum()) == pytest.approx(difference, rel=1e-3)
+
+
+@pytest.mark.parametrize("vertices", [[0, 12, 24], [0, 120, 240]])
+def test_three_markers_leave_the_rest_to_the_path(tube, vertices):
+    x, faces, diagonal = tube
+    seen = tm.Observation(1.0, x[1][vertices], vertices=torch.tensor(vertices), noise=0.001 * diagonal)
+    found = tm.complete(x[::2], faces, [seen], times=[0.0, 2.0, 4.0], progress=False)
+    path = tm.Path(x[::2], faces, times=[0.0, 2.0, 4.0])(x[::2], 1.0)
+    assert error(found.shapes[0], x[1], diagonal) < 0.5 * error(path, x[1], diagonal)
 
 
 def test_a_motion_and_other_units_change_nothing(tube):

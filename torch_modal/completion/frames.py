@@ -89,6 +89,8 @@ class CompletionProblem:
         _, self.axes, self.centre, self.scale = to_canonical(shapes[largest], faces.numpy())
         self.whole = torch.from_numpy((shapes - self.centre) @ self.axes.T * self.scale)
         self.template = self.whole[largest]
+        #: True where gradients in the points may be asked for.
+        self.differentiable = any(one.points.requires_grad for one in observations)
         #: 1, or -1 where the normals of the clouds point inward, and are turned.
         self.side = self._side(observations)
         ends = np.cumsum([len(one.points) for one in observations])

@@ -18,7 +18,7 @@ STRAY = 5.0
 
 
 class MarkerShape(NamedTuple):
-    """A shape as a function of markers, with its graph."""
+    """A shape as a function of markers, with its graph where they require a gradient."""
 
     points: Tensor
     """*Shape:* ``(n, 3)``."""
@@ -28,14 +28,17 @@ class MarkerShape(NamedTuple):
     """*Shape:* ``(V, 3)``."""
 
 
-@torch.enable_grad()
-def shape_of_markers(variation: Variation, frame: Frame, by_modes: Tensor) -> MarkerShape | None:
+def shape_of_markers(
+    variation: Variation, frame: Frame, about: Tensor, by_modes: Tensor, differentiable: bool = False
+) -> MarkerShape | None:
     """The shape of local weights of the key-frames that is nearest to the markers of a frame; None of too few, or many.
 
     Args:
         variation: Of the key-frames.
         frame: Its observations all have known places.
+        about: The most likely weights of the key-frames. *Shape:* ``(K,)``.
         by_modes: The shape by modes. *Shape:* ``(V, 3)``.
+        differentiable: True for a graph, which takes as much memory as several shapes.
     """
     least, rows = min(one.noise for one in frame.seen), []
     for one in frame.seen:
@@ -53,9 +56,9 @@ def shape_of_markers(variation: Variation, frame: Frame, by_modes: Tensor) -> Ma
     to = Observations(*map(torch.from_numpy, columns))
     if not FEWEST <= len(to.corners.unique(dim=0)) <= len(to.points) <= MOST:
         return None
-    points = to.points.requires_grad_()
-    even = torch.full((len(variation),), 1 / len(variation), dtype=torch.float64)
-    local = LocalWeights(variation, to, even, least)
-    factors, to = local.solve(robust=False)
-    x = local.shape(factors)
-    return MarkerShape(points, numbers, to.pose(x).apply(x))
+    points = to.points.requires_grad_(differentiable)
+    with torch.set_grad_enabled(differentiable):
+        local = LocalWeights(variation, to, about, least)
+        factors, to = local.solve(robust=False)
+        x = local.shape(factors)
+        return MarkerShape(points, numbers, to.pose(x).apply(x))

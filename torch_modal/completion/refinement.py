@@ -152,10 +152,13 @@ class Refinement:
         whole, frames = self.problem.whole, self.problem.frames
         if len(whole) < 2:
             return [None] * len(frames)
-        first = self.problem.largest  # whatever the order
-        variation = Variation(torch.cat([whole[first:], whole[:first]]), self.problem.faces)
-        pairs = zip(frames, by_modes, strict=True)
-        return run([partial(shape_of_markers, variation, frame, x) for frame, x in pairs])
+        order = np.roll(np.arange(len(whole)), -self.problem.largest)  # whatever the order of the caller
+        variation, work = Variation(whole[order], self.problem.faces), []
+        for frame, x in zip(frames, by_modes, strict=True):
+            near = [np.interp(frame.time, self.problem.times, row) for row in np.eye(len(whole))[order]]
+            about = torch.tensor(np.array(near))
+            work.append(partial(shape_of_markers, variation, frame, about, x, self.problem.differentiable))
+        return run(work)
 
     def _rests(self, own: list[float]) -> tuple[Tensor, Tensor]:
         """Rest shapes of each frame, and their weights: its own, whole ones, and neighbours in time.
