@@ -16,6 +16,7 @@ from torch_modal.data.augmentation import ShapeAugmentation
 from torch_modal.inbetween.settings import PRESETS
 
 DOUBLE = torch.float64
+TIMES = torch.tensor([0.5, 1.5, 1.0, 0.0], dtype=DOUBLE)
 
 
 class Case(NamedTuple):

@@ -18,6 +18,7 @@ import torch
 from conftest import Shapes
 from helpers.every_layer import (
     CASES,
+    TIMES,
     Made,
     Step,
     assert_near,
@@ -34,7 +35,6 @@ from torch.multiprocessing import get_context
 import torch_modal as tm
 
 DOUBLE = torch.float64
-TIMES = torch.tensor([0.5, 1.5, 1.0, 0.0], dtype=DOUBLE)
 
 
 def tensors_of(value: Any, seen: set[int]) -> Iterator[Tensor]:

@@ -17,6 +17,7 @@ from helpers.every_layer import (
     CONTACT,
     FUNCTIONS,
     LAYERS,
+    TIMES,
     TRANSFORMS,
     Made,
     assert_near,
@@ -32,7 +33,6 @@ import torch_modal as tm
 from torch_modal.data.shape_batch import ShapeBatch
 
 DOUBLE = torch.float64
-TIMES = torch.tensor([0.5, 1.5, 1.0, 0.0], dtype=DOUBLE)
 THIRDS = torch.full((3,), 1 / 3, dtype=DOUBLE)
 OF_ONE_DTYPE = ("ModalDecoder", "Passengers", "GaussNewtonStep")
 """Layers that are cast to the dtype of what they are given."""

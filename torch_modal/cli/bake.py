@@ -53,8 +53,7 @@ def run(args: argparse.Namespace) -> None:
     import torch
 
     import torch_modal as tm
-    from torch_modal.data.sequence import sequence_files, smooth_in_time
-    from torch_modal.io.read import SUFFIXES
+    from torch_modal.data.sequence import sequence_asset, sequence_files, smooth_in_time
 
     files = sequence_files(args.meshes)
     arguments.check_output(args, [args.out], files)
@@ -83,7 +82,7 @@ def run(args: argparse.Namespace) -> None:
             args.report(f"error:     {error((filled - frames)[left])} at the {len(left)} frames between key-frames")
         frames = filled
     skin = tm.bake(frames, faces, args.bones) if args.bones else None
-    asset = tm.open_asset(files[0]) if files[0].suffix.lower() in SUFFIXES else None
+    asset = sequence_asset(files)
     if asset is not None:
         asset.carries.pop("posing", None)  # it is what is written
     options = pick_options(args, "cyclic", "targets", "progress", "size")

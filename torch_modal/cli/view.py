@@ -91,8 +91,8 @@ def _sequences(sequences: list[list[Path]], args: argparse.Namespace) -> Page:
     import torch
 
     import torch_modal as tm
-    from torch_modal.data.sequence import read_shapes, sequence_files
-    from torch_modal.io.read import SUFFIXES, require_same_mesh
+    from torch_modal.data.sequence import read_shapes, sequence_asset
+    from torch_modal.io.read import require_same_mesh
     from torch_modal.io.write import check_indices
     from torch_modal.times import fill_linear
 
@@ -111,9 +111,8 @@ def _sequences(sequences: list[list[Path]], args: argparse.Namespace) -> Page:
         keys = check_indices([*ends, *(options.get("keyframe_indices") or [n - 1])], n, "key-frames")
         names.append("linear")
         shapes.append(fill_linear(torch.from_numpy(first[keys]), [*keys, n] if cyclic else keys).numpy())
-    file = sequence_files(sequences[0])[0]
-    asset = tm.open_asset(file) if file.suffix.lower() in SUFFIXES else None
-    return tm.show(dict(zip(_number_names(names), shapes, strict=True)), faces, **options, asset=asset, title=names[0])
+    options |= {"asset": sequence_asset(sequences[0]), "title": names[0]}
+    return tm.show(dict(zip(_number_names(names), shapes, strict=True)), faces, **options)
 
 
 def _number_names(names: list[str]) -> list[str]:

@@ -43,14 +43,16 @@ class ModalBending:
         return ModalPose(self.columns.new_zeros(len(self.columns)), torch.eye(3).double(), torch.zeros(3).double())
 
     def _bending(self, base: Tensor, pose: ModalPose) -> tuple[Tensor, Tensor, Frames]:
-        """Rotation vectors, strains, and the frames of the shape. *Shape of both:* ``(3, 1, F)``."""
+        """Rotation vectors, unbounded strains, and the frames of the shape. *Shape of both:* ``(3, 1, F)``."""
         rest, bending = frames_of(base[None], self.faces), torch.einsum("k,kcf->cf", pose.amplitudes, self.columns)
         turn = bending[0] * rest.e1 + bending[1] * rest.e2 + bending[2] * rest.normal
         return turn, bending[3:, None], rest
 
     def shape(self, base: Tensor, pose: ModalPose) -> Tensor:
         """The deformed shape. *Shape:* ``(V, 3)``."""
-        turn, strain, rest = self._bending(base, pose)
+        return self._bent(base, pose, *self._bending(base, pose))
+
+    def _bent(self, base: Tensor, pose: ModalPose, turn: Tensor, strain: Tensor, rest: Frames) -> Tensor:
         wanted = bend_sides(turn, strain.clamp(-MOST_LOG_STRETCH, MOST_LOG_STRETCH), rest)
         return self.reconstruction(wanted, base[None])[0] @ pose.rotation.mT + pose.move
 
@@ -59,9 +61,9 @@ class ModalBending:
 
         *Shape:* ``(V, 3), (V, 3, n + 6)``.
         """
-        x = self.shape(base, pose)
-        motions = infinitesimal_motions(x - x.mean(0)).movedim(0, -1)
         turn, strain, rest = self._bending(base, pose)
+        x = self._bent(base, pose, turn, strain, rest)
+        motions = infinitesimal_motions(x - x.mean(0)).movedim(0, -1)
         bounded = strain.clamp(-MOST_LOG_STRETCH, MOST_LOG_STRETCH)
         within = torch.cat([torch.ones_like(strain), (bounded == strain).to(strain)])
         slopes = bend_slopes(turn, bounded, rest, torch.stack(rest[:3], 1))

@@ -14,6 +14,7 @@ from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.data.tree import mesh_files, natural
 from torch_modal.errors import MeshError
 from torch_modal.io.alembic import read_alembic
+from torch_modal.io.asset import Asset
 from torch_modal.io.formats import FPS
 from torch_modal.io.gltf import key_times
 from torch_modal.io.gltf_asset import GltfAsset
@@ -127,6 +128,12 @@ def read_shapes(paths: Paths, fps: float | None = None, **registration: Any) -> 
             return animation[0], asset.faces, animation[1]
     keyframes, faces = load_keyframes(files, **registration)
     return keyframes.numpy(), faces.numpy(), {}
+
+
+def sequence_asset(paths: Paths) -> Asset | None:
+    """The first file of a sequence with all that is in it; None where that is no mesh file."""
+    file = sequence_files(paths)[0]
+    return open_asset(file) if file.suffix.lower() in SUFFIXES else None
 
 
 def _arrays(path: Path) -> Shapes:
