@@ -27,13 +27,13 @@ from torch_modal.elastic.kernel_energy import KernelEnergy, _MergeRests
 from torch_modal.elastic.kernel_steps import KernelFineEnergy, KernelProblem, _Relaxation
 from torch_modal.elastic.kernel_terms import by_kernels
 from torch_modal.elastic.kernels import launch
-from torch_modal.elastic.rotations import WarpRotations, mean_pose
+from torch_modal.elastic.rotations import WarpRotations, best_rotations, mean_pose
 from torch_modal.elastic.steps import FineEnergy, SumOfEnergies, TermsTowards, descend
 from torch_modal.elastic.stretch import Stretch
 from torch_modal.elastic.term import Mesh, Term
 from torch_modal.elastic.volume import Volume
 from torch_modal.errors import MissingPackageError
-from torch_modal.geometry import procrustes
+from torch_modal.geometry import procrustes, rigid
 from torch_modal.geometry.canonical import CANONICAL_SIZE
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.local_rotations import LocalRotations, Trajectory
@@ -238,6 +238,16 @@ class TestAlignment:
         for given in (self.given(), [0.01 * x for x in self.given()[:2]] + self.given()[2:]):
             run, truth = lambda *x: mean_pose(*x)[index], lambda *x: procrustes.mean_pose(*x)[index]
             assert_kernels(run, truth, given, 1e-12, 1e-10)
+
+    def test_best_rotations_without_a_gradient(self) -> None:
+        """Of any size, also of mirrored shapes and flat ones, whose rotation is determined."""
+        generator = torch.Generator().manual_seed(0)
+        given = torch.randn(500, 3, 3, dtype=DOUBLE, generator=generator)
+        given[:100, 2] = 0  # of rank two
+        truth = rigid.best_rotation(given)
+        assert 100 < (torch.linalg.det(given) < 0).sum() < 300
+        for size in (1e-9, 1.0, 1e9):
+            torch.testing.assert_close(best_rotations(size * given), truth, rtol=0, atol=1e-11)
 
     def test_of_shapes_on_a_line(self) -> None:
         """Nothing determines the turn about it: it is a rotation all the same, and gradients are finite."""

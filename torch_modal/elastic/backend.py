@@ -18,7 +18,7 @@ from torch_modal.elastic.distortion import Distortion, KernelDistortion
 from torch_modal.elastic.kernel_steps import KernelFineEnergy
 from torch_modal.elastic.kernel_terms import volumes_by_kernel
 from torch_modal.elastic.kernels.launch import kernels, launch, load_kernels, of_elements
-from torch_modal.elastic.rotations import WarpRotations
+from torch_modal.elastic.rotations import WarpRotations, best_rotations
 from torch_modal.elastic.rotations import mean_pose as mean_pose_by_kernel
 from torch_modal.elastic.steps import FineEnergy
 from torch_modal.elastic.stretch import Stretch
@@ -27,7 +27,7 @@ from torch_modal.errors import MissingPackageError
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.local_rotations import LocalRotations
 from torch_modal.geometry.procrustes import mean_pose
-from torch_modal.geometry.rigid import volumes_of
+from torch_modal.geometry.rigid import best_rotation, volumes_of
 
 
 class TorchBackend:
@@ -38,6 +38,7 @@ class TorchBackend:
     """
 
     mean_pose, volumes_of = staticmethod(mean_pose), staticmethod(volumes_of)
+    best_rotations = staticmethod(best_rotation)
     rotations = staticmethod(LocalRotations)
     """Local rotations of triangles between shapes near references. *Shape:* ``(K, V, 3)``."""
     fine_energy = staticmethod(FineEnergy)
@@ -70,6 +71,7 @@ class WarpBackend(TorchBackend):
     """
 
     mean_pose, volumes_of = staticmethod(mean_pose_by_kernel), staticmethod(volumes_by_kernel)
+    best_rotations = staticmethod(best_rotations)
     rotations = staticmethod(WarpRotations)
     fine_energy = staticmethod(KernelFineEnergy)
     distortion = staticmethod(KernelDistortion)

@@ -159,6 +159,13 @@ class _OnTrajectory(Operation[Tensor]):
         return (which.view(max(len(first), 1), -1) + first[:, None]).flatten().int()
 
 
+def best_rotations(covariance: Tensor) -> Tensor:
+    """:func:`torch_modal.geometry.rigid.best_rotation`, without a gradient, in float64. *Shape:* ``(N, 3, 3)``."""
+    rotations = torch.empty_like(covariance)
+    launch(kernels("procrustes").best_rotations, (len(rotations),), [covariance, rotations])
+    return rotations
+
+
 def mean_pose(to_reference: Tensor, among: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
     """:func:`torch_modal.geometry.procrustes.mean_pose`; of two shapes by a kernel, in float64."""
     if weights.shape[1] != 2:

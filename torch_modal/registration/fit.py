@@ -7,9 +7,9 @@ import torch
 from scipy import sparse
 
 from torch_modal.arrays import BoolArray, FloatArray, IntArray
+from torch_modal.elastic.backend import choose
 from torch_modal.geometry.closest import dot
 from torch_modal.geometry.connectivity import half_cotangents
-from torch_modal.geometry.rigid import best_rotation
 from torch_modal.geometry.sparse import SparseSolver, graph_laplacian
 from torch_modal.registration.maps import SpectralShape
 from torch_modal.registration.pair import MeshPair
@@ -59,6 +59,7 @@ class ElasticSurface:
 
     def __init__(self, rest: MeshSurface, *, stretchable: bool = False) -> None:
         self.stretchable, n, edges = stretchable, len(rest.vertices), rest.edges
+        self._best_rotations = choose("auto").best_rotations
         opposite = half_cotangents(rest.vertices, rest.connectivity)
         weights: FloatArray = np.clip(np.bincount(rest.connectivity.sides, opposite, minlength=len(edges)), *_WEIGHTS)
         self.laplacian = graph_laplacian(edges, weights, n)
@@ -81,7 +82,7 @@ class ElasticSurface:
         covariance = self._gather @ products.reshape(-1, 9)
         for _ in range(_SMOOTHING_ROUNDS):
             covariance = (1 - _SMOOTHING) * covariance + _SMOOTHING * (self.neighbour_mean @ covariance)
-        rotations = best_rotation(torch.from_numpy(covariance).unflatten(1, (3, 3))).numpy()
+        rotations = self._best_rotations(torch.from_numpy(covariance).unflatten(1, (3, 3))).numpy()
         if not self.stretchable:
             return rotations
         # Smoothed ratios of edge lengths to rest lengths.

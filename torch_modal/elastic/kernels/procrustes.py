@@ -1,4 +1,4 @@
-"""The poses of two shapes: :func:`torch_modal.geometry.procrustes.mean_pose`."""
+"""Best rotations, and the poses of two shapes: :func:`torch_modal.geometry.procrustes.mean_pose`."""
 
 import warp as wp
 
@@ -29,6 +29,13 @@ def to_covariance(covariance: wp.mat33d, to_rotation: wp.mat33d):
     m = to_rotation @ wp.transpose(rotation)
     torque = vec3(m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1])
     wp.adjoint[covariance] += wp.skew(wp.inverse(hessian) @ torque) @ rotation
+
+
+@wp.kernel(enable_backward=False)
+def best_rotations(covariances: wp.array[wp.mat33d], rotations: wp.array[wp.mat33d]):
+    """rigid.best_rotation of each."""
+    m = wp.tid()
+    rotations[m] = best_rotation(covariances[m])
 
 
 @wp.kernel(enable_backward=False)
