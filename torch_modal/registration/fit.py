@@ -10,7 +10,7 @@ from torch_modal.arrays import BoolArray, FloatArray, IntArray
 from torch_modal.elastic.backend import choose
 from torch_modal.geometry.closest import dot
 from torch_modal.geometry.connectivity import half_cotangents
-from torch_modal.geometry.sparse import SparseSolver, graph_laplacian
+from torch_modal.geometry.sparse import factorize, graph_laplacian
 from torch_modal.registration.maps import SpectralShape
 from torch_modal.registration.pair import MeshPair
 from torch_modal.registration.surface import MeshSurface
@@ -63,6 +63,8 @@ class ElasticSurface:
         opposite = half_cotangents(rest.vertices, rest.connectivity)
         weights: FloatArray = np.clip(np.bincount(rest.connectivity.sides, opposite, minlength=len(edges)), *_WEIGHTS)
         self.laplacian = graph_laplacian(edges, weights, n)
+        # Pulls of points of faces add no entries, so that one order of elimination serves all steps.
+        self._order = np.argsort(factorize(self.laplacian + sparse.identity(n)).perm_c)
         self._i, self._j = np.concatenate([edges, edges[:, ::-1]]).T
         self._weights = np.tile(weights, 2)
         self._sides = rest.vertices[self._i] - rest.vertices[self._j]
@@ -99,12 +101,14 @@ class ElasticSurface:
             weighted = points.T @ sparse.diags(weights)
             matrix = matrix + weighted @ points
             pulled += weighted @ targets
-        solver = SparseSolver(matrix)
+        order = self._order
+        factors = factorize(matrix[order][:, order], "NATURAL")
         for _ in range(rounds):
             frames = self.local_frames(x)
             wanted = 0.5 * np.einsum("eij,ej->ei", frames[self._i] + frames[self._j], self._sides)
             right = self._gather @ (self._weights[:, None] * wanted) + pulled
-            x = solver(torch.from_numpy(right)).numpy()
+            x = np.empty_like(x)
+            x[order] = factors.solve(right[order])
         return x
 
 
