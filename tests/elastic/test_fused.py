@@ -13,7 +13,7 @@ import pytest
 import torch
 from conftest import Shapes
 from helpers.bodies import sheet_surface
-from helpers.terms import Area, Slopes, Spring, fibres
+from helpers.terms import Anchored, Area, Slopes, Spring, WholeAnchored, WholeArea, WholeSlope, fibres
 from torch import Tensor
 from torch.func import functional_call, grad, vmap
 
@@ -25,7 +25,7 @@ from torch_modal.elastic.distortion import Distortion, KernelDistortion
 from torch_modal.elastic.energy import Energy, Reference, RestShapes
 from torch_modal.elastic.kernel_energy import KernelEnergy, _MergeRests
 from torch_modal.elastic.kernel_steps import KernelFineEnergy, KernelProblem, _Relaxation
-from torch_modal.elastic.kernel_terms import by_kernels
+from torch_modal.elastic.kernel_terms import by_kernels, serves
 from torch_modal.elastic.kernels import launch
 from torch_modal.elastic.rotations import WarpRotations, best_rotations, mean_pose
 from torch_modal.elastic.steps import FineEnergy, SumOfEnergies, TermsTowards, descend
@@ -50,7 +50,8 @@ DOUBLE = torch.float64
 
 def by_kernels_alone(energy: Energy, mesh: Mesh) -> KernelEnergy:
     """Of terms that kernels serve."""
-    return KernelEnergy(energy, [part for part in by_kernels(energy, mesh) if part is not None])
+    assert all(map(serves, energy.parts))
+    return KernelEnergy(energy, [by_kernels(part, mesh) for part in energy.parts])
 
 
 class Case:
@@ -83,7 +84,7 @@ class Case:
 
     def by_warp(self, x: Tensor, *rests: Tensor) -> Tensor:
         to = self.fused.reference(self.rests(*rests))
-        return _Relaxation(self.fused, [4, 4])(x, *to.records)[0]
+        return _Relaxation(self.fused, [4, 4])(x, self.fused.no_anchors(x), *to.records)[0]
 
 
 @pytest.fixture(params=["closed", "open", "flat"])
@@ -127,7 +128,9 @@ def assert_kernels(run: Any, truth: Any, given: list[Tensor], atol: float, to: f
 
 def test_local_steps(case: Case) -> None:
     assert float((case.by_torch(*case.given) - case.given[0]).abs().max()) > 1e-2
-    assert_kernels(case.by_warp, case.by_torch, case.given, 1e-8 * CANONICAL_SIZE, 4e-6, case.fused.parts[2].closed)
+    assert_kernels(
+        case.by_warp, case.by_torch, case.given, 1e-8 * CANONICAL_SIZE, 4e-6, not case.fused.parts[2].extends
+    )
 
 
 @torch.no_grad()
@@ -155,7 +158,9 @@ def test_steps_that_would_go_uphill_are_shortened(small_bars: Shapes) -> None:
     case = Case(small_bars, small_bars.faces, 10.0)
     case.given[5] *= 1e5
     to, taken = case.fused.reference(case.rests(*case.given[1:])), []
-    found = descend(KernelProblem(case.fused, to), case.given[0].contiguous(), [4, 4], taken)
+    found = descend(
+        KernelProblem(case.fused, to, case.fused.no_anchors(case.given[0])), case.given[0].contiguous(), [4, 4], taken
+    )
     lengths = torch.stack([step[3] for step in taken])
     assert float(lengths.min()) < 0.5 < float(lengths.max()), "no step is shortened, or all are"
     torch.testing.assert_close(found, case.by_torch(*case.given), rtol=0, atol=1e-8 * CANONICAL_SIZE)
@@ -395,16 +400,16 @@ class TestLayers:
         torch.testing.assert_close(found[0][0], found[1][0], rtol=0, atol=1e-7)
         torch.testing.assert_close(found[0][1], found[1][1], rtol=1e-4, atol=1e-5)
 
-    @pytest.mark.parametrize("name", ["with its gradient", "measure alone", "without weights"])
+    @pytest.mark.parametrize("name", ["with its gradient", "measure alone", "without weights", "total", "anchored"])
     def test_a_term_of_ones_own_by_kernels(self, bars: Shapes, name: str) -> None:
         """The same numbers as torch's, with a gradient and without; its kernels compute them."""
-        kind = fibres(weighted=name != "without weights")
+        kind = {"total": WholeArea, "anchored": Anchored}.get(name) or fibres(weighted=name != "without weights")
         if name == "measure alone":
             kind.linearised = None
         x, found = bars.keyframes[:2], []
         for backend_name in ("warp", "torch"):
             solver = tm.Solver(backend=backend_name, tolerance=1e-12)
-            objective = tm.Objective(terms=(kind(1e3),))
+            objective = tm.Objective(terms=(kind(1e-2 if name == "total" else 1e3),))
             layer = tm.InBetween(bars.bases[:2], bars.faces, objective=objective, solver=solver)
             ends = x.clone().requires_grad_()
             with torch.no_grad():
@@ -414,7 +419,7 @@ class TestLayers:
             if backend_name == "warp":
                 kernels = layer.core.fine.kernels
                 assert layer.core.fine.further is None and len(kernels.parts) == 4
-                assert (3 in kernels.weighed) == (name == "without weights")
+                assert (3 in kernels.weighed) == (name not in ("with its gradient", "measure alone"))
         plain = tm.InBetween(bars.bases[:2], bars.faces)(*x, 0.3)
         assert float((found[0][0] - plain).abs().max()) > 1e-3 * float(plain.abs().max())
         for got, wanted, to in zip(*found, (1e-11, 1e-11, 1e-9), strict=True):
@@ -434,7 +439,11 @@ class TestLayers:
         assert float(found[1].abs()) > 0
         torch.testing.assert_close(*found, rtol=1e-8, atol=0)
 
-    @pytest.mark.parametrize("kind", [fibres(), fibres(weighted=False), Slopes], ids=["weights", "none", "angles"])
+    @pytest.mark.parametrize(
+        "kind",
+        [fibres(), fibres(weighted=False), Slopes, Anchored, WholeArea, WholeSlope, WholeAnchored],
+        ids=["weights", "none", "angles", "anchored", "total", "total of angles", "anchored total"],
+    )
     @torch.no_grad()
     def test_kernels_of_a_term_of_ones_own(self, case: Case, kind: type[Term]) -> None:
         """Energy, gradient and Hessian of one term are those of torch."""
@@ -442,14 +451,39 @@ class TestLayers:
         own = by_kernels_alone(energy, case.mesh)
         start, first, second, t, *_ = case.given
         rests = case.rests(first, second, t, torch.full((2, 1), 1e3, dtype=DOUBLE))
-        to, truth = own.reference(rests), TermsTowards(energy, rests.reference(energy))
-        found, wanted = KernelProblem(own, to).at(start.contiguous()), truth.at(start)
+        anchors = own.no_anchors(start) + torch.tensor([30.0, 20.0, 10.0], dtype=DOUBLE)
+        to, truth = own.reference(rests), TermsTowards(energy, rests.reference(energy), anchors)
+        found, wanted = KernelProblem(own, to, anchors).at(start.contiguous()), truth.at(start)
         torch.testing.assert_close(found.value + to.constant, wanted.value, rtol=1e-12, atol=0)
         assert_alike([found.gradient, found.diagonal], [wanted.gradient, wanted.diagonal], 1e-12)
         field, out = torch.randn_like(start).contiguous(), torch.zeros(start.shape, dtype=DOUBLE)
-        for each, factors in zip(own.passes, found.factors, strict=True):
-            each.launch("product", *start.shape[:2], field, 0, *factors, out, 0, None, 0)
+        own.add_products(field, found.factors, out)
+        swept = (found.normals * field).sum((2, 3), keepdim=True)
+        out += (found.stiffness[..., None, None] * swept * found.normals).sum(0)
         assert_alike([out], [wanted.product(field)], 1e-12)
+
+    @pytest.mark.parametrize("relax", [[4], [4, 4]], ids=["one step", "two"])
+    @pytest.mark.parametrize("n_open", [0, 6], ids=["closed", "open"])
+    def test_totals_and_anchors_by_kernels(self, small_bars: Shapes, n_open: int, relax: list[int]) -> None:
+        """Several beside the terms of Eq. 5; gradients in the shapes, times, stiffnesses and anchors."""
+        case = Case(small_bars, small_bars.faces[n_open:], 0.3)
+        kinds = Stretch(), Bend(), Volume(), WholeArea(), Anchored(), Volume(), WholeAnchored(point=(0.1, 0.5, 0.2))
+        energy = Energy(case.mesh, kinds)
+        own = by_kernels_alone(energy, case.mesh)
+        more = [torch.full((2, 1), size, dtype=DOUBLE) for size in (1e-2, 1e-2, 3e2, 1e-2)]
+        anchors = torch.tensor([[30.0, 20.0, 10.0], [-20.0, 40.0, 5.0]], dtype=DOUBLE).expand(2, 2, 3)
+        given = [*case.given, *more, anchors.clone()]
+
+        def by_warp(x: Tensor, *rests: Tensor) -> Tensor:
+            to = own.reference(case.rests(*rests[:-1]))
+            return _Relaxation(own, relax)(x, rests[-1], *to.records)[0]
+
+        def by_torch(x: Tensor, *rests: Tensor) -> Tensor:
+            terms = TermsTowards(energy, case.rests(*rests[:-1]).reference(energy), rests[-1])
+            return descend(SumOfEnergies([terms]), x, relax)
+
+        assert float((by_torch(*given) - case.by_torch(*case.given)).abs().max()) > 1e-2
+        assert_kernels(by_warp, by_torch, given, 1e-12 * CANONICAL_SIZE, 1e-9, False)
 
     def test_what_has_no_numbers_is_torchs(self, small_bars: Shapes) -> None:
         from torch._subclasses import FakeTensorMode

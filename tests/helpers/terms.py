@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torch_modal.elastic.bind import Scalar, Vector, Vectors, atan2, dot, rows, sqrt
+from torch_modal.elastic.bind import Scalar, Vector, Vectors, atan2, cross, dot, real, rows, sqrt
 from torch_modal.elastic.term import Mesh, PeriodicTerm, Term
 
 
@@ -114,3 +114,67 @@ class Slopes(PeriodicTerm):
 
     def elements(self, mesh: Mesh) -> Tensor:
         return mesh.edges
+
+
+def doubled_area(x: Vectors) -> Scalar:
+    normal = cross(x[0], x[1])
+    return sqrt(dot(normal, normal))
+
+
+def linearised_area(x: Vectors) -> tuple[Scalar, Vectors]:
+    normal = cross(x[0], x[1])
+    size = sqrt(dot(normal, normal))
+    return size, rows(cross(x[1], normal) / size, cross(normal, x[0]) / size)
+
+
+class WholeArea(Term):
+    """The area of the surface, also for kernels."""
+
+    total = True
+    formula, linearised = staticmethod(doubled_area), staticmethod(linearised_area)
+
+    def elements(self, mesh: Mesh) -> Tensor:
+        return mesh.faces
+
+
+class WholeSlope(PeriodicTerm):
+    """The sum of the slopes of some edges, as an angle."""
+
+    total = True
+    formula = staticmethod(edge_slope)
+
+    def elements(self, mesh: Mesh) -> Tensor:
+        return mesh.edges[:3]
+
+
+def mixed_product(x: Vectors) -> Scalar:
+    return dot(x[0], cross(x[1], x[2])) / real(100.0)
+
+
+def linearised_product(x: Vectors) -> tuple[Scalar, Vectors]:
+    first, second, third = cross(x[1], x[2]), cross(x[2], x[0]), cross(x[0], x[1])
+    return dot(x[0], first) / real(100.0), rows(first / real(100.0), second / real(100.0), third / real(100.0))
+
+
+class Anchored(Term):
+    """Tetrahedra of edges with the centre and a point, also for kernels."""
+
+    formula, linearised = staticmethod(mixed_product), staticmethod(linearised_product)
+
+    def __init__(self, stiffness: float | Tensor = 1.0, point: tuple[float, ...] = (0.3, 0.2, 0.1)) -> None:
+        super().__init__(stiffness)
+        self.register_buffer("points", torch.tensor([point], dtype=torch.float64))
+
+    @property
+    def anchors(self) -> Tensor:
+        return self.points
+
+    def elements(self, mesh: Mesh) -> Tensor:
+        further = torch.tensor([mesh.centre, mesh.first_anchor]).expand(len(mesh.edges), -1)
+        return torch.cat([mesh.edges, further], 1)
+
+
+class WholeAnchored(Anchored):
+    """The sum of these."""
+
+    total = True

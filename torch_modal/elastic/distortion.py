@@ -55,7 +55,8 @@ class Distortion(nn.Module):
         """The distortion of S shapes of each sample. *Shape of each:* ``(B, V, 3) -> (S, B)``."""
         total = self.of_shell(shapes, rests)
         if self.further is not None:
-            terms = TermsTowards.of_terms(self.further, range(N_SHELL_TERMS, len(rests.stiffness)), rests)
+            rests = rests._replace(stiffness=rests.stiffness[N_SHELL_TERMS:])
+            terms = TermsTowards(self.further, rests.reference(self.further), rests.anchors)
             total = total + torch.stack([terms.value(x) for x in shapes])
         return total
 

@@ -162,7 +162,8 @@ class Energy(nn.Module):
     def __init__(self, mesh: Mesh, terms: Sequence[Term], sampled: bool = False) -> None:
         super().__init__()
         n, elements = mesh.n_vertices, []
-        n_anchors = [0 if term.anchors is None else len(term.anchors) for term in terms]
+        #: Number of anchors of each term.
+        self.n_anchors = n_anchors = [0 if term.anchors is None else len(term.anchors) for term in terms]
         for term, more in zip(terms, n_anchors, strict=True):
             corners, last = term.elements(mesh), n + more
             lowest, highest = (float(corners.min()), float(corners.max())) if corners.numel() else (0, last)
@@ -331,6 +332,14 @@ class RestShapes(NamedTuple):
     """One of each term. *Shape of each:* ``(B, M)`` or ``(B, 1)``."""
     anchors: Tensor | None = None
     """Fixed points of the terms, where they have some. *Shape:* ``(B, P, 3)``."""
+
+    def of_terms(self, energy: Energy, numbers: Sequence[int]) -> "RestShapes":
+        """Stiffnesses and anchors of some terms of an energy, by their numbers."""
+        anchors = self.anchors
+        if anchors is not None:
+            each = anchors.split(energy.n_anchors, 1)
+            anchors = torch.cat([each[i] for i in numbers], 1)
+        return self._replace(stiffness=[self.stiffness[i] for i in numbers], anchors=anchors)
 
     def reference(self, energy: Energy, start: Tensor | None = None, relative: bool = False) -> Reference:
         """Merge the rest shapes into one reference of an energy, of the terms that the stiffnesses belong to.

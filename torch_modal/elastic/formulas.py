@@ -232,13 +232,18 @@ def volume_weight(volume: Scalar, area: Scalar) -> Scalar:
     return ONE / (size * size)
 
 
-def volume_of_sizes(x: Vectors) -> Scalar:
-    """The volume, of a volume and an area in a vector."""
+def sum_of_total(x: Vectors) -> Scalar:
+    """A total as one element for kernels: its vector consists of the sum of the measures and, of a volume, an area."""
     return x[0][0]
 
 
-def weight_of_sizes(x: Vectors, volume: Scalar, mean: Scalar) -> Scalar:
-    """:func:`volume_weight` of these."""
+def linearised_sum_of_total(x: Vectors) -> tuple[Scalar, Vectors]:
+    """:func:`sum_of_total` and its gradient, for kernels alone."""
+    return x[0][0], rows(triple(real(1.0), real(0.0), real(0.0)))  # type: ignore[arg-type]  # a vector there
+
+
+def weight_of_volume(x: Vectors, volume: Scalar, mean: Scalar) -> Scalar:
+    """:func:`volume_weight` of such an element."""
     return volume_weight(volume, x[0][1])
 
 

@@ -12,9 +12,8 @@ from torch import Tensor, nn
 
 from torch_modal.elastic.bend import NEEDLE, NEEDLE_OF_STEPS
 from torch_modal.elastic.energy import Energy, Reference, RestShapes
-from torch_modal.elastic.kernel_terms import KernelTerm, KernelVolume, Pass, passes_of
+from torch_modal.elastic.kernel_terms import KernelTerm, KernelTotal, Pass, passes_of
 from torch_modal.elastic.kernels.function import Operation
-from torch_modal.geometry.vectors import inverse
 
 Factors = Sequence[Sequence[Tensor | None]]
 """Factors of the term, and of the term that rides on it, of each pass. *Shape of each:* ``(B, M, f)``."""
@@ -33,12 +32,14 @@ class KernelPoint(NamedTuple):
     """Blocks of the convex Hessian's diagonal, packed, if wanted. *Shape:* ``(B, V, 6)``."""
     factors: Factors
     """Factors of the term and of the term that rides on it, for each pass. *Shape of each:* ``(B, M, f)``."""
-    normal: Tensor
-    """Gradient of the volume. *Shape:* ``(B, V, 3)``."""
-    moment: Tensor
-    """First derivative of the energy in the volume. *Shape:* ``(B,)``."""
+    sums: Tensor
+    """Totals, the first components of the second of two vertices. *Shape:* ``(T, B, 2, 3)``."""
+    forces: Tensor
+    """First derivatives of the energy in these. *Shape:* ``(T, B, 2, 3)``."""
+    normals: Tensor
+    """Gradients of the totals. *Shape:* ``(T, B, V, 3)``."""
     stiffness: Tensor
-    """Second derivative. *Shape:* ``(B,)``."""
+    """Second derivatives of the energy in the totals. *Shape:* ``(T, B)``."""
     extra: Callable[[Tensor], Tensor] | None = None
     """Products with the Hessian of further energies, whose values and derivatives are included above."""
 
@@ -59,15 +60,34 @@ class KernelEnergy(nn.Module):
         super().__init__()
         self.energy = energy
         self.parts: Any = nn.ModuleList(parts)
-        #: The number of the volume, if there is one.
-        self.volumes = [i for i, term in enumerate(parts) if isinstance(term, KernelVolume)]
         #: Numbers of the terms whose rest shapes are merged by kernels, and by torch.
         self.weighed = [i for i, term in enumerate(parts) if term.formulas.weight is not None]
         self.unweighed = [i for i in range(len(parts)) if i not in self.weighed]
         #: The terms in passes over elements, each alone or with another that rides on it.
-        self.passes: Sequence[Pass] = nn.ModuleList(passes_of(parts, energy.n_vertices))  # type: ignore[assignment]
+        self.passes: Sequence[Pass] = nn.ModuleList(passes_of(parts, energy.n_extended))  # type: ignore[assignment]
+        #: The totals, and passes over their one element.
+        self.sums = [term for term in parts if isinstance(term, KernelTotal)]
+        totals = [Pass((i, term)) for i, term in enumerate(parts) if isinstance(term, KernelTotal)]
+        self.totals: Sequence[Pass] = nn.ModuleList(totals)  # type: ignore[assignment]
+        #: True if the elements of passes have vertices beyond those of the mesh.
+        self.extends = any(one.term.extends for one in self.passes)
         #: True if kernels know the adjoints of all terms.
-        self.exact = all(part.formulas.exact for part in parts if not isinstance(part, KernelVolume))
+        self.exact = all(part.term.kernel_formulas(part.n).exact for part in parts)  # type: ignore[union-attr]
+
+    def extend(self, x: Tensor, anchors: Tensor | None = None) -> Tensor:
+        """:meth:`Energy.extend` in the layout of kernels. *Shape:* ``(B, V, 3)``."""
+        centre = x[:, self.energy.used].mean(1, keepdim=True)
+        return torch.cat([x, centre, self.no_anchors(x) if anchors is None else anchors], 1)
+
+    def no_anchors(self, x: Tensor) -> Tensor:
+        """Displacements of the anchors, or their places where they are unknown. *Shape:* ``(B, P, 3)``."""
+        return x.new_zeros(len(x), sum(self.energy.n_anchors), 3)
+
+    def fold(self, extended: Tensor, out: Tensor) -> Tensor:
+        """The adjoint of :meth:`extend`, which is added to values of the vertices. *Shape:* ``(B, V, 3)``."""
+        n, used = out.shape[1], self.energy.used
+        out.add_(extended[:, :n])
+        return out.index_add_(1, used, (extended[:, n : n + 1] / len(used)).expand(-1, len(used), -1))
 
     def reference(self, rests: RestShapes, start: Tensor | None = None, relative: bool = False) -> Reference:
         """Merge rest shapes into one reference (Eq. 8); arguments as :meth:`RestShapes.reference`."""
@@ -84,42 +104,50 @@ class KernelEnergy(nn.Module):
                 constant = constant + left
         return Reference(tuple(records[i] for i in range(len(self.parts))), constant)
 
-    def at(self, x: Tensor, to: Reference, order: int = 2) -> KernelPoint:
-        """Value, gradient from the order of 1 on, and convex Hessian from 2 on. *Shape:* ``(B, V, 3)``."""
-        energy, factors = x.new_zeros(len(x)), []
-        gradient = torch.zeros_like(x) if order > 0 else None
-        diagonal = x.new_zeros(*x.shape[:2], 6) if order > 1 else None
+    def at(self, x: Tensor, anchors: Tensor, to: Reference, order: int = 2) -> KernelPoint:
+        """Value, gradient from the order of 1 on, and convex Hessian from 2 on. *Shape:* ``(B, V, 3), (B, P, 3)``."""
+        (b, n), factors = x.shape[:2], []
+        energy, shapes = x.new_zeros(b), self.extend(x, anchors) if self.extends else x
+        gradient, diagonal = (
+            x.new_zeros(*shapes.shape[:2], size) if order > least else None for size, least in ((3, 0), (6, 1))
+        )
         for one in self.passes:
-            pass_factors = [x.new_empty(len(x), *size) if order > 1 and size else None for size in one.sizes]
+            pass_factors = [x.new_empty(b, *size) if order > 1 and size else None for size in one.sizes]
             records = to.records[one.number], None if one.other is None else to.records[one.other]
-            one.launch("linearise", len(x), x.shape[1], x, *records, energy, gradient, diagonal, *pass_factors)
+            one.launch("linearise", b, shapes.shape[1], shapes, *records, energy, gradient, diagonal, *pass_factors)
             factors.append(pass_factors)
-        if self.volumes:
-            number = self.volumes[0]
-            sizes, normal = self.parts[number].at(x, order > 0)
-            weight, value = to.records[number][:, 0].unbind(1)
-            stiffness = 2 * weight
-            off = sizes[:, 1, 0] - value
-            moment = stiffness * off
-            energy = torch.addcmul(energy, moment, off, value=0.5)
+        if self.extends and gradient is not None:
+            gradient = self.fold(gradient, torch.zeros_like(x))
+            diagonal = None if diagonal is None else diagonal[:, :n].contiguous()
+        sums, forces, normals = (x.new_zeros(len(self.totals), b, size, 3) for size in (2, 2, n if order > 0 else 0))
+        blocks, own_factors = x.new_empty(b, 2, 6) if order > 1 else None, x.new_empty(len(self.totals), b, 1, 5)
+        for i, (one, total) in enumerate(zip(self.totals, self.sums, strict=True)):
+            shapes, extended = self.extend(x, anchors) if total.extends else x, normals[i] if order > 0 else None
+            if total.extends and order > 0:
+                extended = torch.zeros_like(shapes)
+            total.sum(b, shapes.shape[1], shapes, sums[i], extended)
+            if extended is not None and total.extends:
+                self.fold(extended, normals[i])
+            derivatives = (forces[i] if order > 0 else None), blocks, (own_factors[i] if order > 1 else None)
+            one.launch("linearise", b, 2, sums[i], to.records[one.number], None, energy, *derivatives, None)
             if gradient is not None:
-                gradient.addcmul_(moment[:, None, None], normal)
-        else:
-            normal = torch.zeros_like(x)
-            moment = stiffness = torch.zeros_like(energy)
-        return KernelPoint(energy, gradient, diagonal, factors, normal, moment, stiffness)  # type: ignore[arg-type]
+                gradient.addcmul_(forces[i, :, 1:, :1], normals[i])
+        stiffness = own_factors[:, :, 0, 3].contiguous()  # along the gradient
+        return KernelPoint(energy, gradient, diagonal, factors, sums, forces, normals, stiffness)  # type: ignore[arg-type]
 
     def back(
         self,
         x: Tensor,
+        anchors: Tensor,
         at: KernelPoint,
         to: Reference,
         to_gradient: Tensor,
         to_x: Tensor,
+        to_anchors: Tensor,
         to_records: Sequence[Tensor],
         to_diagonal: Tensor | None = None,
         to_factors: Factors | None = None,
-        to_normal: Tensor | None = None,
+        to_normals: Tensor | None = None,
         to_stiffness: Tensor | None = None,
         to_energy: Tensor | None = None,
     ) -> None:
@@ -127,41 +155,81 @@ class KernelEnergy(nn.Module):
 
         Args:
             x: The shapes. *Shape:* ``(B, V, 3)``.
+            anchors: Fixed points of the terms. *Shape:* ``(B, P, 3)``.
             at: The energy there.
             to: The references.
             to_gradient: In the gradient. *Shape:* ``(B, V, 3)``.
             to_x: Is added to. *Shape:* ``(B, V, 3)``.
+            to_anchors: Is added to. *Shape:* ``(B, P, 3)``.
             to_records: Are added to.
             to_diagonal: In the blocks of the diagonal. *Shape:* ``(B, V, 6)``.
             to_factors: In the factors of products.
-            to_normal: In the volume's gradient beyond that. *Shape:* ``(B, V, 3)``.
-            to_stiffness: In the volume's stiffness. *Shape:* ``(B,)``.
+            to_normals: In the gradients of totals beyond that. *Shape:* ``(T, B, V, 3)``.
+            to_stiffness: In the stiffnesses of totals. *Shape:* ``(T, B)``.
             to_energy: In the energy. *Shape:* ``(B,)``.
         """
-        b, n = x.shape[:2]
+        (b, n), extends = x.shape[:2], self.extends
+        shapes, to_shapes, to_forces = x, to_x, to_gradient
+        if extends:
+            shapes, to_forces = self.extend(x, anchors), self.extend(to_gradient)
+            to_shapes = torch.zeros_like(shapes)
+            if to_diagonal is not None:
+                to_diagonal = nn.functional.pad(to_diagonal, (0, 0, 0, shapes.shape[1] - n))
         for one, factors, received in zip(self.passes, at.factors, to_factors or at.factors, strict=True):
             records, to_own = (
                 (each[one.number], None if one.other is None else each[one.other]) for each in (to.records, to_records)
             )
-            values = n, x, *records, at.value, at.gradient, at.diagonal, *factors
-            adjoints = None, to_x, *to_own, to_energy, to_gradient, to_diagonal, *received
+            # Of results, adjoints read no values, only which are wanted.
+            values = shapes.shape[1], shapes, *records, at.value, to_forces, to_diagonal, *factors
+            adjoints = None, to_shapes, *to_own, to_energy, to_forces, to_diagonal, *received
             one.launch("linearise", b, *values, adjoints=adjoints)
-        if not self.volumes:
-            return
-        i = self.volumes[0]
-        to_moment = (to_gradient * at.normal).sum((1, 2))
-        off = at.moment * inverse(at.stiffness, at.stiffness <= 0)
-        to_volume, to_weight = at.stiffness * to_moment, 2 * off * to_moment
-        if to_stiffness is not None:  # twice the weight
-            to_weight = to_weight + 2 * to_stiffness
-        if to_energy is not None:
-            to_volume, to_weight = to_volume + at.moment * to_energy, to_weight + off**2 * to_energy
-        to_whole_normal = at.moment[:, None, None] * to_gradient
-        to_whole_normal = to_whole_normal if to_normal is None else to_whole_normal.add_(to_normal)
-        to_sizes = x.new_zeros(b, 2, 3)
-        to_sizes[:, 1, 0] = to_volume
-        self.parts[i].back(x, to_sizes, to_whole_normal, to_x)
-        to_records[i].add_(torch.stack([to_weight, -to_volume], -1)[:, None])
+        if extends:
+            self._extend_back(to_shapes, to_x, to_anchors)
+        for i, (one, total) in enumerate(zip(self.totals, self.sums, strict=True)):
+            to_sums, to_force = torch.zeros_like(at.sums[i]), torch.zeros_like(at.forces[i])
+            to_force[:, 1, 0] = (to_gradient * at.normals[i]).sum((1, 2))
+            known = 2, at.sums[i], to.records[one.number], None, at.value, at.forces[i], None, None, None
+            received = None, to_sums, to_records[one.number], None, to_energy, to_force, None, None, None
+            one.launch("linearise", b, *known, adjoints=received)
+            if to_stiffness is not None:  # twice the weight, the first row of a record
+                to_records[one.number][:, 0, 0].add_(to_stiffness[i], alpha=2)
+            to_normal = at.forces[i, :, 1:, :1] * to_gradient
+            if to_normals is not None:
+                to_normal.add_(to_normals[i])
+            if total.extends:
+                shapes = self.extend(x, anchors)
+                to_shapes = torch.zeros_like(shapes)
+                total.back(shapes, to_sums, self.extend(to_normal), to_shapes)
+                self._extend_back(to_shapes, to_x, to_anchors)
+            else:
+                total.back(x, to_sums, to_normal, to_x)
+
+    def _extend_back(self, to_shapes: Tensor, to_x: Tensor, to_anchors: Tensor) -> None:
+        """The adjoint of :meth:`extend`, which is added."""
+        self.fold(to_shapes, to_x)
+        to_anchors.add_(to_shapes[:, to_x.shape[1] + 1 :])
+
+    def add_products(self, field: Tensor, factors: Factors, out: Tensor, scalars: Tensor | None = None) -> None:
+        """Products with the convex Hessian but for the totals' parts, and their scalars. *Shape:* ``(B, V, 3)``."""
+        fields = self.extend(field) if self.extends else field
+        products = torch.zeros_like(fields) if self.extends else out
+        for one, own in zip(self.passes, factors, strict=True):
+            one.launch("product", len(field), fields.shape[1], fields, *own, products, scalars)
+        if self.extends:
+            self.fold(products, out)
+
+    def add_products_back(
+        self, field: Tensor, factors: Factors, to_field: Tensor, to_factors: Factors, to_out: Tensor, to_scalars: Tensor
+    ) -> None:
+        """Adjoint of :meth:`add_products`: adds the gradients in the field and the factors."""
+        fields, received = (self.extend(each) if self.extends else each for each in (field, to_out))
+        to_fields = torch.zeros_like(fields) if self.extends else to_field
+        for one, own, to_own in zip(self.passes, factors, to_factors, strict=True):
+            values = fields.shape[1], fields, *own, received, to_scalars
+            adjoints = None, to_fields, *to_own, received, to_scalars
+            one.launch("product", len(field), *values, adjoints=adjoints)
+        if self.extends:
+            self.fold(to_fields, to_field)
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,7 +259,8 @@ class _MergeRests(Operation[Seen]):
         shapes, records = tensors[0], []
         constant = shapes.new_zeros(len(shapes))
         for i, term in enumerate(self.parts):
-            seen = term.shapes_to_merge(shapes.flatten(0, 1))
+            x = shapes.flatten(0, 1)
+            seen = term.shapes_to_merge(self.energy.extend(x) if term.extends else x)
             n_rows = 6 if term.formulas.periodic else 2  # formulas.periodic_record, square_record
             records.append(shapes.new_empty(len(shapes), term.n_elements, n_rows))
             term.launch("merge", len(shapes), *self._arguments(i, seen, tensors), records[i], constant)
@@ -203,15 +272,19 @@ class _MergeRests(Operation[Seen]):
         if not kept:
             self.run(kept, *tensors)
         gradients = tuple(torch.zeros_like(each) for each in tensors)
-        to_shapes = gradients[0].flatten(0, 1)
+        x, to_x = tensors[0].flatten(0, 1), gradients[0].flatten(0, 1)
         for i, term in enumerate(self.parts):
-            to_seen = torch.zeros_like(kept[i][0]) if isinstance(term, KernelVolume) else to_shapes
+            shapes = self.energy.extend(x) if term.extends else x
+            to_shapes = torch.zeros_like(shapes) if term.extends else to_x
+            to_seen = torch.zeros_like(kept[i][0]) if isinstance(term, KernelTotal) else to_shapes
             values = *self._arguments(i, kept[i], tensors), torch.empty_like(grads[i]), torch.empty_like(grads[-1])
             _, _, to_weights, _, to_stiffness, to_start, *sizes = self._arguments(i, (to_seen, None), gradients)
             adjoints = None, to_seen, to_weights, None, to_stiffness, to_start, *[None] * len(sizes), grads[i]
             term.launch("merge", len(tensors[0]), *values, adjoints=adjoints)
-            if isinstance(term, KernelVolume):
-                term.back(tensors[0].flatten(0, 1), to_seen, None, to_shapes)
+            if isinstance(term, KernelTotal):
+                term.back(shapes, to_seen, None, to_shapes)
+            if term.extends:
+                self.energy.fold(to_shapes, to_x)
         return gradients
 
     def by_torch(self, *tensors: Tensor) -> tuple[Tensor, ...]:

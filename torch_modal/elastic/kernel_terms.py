@@ -7,7 +7,8 @@ import torch
 from torch import Tensor, nn
 
 from torch_modal.autograd import is_eager
-from torch_modal.elastic.energy import AssembledTerm, Energy
+from torch_modal.elastic import formulas
+from torch_modal.elastic.energy import AssembledTerm
 from torch_modal.elastic.kernels.launch import kernels, launch, of_elements
 from torch_modal.elastic.term import Formulas, Mesh, Term
 from torch_modal.elastic.volume import Volume
@@ -19,106 +20,120 @@ class KernelTerm(nn.Module):
 
     Args:
         part: The term.
-        elements: The elements of the kernels; by default the elements of the term. *Shape:* ``(M, n)``.
+        mesh: The mesh.
     """
 
     elements: Tensor
     term: Term
 
-    def __init__(self, part: AssembledTerm, elements: Tensor | None = None) -> None:
+    def __init__(self, part: AssembledTerm, mesh: Mesh) -> None:
         super().__init__()
         self.part, self.n = part, len(part.corners) - 1
         self.__dict__["term"] = part.term  # not registered here: the layer owns it
-        elements = part.corners.T if elements is None else elements
-        self.register_buffer("elements", elements.int().contiguous(), persistent=False)
-        self.n_elements = len(elements)
+        self.register_buffer("elements", part.corners.T.int().contiguous(), persistent=False)
+        self.n_elements = self.elements.shape[0]
+        #: True if elements have vertices beyond those of the mesh.
+        self.extends = bool((part.corners >= mesh.n_vertices).any())
 
     def __getstate__(self) -> dict[str, object]:
         """Without formulas, which are no data."""
-        return {name: value for name, value in self.__dict__.items() if name != "formulas"}
+        return {name: value for name, value in self.__dict__.items() if name not in ("formulas", "formulas_of_sum")}
 
     @cached_property
     def formulas(self) -> Formulas:
         """The formulas that kernels are made from."""
-        return self.term.kernel_formulas(self.n)  # type: ignore[return-value]  # :func:`by_kernels` has seen them
+        return self.term.kernel_formulas(self.n)  # type: ignore[return-value]  # :func:`serves` has seen them
 
     def launch(self, name: str, dim: int, *arguments: object, adjoints: Sequence[object] = ()) -> None:
         """Run a kernel over the elements of so many samples, or its adjoint."""
-        kernel = of_elements("merging", name, self.formulas)
+        kernel = of_elements("totals" if name == "total" else "merging", name, self.formulas)
         launch(kernel, (dim, self.n_elements), [self.elements, *arguments], adjoints and [None, *adjoints])
 
     def shapes_to_merge(self, shapes: Tensor) -> tuple[Tensor, Tensor | None]:
         """The shapes that elements are merged of, and all measures together, where their mean counts.
 
-        *Shape:* ``(N, V, 3) -> (N, n, 3), (N,)``.
+        *Shape:* ``(N, V, 3) -> (N, n, 3), (N, 2, 3)``.
         """
         if not self.formulas.uses_mean:
             return shapes, None
-        total = shapes.new_zeros(len(shapes))
-        self.launch("total", len(shapes), shapes.shape[1], shapes, total)
-        return shapes, total
+        sizes = shapes.new_zeros(len(shapes), 2, 3)
+        self.launch("total", len(shapes), shapes.shape[1], shapes, sizes, None)
+        return shapes, sizes
 
 
-class KernelVolume(KernelTerm):
-    """The volume of a mesh, by kernels; rest shapes are merged as elements of volume and area.
+class KernelTotal(KernelTerm):
+    """A total by kernels: one element, which begins at zero, and whose vector consists of the sum of the measures.
 
-    Shapes of an open surface are extended by their centre, which cones join to the boundary.
-
-    Args:
-        part: The term.
-        mesh: The mesh.
-        used: Vertices of faces.
+    Arguments as for the base class.
     """
 
-    faces: Tensor
-    used: Tensor
+    summands: Tensor
 
-    def __init__(self, part: AssembledTerm, mesh: Mesh, used: Tensor) -> None:
-        super().__init__(part, torch.tensor([[0, 1]]))
-        chain = torch.tensor(mesh.connectivity.boundary_chain)
-        self.closed, self.n_faces = len(chain) == 0, len(mesh.faces)
-        cones = torch.cat([chain.flip(1), torch.full_like(chain[:, :1], mesh.centre)], 1)
-        self.register_buffer("faces", torch.cat([mesh.faces, cones]).int(), persistent=False)
-        self.register_buffer("used", used, persistent=False)
+    def __init__(self, part: AssembledTerm, mesh: Mesh) -> None:
+        super().__init__(part, mesh)
+        self.register_buffer("summands", self.elements, persistent=False)
+        self.register_buffer("elements", torch.tensor([[0, 1]]).int(), persistent=False)
+        self.n_elements = 1
 
-    def extend(self, x: Tensor) -> Tensor:
-        """The vertices, and of an open surface the mean of the vertices of faces. *Shape:* ``(B, V, 3)``."""
-        return x if self.closed else torch.cat([x, x[:, self.used].mean(1, keepdim=True)], 1)
+    @cached_property
+    def formulas(self) -> Formulas:
+        """Overrides the base class: formulas of the one element."""
+        own: Formulas = self.term.kernel_formulas(self.n)  # type: ignore[assignment]
+        name = "total_of_angles" if own.periodic else "total"
+        made = formulas.sum_of_total, formulas.linearised_sum_of_total, own.weight
+        return Formulas(name, 1, *made, periodic=own.periodic)
 
-    def fold(self, extended: Tensor) -> Tensor:
-        """The adjoint of :meth:`extend`."""
-        if self.closed:
-            return extended
-        share = extended[:, -1:] / len(self.used)
-        return extended[:, :-1].index_add(1, self.used, share.expand(-1, len(self.used), -1))
+    @cached_property
+    def formulas_of_sum(self) -> Formulas:
+        """The formulas of the measures that are added up."""
+        own: Formulas = self.term.kernel_formulas(self.n)  # type: ignore[assignment]
+        return own._replace(weight=None, periodic=False)
 
-    def at(self, x: Tensor, gradient: bool = False, area: bool = False) -> tuple[Tensor, Tensor | None]:
-        """Volumes, and areas if wanted, as the first two components of the second vertex of an element.
+    def sum(self, dim: int, *arguments: object, area: bool = False, adjoints: Sequence[object] = ()) -> None:
+        """Run the kernel that adds up the measures, or its adjoint.
 
-        Returns:
-            *Shape:* ``(B, 2, 3)``; the gradients of the volumes if wanted, *shape* ``(B, V, 3)``.
+        Args:
+            dim: Number of shapes.
+            arguments: Number of their vertices; shapes, *shape* ``(N, V, 3)``; sums, *shape* ``(N, 2, 3)``; gradients
+                of these or None, *shape* ``(N, V, 3)``.
+            area: True to add the area, too, where the weight depends on it.
+            adjoints: Gradients of the arguments.
         """
-        extended, sizes = self.extend(x), x.new_zeros(len(x), 2, 3)
-        normal = torch.zeros_like(extended) if gradient else None
-        arguments = [self.faces, extended.shape[1], extended, sizes, self.n_faces if area else 0, normal]
-        launch(kernels("volume").sizes, (len(x), len(self.faces)), arguments)
-        return sizes, None if normal is None else self.fold(normal)
+        kernel = of_elements("totals", "total", self.formulas_of_sum)
+        launch(kernel, (dim, len(self.summands)), [self.summands, *arguments], adjoints and [None, *adjoints])
 
     def shapes_to_merge(self, shapes: Tensor) -> tuple[Tensor, Tensor | None]:
         """Overrides the base class."""
-        return self.at(shapes, area=True)
+        sizes = shapes.new_zeros(len(shapes), 2, 3)
+        self.sum(len(shapes), shapes.shape[1], shapes, sizes, None, area=True)
+        return sizes, None
 
     def back(self, x: Tensor, to_sizes: Tensor, to_normal: Tensor | None, to_x: Tensor) -> None:
-        """Adjoint of :meth:`at`: adds the gradient."""
-        extended = self.extend(x)
-        to_extended = to_x if self.closed else torch.zeros_like(extended)
-        to_normal = None if to_normal is None else self.extend(to_normal)
+        """Adjoint of the sum and its gradient: adds the gradient in the shapes."""
         normal = None if to_normal is None else torch.empty_like(to_normal)
-        values = [self.faces, extended.shape[1], extended, torch.empty_like(to_sizes), self.n_faces, normal]
-        adjoints = [None, None, to_extended, to_sizes, None, to_normal]
-        launch(kernels("volume").sizes, (len(x), len(self.faces)), values, adjoints)
-        if not self.closed:
-            to_x.add_(self.fold(to_extended))
+        values, adjoints = [x.shape[1], x, torch.empty_like(to_sizes), normal], [None, to_x, to_sizes, to_normal]
+        self.sum(len(x), *values, area=True, adjoints=adjoints)
+
+
+class KernelVolume(KernelTotal):
+    """The volume of a mesh, by kernels.
+
+    Cones join the boundary of an open surface to its centre. Arguments as for the base class.
+    """
+
+    formulas = KernelTerm.formulas
+
+    def __init__(self, part: AssembledTerm, mesh: Mesh) -> None:
+        super().__init__(part, mesh)
+        chain, centre = torch.tensor(mesh.connectivity.boundary_chain), mesh.centre
+        self.n_faces, self.extends = self.summands.shape[0], len(chain) > 0
+        cones = torch.cat([chain.flip(1), torch.full_like(chain[:, :1], centre)], 1)
+        self.summands = torch.cat([mesh.faces, cones]).int()
+
+    def sum(self, dim: int, *arguments: object, area: bool = False, adjoints: Sequence[object] = ()) -> None:
+        """Overrides the base class."""
+        values = [self.summands, *arguments, self.n_faces if area else 0]
+        launch(kernels("volume").sizes, (dim, len(self.summands)), values, adjoints and [None, *adjoints])
 
 
 def volumes_by_kernel(x: Tensor, faces: Tensor) -> Tensor:
@@ -127,23 +142,21 @@ def volumes_by_kernel(x: Tensor, faces: Tensor) -> Tensor:
         return volumes_of(x, faces)
     shapes = x.detach().double().flatten(0, -3).contiguous()
     sizes = shapes.new_zeros(len(shapes), 2, 3)
-    arguments = [faces, shapes.shape[1], shapes, sizes, 0, None]
+    arguments = [faces, shapes.shape[1], shapes, sizes, None, 0]
     launch(kernels("volume").sizes, (len(shapes), len(faces)), arguments)
     return sizes[:, 1, 0].view(x.shape[:-2]).to(x)
 
 
-def by_kernels(energy: Energy, mesh: Mesh) -> list[KernelTerm | None]:
-    """The terms of an energy by kernels; None for one that torch computes: all but one volume, for example."""
-    terms: list[KernelTerm | None] = []
-    for summand in energy.parts:
-        n = len(summand.corners) - 1
-        if type(summand.term) is Volume and not any(isinstance(each, KernelVolume) for each in terms):
-            terms.append(KernelVolume(summand, mesh, energy.used))
-            continue
-        fits = summand.term.anchors is None and 1 <= n <= 3 and bool((summand.corners < mesh.n_vertices).all())
-        serves = fits and not energy.sampled and summand.term.kernel_formulas(n) is not None
-        terms.append(KernelTerm(summand) if serves else None)
-    return terms
+def serves(part: AssembledTerm) -> bool:
+    """True for a term that kernels compute."""
+    n = len(part.corners) - 1
+    return n <= 3 and part.term.kernel_formulas(n) is not None
+
+
+def by_kernels(part: AssembledTerm, mesh: Mesh) -> KernelTerm:
+    """A term by kernels."""
+    kind = KernelVolume if type(part.term) is Volume else KernelTotal if part.term.total else KernelTerm
+    return kind(part, mesh)
 
 
 class Pass(nn.Module):
@@ -185,8 +198,8 @@ class Pass(nn.Module):
 
 
 def passes_of(parts: Sequence[KernelTerm], n_vertices: int) -> list[Pass]:
-    """The terms but the volume in as few passes as may be: edges ride on elements that begin with them."""
-    terms = [(i, part) for i, part in enumerate(parts) if not isinstance(part, KernelVolume)]
+    """The terms but totals in as few passes as may be: edges ride on elements that begin with them."""
+    terms = [(i, part) for i, part in enumerate(parts) if not isinstance(part, KernelTotal)]
     ends = torch.tensor([n_vertices, 1])
     for edges in (term for term in terms if term[1].formulas.even):
         keys = edges[1].elements.long().sort(1)[0] @ ends

@@ -251,12 +251,6 @@ class TermsTowards:
         self.energy, self.reference = energy, reference
         self.anchors = None if anchors is None else anchors.movedim(-1, 0)
 
-    @classmethod
-    def of_terms(cls, energy: Energy, numbers: Sequence[int], rests: RestShapes) -> "TermsTowards":
-        """Some of the terms of rest shapes, by their numbers."""
-        some_rests = rests._replace(stiffness=[rests.stiffness[i] for i in numbers])
-        return cls(energy, some_rests.reference(energy), rests.anchors)
-
     def _extend(self, x: Tensor) -> Tensor:
         return self.energy.extend(x.movedim(-1, 0), self.anchors)
 

@@ -215,7 +215,7 @@ class Term(nn.Module):
             getattr(type(self), each) is not getattr(kind, each)
             for each in ("energies", "derivatives", "measure", "measures", "linearise", *fixed)
         )
-        if self.formula is None or self.total or any(overridden):
+        if self.formula is None or any(overridden):
             return None
         name = f"{type(self).__module__}.{type(self).__qualname__}"
         merged = ("weights", "at_rest", "merge_rests", "softening")

@@ -18,8 +18,9 @@ class Volume(Term):
 
     total = True
     formula, linearised = staticmethod(formulas.tetrahedron), staticmethod(formulas.linearised_tetrahedron)
-    own_formulas = Formulas("volume", 1, formulas.volume_of_sizes, weight=formulas.weight_of_sizes)
-    """Of elements whose edge vector consists of volume and area."""
+    own_formulas = Formulas(
+        "volume", 1, formulas.sum_of_total, formulas.linearised_sum_of_total, weight=formulas.weight_of_volume
+    )
 
     def elements(self, mesh: Mesh) -> Tensor:
         """The centre and each face."""

@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from torch_modal.elastic.kernels.measures import functions_of
-from torch_modal.elastic.kernels.types import block, place, real, symmetric, vec3
+from torch_modal.elastic.kernels.types import block, place, real, symmetric, vec2, vec3
 from torch_modal.elastic.term import Formulas
 
 
@@ -223,14 +223,11 @@ def _product(f: Formulas, rider: Formulas | None) -> "wp.Kernel":
 
     @kernel
     def product(
-        elements: wp.array[corners], own: wp.array[wp.int32], n_own: int, n_vertices: int, fields: wp.array[vec3],
-        start: int, factors: wp.array[Factors], other_factors: wp.array[other.Factors], out: wp.array[vec3],
-        out_start: int, scalars: wp.array[vec3], first: int, threads: int,
+        elements: wp.array[corners], own: wp.array[wp.int32], n_own: int, n_vertices: int, field: wp.array[vec3],
+        factors: wp.array[Factors], other_factors: wp.array[other.Factors], out: wp.array[vec3],
+        scalars: wp.array[vec2], threads: int,
     ):  # fmt: skip
-        """The convex Hessian times a field, and the field times that, the third of the scalars, where there are some.
-
-        Fields, results and scalars begin at the given places of their arrays.
-        """
+        """The convex Hessian times a field, and the field times that, the second of the scalars, if wanted."""
         i = wp.tid()
         s = i // threads
         total = real(0.0)
@@ -239,7 +236,7 @@ def _product(f: Formulas, rider: Formulas | None) -> "wp.Kernel":
             at = k
             if own:
                 at = own[place(k, 0)]
-            e = edge_vectors(fields, start + s * n_vertices, q)
+            e = edge_vectors(field, s * n_vertices, q)
             ridden = vec3()
             form = real(0.0)
             if wp.static(rides):
@@ -250,8 +247,8 @@ def _product(f: Formulas, rider: Formulas | None) -> "wp.Kernel":
                 received, form = c.product(factors[place(s * n_own, at)], e)
                 total += form
             received[0] += ridden
-            add(out, out_start + s * n_vertices, q, received)
+            add(out, s * n_vertices, q, received)
         if scalars:
-            wp.atomic_add(scalars, first + s, vec3(real(0.0), real(0.0), total))
+            wp.atomic_add(scalars, s, vec2(real(0.0), total))
 
     return product

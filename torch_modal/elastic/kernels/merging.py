@@ -35,15 +35,15 @@ def _merging(f: Formulas) -> SimpleNamespace:
         return result
 
     @wp.func
-    def mean_of(whole: wp.array[real], r: int, n_elements: int):
+    def mean_of(whole: wp.array[vec3], r: int, n_elements: int):
         result = real(0.0)
         if whole:
-            result = whole[r] / real(n_elements)
+            result = whole[2 * r + 1][0] / real(n_elements)
         return result
 
     @wp.func
     def merge(
-        x: wp.array[vec3], n_vertices: int, q: corners, weights: wp.array[real], whole: wp.array[real],
+        x: wp.array[vec3], n_vertices: int, q: corners, weights: wp.array[real], whole: wp.array[vec3],
         n_elements: int, altitude: real, relative: int, first: int, last: int,
     ):  # fmt: skip
         """Sums over rest shapes, and their mean fullness if wanted."""
@@ -64,14 +64,13 @@ def _merging(f: Formulas) -> SimpleNamespace:
 def kernels_of(f: Formulas) -> SimpleNamespace:
     """Kernels that merge the rest shapes of a term into records (Eq. 8)."""
     c, potential, module = common(f), functions_of(f).potential, module_of(f, "forward")
-    measure = functions_of(f).measure
     corners, edge_vectors, record = c.corners, c.edge_vectors, potential.record
     kernel, merging = kernel_of(f, module), _merging(f)
     fullness, softness, merge_rests = merging.fullness, merging.softness, merging.merge
 
     @kernel
     def merge(
-        elements: wp.array[corners], n_vertices: int, x: wp.array[vec3], weights: wp.array[real], whole: wp.array[real],
+        elements: wp.array[corners], n_vertices: int, x: wp.array[vec3], weights: wp.array[real], whole: wp.array[vec3],
         stiffness: wp.array[real], start: wp.array[vec3], altitude: real, relative: int, n_shapes: int,
         n_stiffness: int, out: wp.array[record], constant: wp.array[real], threads: int,
     ):  # fmt: skip
@@ -93,19 +92,4 @@ def kernels_of(f: Formulas) -> SimpleNamespace:
             out[place(s * elements.shape[0], k)] = to
         wp.atomic_add(constant, s, left)
 
-    if not f.uses_mean:
-        return SimpleNamespace(merge=merge)
-
-    @kernel
-    def total(
-        elements: wp.array[corners], n_vertices: int, x: wp.array[vec3], out: wp.array[real], threads: int,
-    ):  # fmt: skip
-        """All measures together."""
-        i = wp.tid()
-        s = i // threads
-        moments_sum = real(0.0)
-        for k in range(i - s * threads, elements.shape[0], threads):
-            moments_sum += measure(edge_vectors(x, s * n_vertices, elements[place(k, 0)]))
-        wp.atomic_add(out, s, moments_sum)
-
-    return SimpleNamespace(merge=merge, total=total)
+    return SimpleNamespace(merge=merge)

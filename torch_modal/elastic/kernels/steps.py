@@ -1,14 +1,14 @@
 """Conjugate gradients for the steps of all vertices, preconditioned by the vertices' blocks.
 
-The scalars of an iteration are the inner product of its residual, the volume that its direction sweeps, and the inner
-product of the direction with the Hessian's product but for the volume's part. Adjoints need the fields of all
-iterations.
+The scalars of an iteration are the inner product of its residual, and that of its direction with the Hessian's product
+but for the totals' parts. Of each total, these are its stiffness times its gradient times the change along the
+direction, which is swept. Gradients of totals, stiffnesses and changes are rows of one total after the other.
 """
 
 import warp as wp
 
 from torch_modal.elastic import steps as relax
-from torch_modal.elastic.kernels.types import multiply, place, real, symmetric, vec3
+from torch_modal.elastic.kernels.types import multiply, place, real, symmetric, vec2, vec3
 
 RIDGE = wp.constant(real(relax.RIDGE))
 
@@ -41,89 +41,98 @@ def quotient(a: real, b: real):
 
 
 @wp.func
-def form_of(sums: vec3, stiffness: real):
-    """The inner product of a direction with its product, with the volume's part."""
-    return sums[2] + stiffness * sums[1] * sums[1]
+def form_of_totals(stiffness: wp.array[real], swept: wp.array[real], n_samples: int, s: int):
+    """The totals' part of the inner product of a direction with its product.
+
+    A function, as below: adjoints of kernels take results of their own loops for those before the loops.
+    """
+    result = real(0.0)
+    for t in range(stiffness.shape[0] // n_samples):
+        at = place(t * n_samples, s)
+        result += stiffness[at] * swept[at] * swept[at]
+    return result
 
 
 @wp.func
-def row(kind: int, k: int, n_kept: int, n_samples: int, s: int, n: int):
-    """Start of a sample's residual (0), direction (1) or product (2) of an iteration; all share one if one is kept."""
-    return ((kind * n_kept + k % n_kept) * n_samples + s) * n
+def push_of_totals(
+    normals: wp.array[vec3], stiffness: wp.array[real], swept: wp.array[real], n_all: int, v: int, n_samples: int,
+    s: int,
+):  # fmt: skip
+    """The totals' part of a product at a vertex."""
+    result = vec3()
+    for t in range(stiffness.shape[0] // n_samples):
+        at = place(t * n_samples, s)
+        result += (stiffness[at] * swept[at]) * normals[place(t * n_all, v)]
+    return result
 
 
 @wp.kernel(enable_backward=False)
 def begin(
-    gradient: wp.array[vec3], normal: wp.array[vec3], diagonal: wp.array[symmetric], n_samples: int, n_kept: int,
-    n: int, inverse: wp.array[symmetric], fields: wp.array[vec3], scalars: wp.array[vec3], threads: int,
+    gradient: wp.array[vec3], normals: wp.array[vec3], diagonal: wp.array[symmetric], n: int,
+    inverse: wp.array[symmetric], residual: wp.array[vec3], direction: wp.array[vec3], product: wp.array[vec3],
+    scalars: wp.array[vec2], swept: wp.array[real], threads: int,
 ):  # fmt: skip
     """The inverse of the diagonal, and the first residual and direction."""
     i = wp.tid()
     s = i // threads
-    residual = row(0, 0, n_kept, n_samples, s, n)
-    direction = row(1, 0, n_kept, n_samples, s, n)
-    product = row(2, 0, n_kept, n_samples, s, n)
-    products = vec3()
+    n_all = gradient.shape[0]
+    size = real(0.0)
     for k in range(i - s * threads, n, threads):
         v = place(s * n, k)
         r = -gradient[v]
         block = invert(diagonal[v])
         z = multiply(block, r)
         inverse[v] = block
-        fields[place(residual, k)] = r
-        fields[place(direction, k)] = z
-        fields[place(product, k)] = vec3()
-        products += vec3(wp.dot(r, z), wp.dot(normal[v], z), real(0.0))
-    wp.atomic_add(scalars, s, products)
+        residual[v] = r
+        direction[v] = z
+        product[v] = vec3()
+        size += wp.dot(r, z)
+        for t in range(normals.shape[0] // n_all):
+            wp.atomic_add(swept, place(t * (n_all // n), s), wp.dot(normals[place(t * n_all, v)], z))
+    wp.atomic_add(scalars, s, vec2(size, real(0.0)))
 
 
 @wp.kernel(enable_backward=False)
 def advance(
-    normal: wp.array[vec3], inverse: wp.array[symmetric], stiffness: wp.array[real], m: int, n_kept: int, n: int,
-    fields: wp.array[vec3], scalars: wp.array[vec3], solution: wp.array[vec3], threads: int,
+    normals: wp.array[vec3], inverse: wp.array[symmetric], stiffness: wp.array[real], n: int,
+    residual: wp.array[vec3], direction: wp.array[vec3], product: wp.array[vec3], scalars: wp.array[vec2],
+    swept: wp.array[real], next_residual: wp.array[vec3], next_scalars: wp.array[vec2], solution: wp.array[vec3],
+    threads: int,
 ):  # fmt: skip
-    """The solution after a direction, and the residual there."""
+    """The solution after a direction, and the residual there if wanted."""
     i = wp.tid()
     s = i // threads
-    n_samples = stiffness.shape[0]
-    residual = row(0, m, n_kept, n_samples, s, n)
-    direction = row(1, m, n_kept, n_samples, s, n)
-    product = row(2, m, n_kept, n_samples, s, n)
-    following = row(0, m + 1, n_kept, n_samples, s, n)
-    sums = scalars[m * n_samples + s]
-    push = stiffness[s] * sums[1]
-    step = quotient(sums[0], form_of(sums, stiffness[s]))
+    n_all = solution.shape[0]
+    n_samples = n_all // n
+    sums = scalars[s]
+    step = quotient(sums[0], sums[1] + form_of_totals(stiffness, swept, n_samples, s))
     size = real(0.0)
-    last = (m + 2) * n_samples == scalars.shape[0]
     for k in range(i - s * threads, n, threads):
         v = place(s * n, k)
-        solution[v] = solution[v] + step * fields[place(direction, k)]
-        if not last:
-            r = fields[place(residual, k)] - step * (fields[place(product, k)] + push * normal[v])
-            fields[place(following, k)] = r
+        solution[v] = solution[v] + step * direction[v]
+        if next_residual:
+            pushed = push_of_totals(normals, stiffness, swept, n_all, v, n_samples, s)
+            r = residual[v] - step * (product[v] + pushed)
+            next_residual[v] = r
             size += wp.dot(r, multiply(inverse[v], r))
-    wp.atomic_add(scalars, (m + 1) * n_samples + s, vec3(size, real(0.0), real(0.0)))
+    wp.atomic_add(next_scalars, s, vec2(size, real(0.0)))
 
 
 @wp.kernel(enable_backward=False)
 def turn(
-    normal: wp.array[vec3], inverse: wp.array[symmetric], n_samples: int, m: int, n_kept: int, n: int,
-    fields: wp.array[vec3], scalars: wp.array[vec3], threads: int,
+    normals: wp.array[vec3], inverse: wp.array[symmetric], n: int, direction: wp.array[vec3],
+    scalars: wp.array[vec2], next_residual: wp.array[vec3], next_direction: wp.array[vec3],
+    next_product: wp.array[vec3], next_scalars: wp.array[vec2], next_swept: wp.array[real], threads: int,
 ):  # fmt: skip
     """The next direction; its product is set to zero."""
     i = wp.tid()
     s = i // threads
-    residual = row(0, m + 1, n_kept, n_samples, s, n)
-    direction = row(1, m, n_kept, n_samples, s, n)
-    following = row(1, m + 1, n_kept, n_samples, s, n)
-    product = row(2, m + 1, n_kept, n_samples, s, n)
-    to = (m + 1) * n_samples + s
-    ratio = quotient(scalars[to][0], scalars[m * n_samples + s][0])
-    swept = real(0.0)
+    n_all = direction.shape[0]
+    ratio = quotient(next_scalars[s][0], scalars[s][0])
     for k in range(i - s * threads, n, threads):
         v = place(s * n, k)
-        d = multiply(inverse[v], fields[place(residual, k)]) + ratio * fields[place(direction, k)]
-        fields[place(following, k)] = d
-        fields[place(product, k)] = vec3()
-        swept += wp.dot(normal[v], d)
-    wp.atomic_add(scalars, to, vec3(real(0.0), swept, real(0.0)))
+        d = multiply(inverse[v], next_residual[v]) + ratio * direction[v]
+        next_direction[v] = d
+        next_product[v] = vec3()
+        for t in range(normals.shape[0] // n_all):
+            wp.atomic_add(next_swept, place(t * (n_all // n), s), wp.dot(normals[place(t * n_all, v)], d))

@@ -12,8 +12,8 @@ triangle_area = for_kernels(formulas.triangle_area)
 
 @wp.kernel(enable_backward=False)
 def sizes(
-    faces: wp.array[wp.vec3i], n_vertices: int, x: wp.array[vec3], result: wp.array[vec3], n_areas: int,
-    normal: wp.array[vec3], threads: int,
+    faces: wp.array[wp.vec3i], n_vertices: int, x: wp.array[vec3], result: wp.array[vec3],
+    normal: wp.array[vec3], n_areas: int, threads: int,
 ):  # fmt: skip
     """The volume, and the area of the first faces, of each shape in the second of two; and the volume's gradient.
 
