@@ -23,7 +23,7 @@ import torch_modal as tm
 
 BOUNDS = {
     "lines of code": 17600,
-    "functions": 1570,
+    "functions": 1571,
     "docstrings that begin with no noun": 0,
     "functions of in-between": 88,
     "files of in-between": 22,
