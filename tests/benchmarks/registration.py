@@ -426,7 +426,7 @@ def main() -> None:
         return
     if given.across:
         columns = ["", "landmarks", "error, mean", "at most", "confidence"]
-        check = "--across --only 'slender on stout'"
+        check = "--across --only 'woman on herself'"
         with Table("registration-across", columns, given.keep, check=check, labels=2) as table:
             across(given.only, table)
         return
