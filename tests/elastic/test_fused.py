@@ -129,9 +129,12 @@ def assert_kernels(run: Any, truth: Any, given: list[Tensor], atol: float, to: f
 def test_local_steps(case: Case) -> None:
     assert float((case.by_torch(*case.given) - case.given[0]).abs().max()) > 1e-2
     second = not case.fused.parts[2].extends
-    # Torch's own result of the flat one moves by up to 2e-6 if rounding changes the start: products amplify it.
-    far = 5e-8 if case.mesh.n_vertices == 36 else 1e-8
-    assert_kernels(case.by_warp, case.by_torch, case.given, far * CANONICAL_SIZE, 4e-6, second)
+    start, *rests = case.given
+    noise = 2.0**-52 * torch.randn(start.shape, dtype=DOUBLE, generator=torch.Generator().manual_seed(0))
+    # Products amplify rounding, most for the flat one: torch's own result moves by this.
+    rounding = float((case.by_torch(start * (1 + noise), *rests) - case.by_torch(*case.given)).abs().max())
+    atol = max(1e-8 * CANONICAL_SIZE, 4 * rounding)
+    assert_kernels(case.by_warp, case.by_torch, case.given, atol, 4e-6, second)
 
 
 @torch.no_grad()
