@@ -65,12 +65,12 @@ class KernelEnergy(nn.Module):
         self.unweighed = [i for i in range(len(parts)) if i not in self.weighed]
         #: The terms in passes over elements, each alone or with another that rides on it.
         self.passes: Sequence[Pass] = nn.ModuleList(passes_of(parts, energy.n_extended))  # type: ignore[assignment]
-        #: The totals, and passes over their one element.
-        self.sums = [term for term in parts if isinstance(term, KernelTotal)]
+        #: Passes over the one element of each total.
         totals = [Pass((i, term)) for i, term in enumerate(parts) if isinstance(term, KernelTotal)]
         self.totals: Sequence[Pass] = nn.ModuleList(totals)  # type: ignore[assignment]
-        #: True if the elements of passes have vertices beyond those of the mesh.
+        #: True if the elements of passes have vertices beyond those of the mesh; and if any term's have.
         self.extends = any(one.term.extends for one in self.passes)
+        self.any_extends = any(term.extends for term in parts)
         #: True if kernels know the adjoints of all terms.
         self.exact = all(part.term.kernel_formulas(part.n).exact for part in parts)  # type: ignore[union-attr]
 
@@ -83,9 +83,14 @@ class KernelEnergy(nn.Module):
         """Displacements of the anchors, or their places where they are unknown. *Shape:* ``(B, P, 3)``."""
         return x.new_zeros(len(x), sum(self.energy.n_anchors), 3)
 
-    def fold(self, extended: Tensor, out: Tensor) -> Tensor:
-        """The adjoint of :meth:`extend`, which is added to values of the vertices. *Shape:* ``(B, V, 3)``."""
+    def fold(self, extended: Tensor, out: Tensor, to_anchors: Tensor | None = None) -> Tensor:
+        """The adjoint of :meth:`extend`, which is added to values of the vertices, and of the anchors.
+
+        *Shape:* ``(B, E, 3), (B, V, 3), (B, P, 3) -> (B, V, 3)``.
+        """
         n, used = out.shape[1], self.energy.used
+        if to_anchors is not None:
+            to_anchors.add_(extended[:, n + 1 :])
         out.add_(extended[:, :n])
         return out.index_add_(1, used, (extended[:, n : n + 1] / len(used)).expand(-1, len(used), -1))
 
@@ -107,7 +112,8 @@ class KernelEnergy(nn.Module):
     def at(self, x: Tensor, anchors: Tensor, to: Reference, order: int = 2) -> KernelPoint:
         """Value, gradient from the order of 1 on, and convex Hessian from 2 on. *Shape:* ``(B, V, 3), (B, P, 3)``."""
         (b, n), factors = x.shape[:2], []
-        energy, shapes = x.new_zeros(b), self.extend(x, anchors) if self.extends else x
+        energy, extended = x.new_zeros(b), self.extend(x, anchors) if self.any_extends else x
+        shapes = extended if self.extends else x
         gradient, diagonal = (
             x.new_zeros(*shapes.shape[:2], size) if order > least else None for size, least in ((3, 0), (6, 1))
         )
@@ -121,13 +127,13 @@ class KernelEnergy(nn.Module):
             diagonal = None if diagonal is None else diagonal[:, :n].contiguous()
         sums, forces, normals = (x.new_zeros(len(self.totals), b, size, 3) for size in (2, 2, n if order > 0 else 0))
         blocks, own_factors = x.new_empty(b, 2, 6) if order > 1 else None, x.new_empty(len(self.totals), b, 1, 5)
-        for i, (one, total) in enumerate(zip(self.totals, self.sums, strict=True)):
-            shapes, extended = self.extend(x, anchors) if total.extends else x, normals[i] if order > 0 else None
-            if total.extends and order > 0:
-                extended = torch.zeros_like(shapes)
-            total.sum(b, shapes.shape[1], shapes, sums[i], extended)
-            if extended is not None and total.extends:
-                self.fold(extended, normals[i])
+        for i, one in enumerate(self.totals):
+            total: KernelTotal = one.term  # type: ignore[assignment]
+            shapes, folds = (extended, True) if total.extends else (x, False)
+            normal = (torch.zeros_like(shapes) if folds else normals[i]) if order > 0 else None
+            total.sum(b, shapes.shape[1], shapes, sums[i], normal)
+            if folds and normal is not None:
+                self.fold(normal, normals[i])
             derivatives = (forces[i] if order > 0 else None), blocks, (own_factors[i] if order > 1 else None)
             one.launch("linearise", b, 2, sums[i], to.records[one.number], None, energy, *derivatives, None)
             if gradient is not None:
@@ -170,9 +176,9 @@ class KernelEnergy(nn.Module):
         """
         (b, n), extends = x.shape[:2], self.extends
         shapes, to_shapes, to_forces = x, to_x, to_gradient
+        extended = self.extend(x, anchors) if self.any_extends else x
         if extends:
-            shapes, to_forces = self.extend(x, anchors), self.extend(to_gradient)
-            to_shapes = torch.zeros_like(shapes)
+            shapes, to_forces, to_shapes = extended, self.extend(to_gradient), torch.zeros_like(extended)
             if to_diagonal is not None:
                 to_diagonal = nn.functional.pad(to_diagonal, (0, 0, 0, shapes.shape[1] - n))
         for one, factors, received in zip(self.passes, at.factors, to_factors or at.factors, strict=True):
@@ -184,8 +190,9 @@ class KernelEnergy(nn.Module):
             adjoints = None, to_shapes, *to_own, to_energy, to_forces, to_diagonal, *received
             one.launch("linearise", b, *values, adjoints=adjoints)
         if extends:
-            self._extend_back(to_shapes, to_x, to_anchors)
-        for i, (one, total) in enumerate(zip(self.totals, self.sums, strict=True)):
+            self.fold(to_shapes, to_x, to_anchors)
+        for i, one in enumerate(self.totals):
+            total: KernelTotal = one.term  # type: ignore[assignment]
             to_sums, to_force = torch.zeros_like(at.sums[i]), torch.zeros_like(at.forces[i])
             to_force[:, 1, 0] = (to_gradient * at.normals[i]).sum((1, 2))
             known = 2, at.sums[i], to.records[one.number], None, at.value, at.forces[i], None, None, None
@@ -197,17 +204,11 @@ class KernelEnergy(nn.Module):
             if to_normals is not None:
                 to_normal.add_(to_normals[i])
             if total.extends:
-                shapes = self.extend(x, anchors)
-                to_shapes = torch.zeros_like(shapes)
-                total.back(shapes, to_sums, self.extend(to_normal), to_shapes)
-                self._extend_back(to_shapes, to_x, to_anchors)
+                to_shapes = torch.zeros_like(extended)
+                total.back(extended, to_sums, self.extend(to_normal), to_shapes)
+                self.fold(to_shapes, to_x, to_anchors)
             else:
                 total.back(x, to_sums, to_normal, to_x)
-
-    def _extend_back(self, to_shapes: Tensor, to_x: Tensor, to_anchors: Tensor) -> None:
-        """The adjoint of :meth:`extend`, which is added."""
-        self.fold(to_shapes, to_x)
-        to_anchors.add_(to_shapes[:, to_x.shape[1] + 1 :])
 
     def add_products(self, field: Tensor, factors: Factors, out: Tensor, scalars: Tensor | None = None) -> None:
         """Products with the convex Hessian but for the totals' parts, and their scalars. *Shape:* ``(B, V, 3)``."""

@@ -46,7 +46,7 @@ class KernelTerm(nn.Module):
 
     def launch(self, name: str, dim: int, *arguments: object, adjoints: Sequence[object] = ()) -> None:
         """Run a kernel over the elements of so many samples, or its adjoint."""
-        kernel = of_elements("totals" if name == "total" else "merging", name, self.formulas)
+        kernel = of_elements("merging", name, self.formulas)
         launch(kernel, (dim, self.n_elements), [self.elements, *arguments], adjoints and [None, *adjoints])
 
     def shapes_to_merge(self, shapes: Tensor) -> tuple[Tensor, Tensor | None]:
@@ -57,7 +57,8 @@ class KernelTerm(nn.Module):
         if not self.formulas.uses_mean:
             return shapes, None
         sizes = shapes.new_zeros(len(shapes), 2, 3)
-        self.launch("total", len(shapes), shapes.shape[1], shapes, sizes, None)
+        kernel = of_elements("totals", "total", self.formulas)
+        launch(kernel, (len(shapes), self.n_elements), [self.elements, shapes.shape[1], shapes, sizes, None])
         return shapes, sizes
 
 

@@ -66,6 +66,18 @@ def push_of_totals(
     return result
 
 
+@wp.func
+def sweep(
+    normals: wp.array[vec3], direction: wp.array[vec3], before: int, first: int, n: int, begin: int, threads: int
+):  # fmt: skip
+    """The change of a total along a direction, at the vertices of a thread."""
+    result = real(0.0)
+    for k in range(begin, n, threads):
+        v = place(first, k)
+        result += wp.dot(normals[place(before, v)], direction[v])
+    return result
+
+
 @wp.kernel(enable_backward=False)
 def begin(
     gradient: wp.array[vec3], normals: wp.array[vec3], diagonal: wp.array[symmetric], n: int,
@@ -87,9 +99,10 @@ def begin(
         direction[v] = z
         product[v] = vec3()
         size += wp.dot(r, z)
-        for t in range(normals.shape[0] // n_all):
-            wp.atomic_add(swept, place(t * (n_all // n), s), wp.dot(normals[place(t * n_all, v)], z))
     wp.atomic_add(scalars, s, vec2(size, real(0.0)))
+    for t in range(normals.shape[0] // n_all):
+        change = sweep(normals, direction, t * n_all, s * n, n, i - s * threads, threads)
+        wp.atomic_add(swept, place(t * (n_all // n), s), change)
 
 
 @wp.kernel(enable_backward=False)
@@ -134,5 +147,6 @@ def turn(
         d = multiply(inverse[v], next_residual[v]) + ratio * direction[v]
         next_direction[v] = d
         next_product[v] = vec3()
-        for t in range(normals.shape[0] // n_all):
-            wp.atomic_add(next_swept, place(t * (n_all // n), s), wp.dot(normals[place(t * n_all, v)], d))
+    for t in range(normals.shape[0] // n_all):
+        change = sweep(normals, next_direction, t * n_all, s * n, n, i - s * threads, threads)
+        wp.atomic_add(next_swept, place(t * (n_all // n), s), change)
