@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from torch_modal.arrays import Array
+from torch_modal.arrays import Array, FloatArray, IntArray
 from torch_modal.geometry.skin import Skin
 from torch_modal.io.asset import Asset
 from torch_modal.io.files import atomic_write
@@ -42,20 +42,19 @@ def save_animation(
 ) -> Path:
     """Write the sequence as one file that plays.
 
-    ``.glb`` is glTF 2.0 with a morph target for each frame after the first; viewers interpolate linearly between
-    neighbouring frames. glTF calls Y up and metres the unit; the caller's coordinates are written as they are
-    (float32), so a Z-up sequence lies on its back there. Normals move with the shape. ``.usd``, ``.usda`` and ``.usdc``
-    (extra ``usd``) hold the points over time in the same manner, ``.abc`` (extra ``alembic``) at a fixed rate. A GLB
-    with ``bones`` holds a skin instead (:func:`torch_modal.bake`), a tenth of the size, with which every engine plays;
-    with ``targets``, the mean and a few principal shapes.
+    ``.glb`` is glTF 2.0 with a morph target for each frame after the first, between which viewers interpolate linearly.
+    glTF calls Y up and metres the unit; the caller's coordinates are written as they are (float32), so a Z-up sequence
+    lies on its back there. Normals move with the shape. ``.usd``, ``.usda`` and ``.usdc`` (extra ``usd``) hold the
+    points over time, ``.abc`` (extra ``alembic``) at a fixed rate. A GLB with ``bones`` holds a skin
+    (:func:`torch_modal.bake`), a tenth of the size, that every engine plays; with ``targets``, the mean and a few
+    principal shapes.
 
     ``.mp4`` (extra ``video``) and ``.gif`` are drawn, with the materials and textures of the asset. ``.mdd`` and
     ``.pc2`` are point caches, for a mesh that is already in Blender, Maya or Houdini. ``.npz`` holds ``frames``,
     ``faces``, ``times`` and ``keyframes`` as arrays.
 
     Args:
-        frames: Vertex positions, in the caller's coordinates. *Shape:* ``(N, V, 3)``. One shape gives a file that
-            stands still.
+        frames: Vertex positions, in the caller's coordinates; one shape stands still. *Shape:* ``(N, V, 3)``.
         faces: Vertex indices. *Shape:* ``(F, 3)``.
         out: File to write; replaced if it exists.
         fps: Frames a second; with a ``duration``, pictures or samples a second of videos and point caches
@@ -67,8 +66,8 @@ def save_animation(
             cycle, 2 s for two key-frames, and 1 s for each interval of more.
         ping_pong: Play forwards and then backwards, which takes twice the duration.
         ease: Slow at both ends, by half a period of a cosine.
-        times: Times of the frames, in any unit; of a cycle, also the time when it
-            begins again. Default: evenly spaced. The duration does not change.
+        times: Times of the frames, in any unit; of a cycle, also the time when it begins again. Default: evenly
+            spaced. The duration does not change.
         asset: The mesh file that the frames come from (:func:`torch_modal.open_asset`). GLB gets its materials,
             textures, texture coordinates, colours and normals, USD its polygons, texture coordinates and colours.
         bones: Most bones of a skin, or a skin of these frames. GLB alone.
@@ -88,6 +87,27 @@ def save_animation(
         MeshWarning: The format cannot hold what the asset carries.
     """
     shapes, triangles = check_frames(frames, faces)
+    path, suffix = _check_file(out, shapes, asset, bones, targets, size)
+    keyframes = [] if keyframe_indices is None else check_indices(keyframe_indices, len(shapes), "keyframe_indices")
+    if cyclic and len(shapes) > 1 and np.array_equal(shapes[0], shapes[-1]):
+        shapes = shapes[:-1]
+        keyframes = [number for number in keyframes if number < len(shapes)]
+    if times is None and isinstance(bones, Skin) and bones.times is not None:
+        times = bones.times.tolist()
+    repeats = {"cyclic": cyclic and len(shapes) > 1, "ping_pong": ping_pong, "ease": ease}
+    timing = Timing(len(shapes), len(keyframes), duration=duration, fps=fps, times=times, **repeats)
+    skin = None if bones is None else _make_skin(bones, shapes, triangles, cyclic)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    animation = Animation(shapes, triangles, timing, path.name, keyframes, asset, progress, skin, targets, size)
+    with atomic_write(path, suffix) as temporary:
+        ANIMATION_FORMATS[suffix].write(animation, temporary)
+    return path
+
+
+def _check_file(
+    out: str | Path, shapes: FloatArray, asset: Asset | None, bones: int | Skin | None, targets: int | None, size: int
+) -> tuple[Path, str]:
+    """Check that a file can be written, in a format that holds the frames as requested; returns it and its suffix."""
     path = Path(out)
     check_forms(path, bones, targets)
     if targets is not None and not (isinstance(targets, int) and 1 <= targets < len(shapes)):
@@ -99,25 +119,16 @@ def save_animation(
         asset.check(shapes, path, ANIMATION_FORMATS[suffix].holds)
     ANIMATION_FORMATS[suffix].check_installed(path.name)
     refuse_existing(path)
-    keyframes = [] if keyframe_indices is None else check_indices(keyframe_indices, len(shapes), "keyframe_indices")
-    if cyclic and len(shapes) > 1 and np.array_equal(shapes[0], shapes[-1]):
-        shapes = shapes[:-1]
-        keyframes = [number for number in keyframes if number < len(shapes)]
-    if times is None and isinstance(bones, Skin) and bones.times is not None:
-        times = bones.times.tolist()
-    repeats = {"cyclic": cyclic and len(shapes) > 1, "ping_pong": ping_pong, "ease": ease}
-    timing = Timing(len(shapes), len(keyframes), duration=duration, fps=fps, times=times, **repeats)
-    skin = bones if bones is None or isinstance(bones, Skin) else bake(shapes, triangles, bones)
-    if skin is not None:
-        n = len(skin.transforms)
-        if skin.rest.shape != shapes.shape[1:] or not 0 <= n - len(shapes) <= cyclic:
-            raise ValueError(f"bones is a skin of {n} other frames than these {len(shapes)}; bake these")
-        skin = replace(skin, transforms=skin.transforms[: len(shapes)])
-    path.parent.mkdir(parents=True, exist_ok=True)
-    animation = Animation(shapes, triangles, timing, path.name, keyframes, asset, progress, skin, targets, size)
-    with atomic_write(path, suffix) as temporary:
-        ANIMATION_FORMATS[suffix].write(animation, temporary)
-    return path
+    return path, suffix
+
+
+def _make_skin(bones: int | Skin, shapes: FloatArray, faces: IntArray, cyclic: bool) -> Skin:
+    """Bake a skin of at most this many bones, or check a given one, whose repeated frame of a cycle is dropped."""
+    skin = bones if isinstance(bones, Skin) else bake(shapes, faces, bones)
+    n = len(skin.transforms)
+    if skin.rest.shape != shapes.shape[1:] or not 0 <= n - len(shapes) <= cyclic:
+        raise ValueError(f"bones is a skin of {n} other frames than these {len(shapes)}; bake these")
+    return replace(skin, transforms=skin.transforms[: len(shapes)])
 
 
 def write_mp4(animation: Animation, path: Path) -> None:

@@ -15,6 +15,7 @@ from torch_modal.geometry.vectors import vertex_normals
 from torch_modal.io.asset import Asset, linear_rgba
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from PIL import Image
 
 ByteArray = NDArray[np.uint8]
@@ -106,7 +107,7 @@ def make_cells(n_rows: int, n_columns: int, half_size: FloatArray, pixels: IntAr
     return cells
 
 
-def draw_shape(cell: Any, points: FloatArray, surface: PaintedFaces) -> None:
+def draw_shape(cell: Axes, points: FloatArray, surface: PaintedFaces) -> None:
     """Draw a surface with its vertices at points into a cell, from back to front. *Shape:* ``(V, 3)``."""
     from matplotlib.collections import TriMesh
     from matplotlib.tri import Triangulation
@@ -124,7 +125,7 @@ def draw_shape(cell: Any, points: FloatArray, surface: PaintedFaces) -> None:
     cell.add_collection(TriMesh(triangles, facecolors=paint[order].reshape(-1, 3), rasterized=True))
 
 
-def draw_points(cell: Any, points: FloatArray, color: tuple[float, ...]) -> None:
+def draw_points(cell: Axes, points: FloatArray, color: tuple[float, ...]) -> None:
     """Draw dots into a cell, near ones darker and over far ones. *Shape:* ``(n, 3)``."""
     points = points[:: len(points) // 20_000 + 1]
     x, y, _ = points[points[:, 2].argsort(kind="stable")].T

@@ -9,7 +9,7 @@ import io
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -18,6 +18,11 @@ from torch_modal.io.files import write_files
 from torch_modal.io.formats import PICTURES
 from torch_modal.io.write import check_frames, check_indices, check_suffix, refuse_existing, to_numpy
 from torch_modal.view.drawing import DPI, draw_points, draw_shape, make_cells, plain
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.figure import Figure
 
 KEYFRAME_COLOR = (0.91, 0.60, 0.36)  # warm: given
 BETWEEN_COLOR = (0.62, 0.71, 0.82)  # cool: computed
@@ -114,12 +119,10 @@ def render_sequence(
             *Shape of each:* ``(N, V, 3)``, the same for all.
         faces: Vertex indices. *Shape:* ``(F, 3)``.
         out: File to write, ``*.png`` or ``*.pdf``; replaced if it exists.
-        columns: How many frames to show, evenly chosen with the first and the last, or their numbers. By
-            default all up to seven, and of more a number from four to seven that gives equal steps; where most of
-            these were key-frames, shapes half-way between key-frames instead.
+        columns: How many frames to show, evenly chosen with the first and the last, or their numbers. Default: up to
+            seven, in equal steps, or half-way between key-frames where most of these were key-frames.
         titles: Text above the columns. Default: their times, from 0 to 1.
-        keyframe_indices: Frames that are key-frames, drawn in the other colour; an empty list is none. The first
-            and the last by default.
+        keyframe_indices: Frames that are key-frames, drawn in the other colour. Default: the first and the last.
         view: Azimuth and elevation of the camera in degrees; ``(0, 0)`` looks from the front (+Z where Y is up, -Y
             where Z is), a positive azimuth moves the camera to the right. By default chosen from the shape.
         up: ``"y"`` or ``"z"``; by default Y, unless the first shape is flat in Y.
@@ -149,28 +152,17 @@ def render_sequence(
     titles = [f"t = {n / max(n_frames - 1, 1):.3g}" for n in chosen] if titles is None else titles
     if len(titles) != len(chosen):
         raise ValueError(f"titles stand above {len(chosen)} columns, got {len(titles)}")
-    clouds = {label: [to_numpy(cloud) for cloud in row] for label, row in (points or {}).items()}
-    for label, row in clouds.items():
-        if len(row) != n_frames or any(cloud.shape != (len(cloud), 3) for cloud in row):
-            raise ValueError(f"points[{label!r}] must be {n_frames} clouds (n, 3), got {[c.shape for c in row]}")
-
-    values = {row: to_numpy(numbers).astype(np.float64) for row, numbers in (colors or {}).items()}
-    for label, numbers in values.items():
-        size = checked[label].shape[:2] if label in checked else f"of a row {', '.join(rows)}"
-        if numbers.shape != size or not np.isfinite(numbers).all():
-            raise ValueError(f"colors[{label!r}] must be finite numbers of shape {size}, got shape {numbers.shape}")
-    scale: Any = _color_scale(np.stack([numbers[chosen] for numbers in values.values()])) if values else None
+    clouds = _check_points(points or {}, n_frames)
+    values = _check_colors(colors or {}, checked)
+    scale = _color_scale(np.stack([numbers[chosen] for numbers in values.values()])) if values else None
     rotation = view_rotation(shapes[0][0], view, up)
     turned = np.stack([frames[chosen] for frames in shapes]) @ rotation.T  # (R, C, V, 3)
     placed, half = fit_into_cells(turned)
     moves = (placed - turned)[0, :, 0]  # of the first row, into the cells
     pixels = np.maximum((CELL_PIXELS * half / half.max()).round(), 1).astype(np.int64)
-    labels = [*clouds, *rows]
-    cells = make_cells(len(labels), len(chosen), half, pixels)
+    cells = make_cells(len(clouds) + len(rows), len(chosen), half, pixels)
     points_of_text = min(17.0, 0.13 * pixels[0] * 72 / DPI)  # the longest title has about twelve letters
-    for cell, label in zip(cells[:, 0], labels, strict=True):
-        text = {"fontsize": 1.1 * points_of_text, "va": "center", "ha": "right", "transform": cell.transAxes}
-        cell.text(-0.05, 0.5, label, **text)
+    _label_rows(cells[:, 0], [*clouds, *rows], 1.1 * points_of_text)
     for column, (n, title) in enumerate(zip(chosen, titles, strict=True)):
         color = "#b4581a" if n in keyframes else "#333333"
         cells[0, column].set_title(title, fontsize=points_of_text, color=color)
@@ -178,21 +170,51 @@ def render_sequence(
         for cell, cloud in zip(cells[:, column], clouds.values(), strict=False):
             draw_points(cell, cloud[n] @ rotation.T + moves[column], DOT_COLOR)
         for cell, label, shape in zip(cells[len(clouds) :, column], rows, placed[:, column], strict=True):
-            paint = scale.to_rgba(values[label][n])[:, :3] if label in values else usual
+            paint = scale.to_rgba(values[label][n])[:, :3] if scale and label in values else usual
             draw_shape(cell, shape, plain(paint, triangles))
     figure = cells[0, 0].figure
     if scale:
-        width, height = (pixels / DPI / figure.get_size_inches()).tolist()
-        tall = min(1.0, 2 * height)
-        box = (1 + 0.1 * width, (1 - tall) / 2, 0.06 * width, tall)
-        bar = figure.colorbar(scale, cax=figure.add_axes(box), extendfrac=0.03)
-        bar.ax.tick_params(labelsize=0.8 * points_of_text)
-        bar.set_label(color_label, fontsize=0.9 * points_of_text)
-        bar.outline.set_visible(False)
+        _draw_bar(figure, scale, pixels, color_label, points_of_text)
     stream = io.BytesIO()
     figure.savefig(stream, format=fmt, dpi=DPI, bbox_inches="tight", pad_inches=0.2)
     write_files([(path, stream.getvalue())])
     return path
+
+
+def _check_points(points: Mapping[str, Sequence[Array]], n_frames: int) -> dict[str, list[FloatArray]]:
+    """Check rows of clouds, one cloud for each frame."""
+    clouds = {label: [to_numpy(cloud) for cloud in row] for label, row in points.items()}
+    for label, row in clouds.items():
+        if len(row) != n_frames or any(cloud.shape != (len(cloud), 3) for cloud in row):
+            raise ValueError(f"points[{label!r}] must be {n_frames} clouds (n, 3), got {[c.shape for c in row]}")
+    return clouds
+
+
+def _check_colors(colors: Mapping[str, Array], shapes: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
+    """Check the numbers of vertices that are shown as colours, for any of the rows of shapes."""
+    values = {row: to_numpy(numbers).astype(np.float64) for row, numbers in colors.items()}
+    for label, numbers in values.items():
+        size = shapes[label].shape[:2] if label in shapes else f"of a row {', '.join(shapes)}"
+        if numbers.shape != size or not np.isfinite(numbers).all():
+            raise ValueError(f"colors[{label!r}] must be finite numbers of shape {size}, got shape {numbers.shape}")
+    return values
+
+
+def _label_rows(cells: Sequence[Axes], labels: Sequence[str], font: float) -> None:
+    """Write labels to the left of the first cell of each row."""
+    for cell, label in zip(cells, labels, strict=True):
+        cell.text(-0.05, 0.5, label, fontsize=font, va="center", ha="right", transform=cell.transAxes)
+
+
+def _draw_bar(figure: Figure, scale: ScalarMappable, pixels: IntArray, label: str, font: float) -> None:
+    """Draw the bar of a colour scale to the right of a figure, as tall as two cells of this width and height."""
+    width, height = (pixels / DPI / figure.get_size_inches()).tolist()
+    tall = min(1.0, 2 * height)
+    box = (1 + 0.1 * width, (1 - tall) / 2, 0.06 * width, tall)
+    bar = figure.colorbar(scale, cax=figure.add_axes(box), extendfrac=0.03)
+    bar.ax.tick_params(labelsize=0.8 * font)
+    bar.set_label(label, fontsize=0.9 * font)
+    bar.outline.set_visible(False)
 
 
 def choose_columns(columns: int | Sequence[int] | None, n_frames: int, keyframes: Sequence[int]) -> list[int]:
@@ -215,8 +237,8 @@ def choose_columns(columns: int | Sequence[int] | None, n_frames: int, keyframes
     return chosen
 
 
-def _color_scale(numbers: FloatArray) -> Any:
-    """Colours of numbers, a ScalarMappable; a few extreme ones do not hide the rest."""
+def _color_scale(numbers: FloatArray) -> ScalarMappable:
+    """Colours of numbers; a few extreme ones do not hide the rest."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import LinearSegmentedColormap, Normalize
 
