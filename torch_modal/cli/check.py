@@ -1,14 +1,21 @@
 """``torch-modal check``: crossings, volumes and strains of meshes and of the motion through them."""
 
+from __future__ import annotations
+
 import argparse
 import time
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from torch_modal.cli.arguments import check_output, pick_options
 from torch_modal.io.files import write_files
 from torch_modal.io.formats import PICTURES
 from torch_modal.io.write import check_suffix
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from torch_modal.contact.self_contacts import SelfContacts
 
 CROSSES = 3  # exit status when parts newly pass through each other
 
@@ -99,7 +106,7 @@ def run(args: argparse.Namespace) -> int:
     return CROSSES if bool(contacts.n_far.any()) else 0
 
 
-def _draw(args: argparse.Namespace, shapes: Any, faces: Any, contacts: Any) -> None:
+def _draw(args: argparse.Namespace, shapes: Tensor, faces: Tensor, contacts: SelfContacts) -> None:
     """Draw the shapes with their crossings in colour."""
     import torch_modal as tm
 

@@ -9,8 +9,8 @@ import os
 import signal
 import sys
 import warnings
+from argparse import ArgumentParser, Namespace
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
 
 from torch_modal.cli import bake, check, commands, complete, subdivide, transfer, view
 from torch_modal.version import __version__
@@ -32,7 +32,7 @@ start here:
   torch-modal complete a.obj scans/*.ply --out motion.glb             from scans and a template
   torch-modal interpolate --help                            all that can be set"""
 
-COMMANDS: dict[str, tuple[Callable[[Any], None], Callable[[Any], int | None]]] = {
+COMMANDS: dict[str, tuple[Callable[[ArgumentParser], None], Callable[[Namespace], int | None]]] = {
     "interpolate": (subdivide.add_arguments, subdivide.run),
     "bake": (bake.add_arguments, bake.run),
     "complete": (complete.add_arguments, complete.run),

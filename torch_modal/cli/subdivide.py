@@ -6,8 +6,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from torch_modal.arrays import Array
 from torch_modal.cli import arguments
 from torch_modal.cli.arguments import pick_options
+from torch_modal.io.asset import Asset
 from torch_modal.io.formats import ANIMATION_FORMATS, MESH_FORMATS, PICTURES, Timing, check_forms
 from torch_modal.io.write import check_suffix
 
@@ -38,7 +40,7 @@ def check_files(args: argparse.Namespace, inputs: list[Path]) -> Path:
 
 
 def write_sequence(
-    args: argparse.Namespace, animation: Path, frames: Any, faces: Any, asset: Any, **options: Any
+    args: argparse.Namespace, animation: Path, frames: Array, faces: Array, asset: Asset | None, **options: Any
 ) -> None:
     """Write frames, if --out is a folder, and the animation; ``options`` are passed to `save_animation`."""
     import torch_modal as tm

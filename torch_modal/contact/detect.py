@@ -5,7 +5,6 @@ pairs a vertex with a face that it was behind in a known shape: a self-intersect
 """
 
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from scipy.sparse.csgraph import connected_components
@@ -122,8 +121,8 @@ class Search(Crossings):
         of_face = np.where((patch[faces] == patch[faces[:, :1]]).all(1), patch[faces[:, 0]], -1)
         surface = Surface(x, self.mesh)
         n = min(_NEAREST, len(faces))
-        v: Any = np.repeat(inside, n)
-        f: Any = np.asarray(cKDTree(surface.face_centres).query(x[inside], n)[1]).reshape(-1)
+        v = np.repeat(inside, n)
+        f: IntArray = np.asarray(cKDTree(surface.face_centres).query(x[inside], n)[1]).reshape(-1)
         facing = dot(surface.vertex_normals[v], surface.face_normals[f]) < FACING
         v, f = _select(facing & (of_face[f] != patch[v]), v, f)
         v, f = _select(_heights(surface, v, f) < 0, v, f)

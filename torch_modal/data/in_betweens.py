@@ -4,7 +4,6 @@ import contextlib
 import warnings
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -115,7 +114,7 @@ def compute_by_kind(kinds: Tensor, compute: Callable[[list[int], Tensor], Tensor
 
 
 def read_or_compute(
-    folder: Path | None, name: str, content: list[Any], compute: Callable[[], tuple[Tensor, bool]]
+    folder: Path | None, name: str, content: list[object], compute: Callable[[], tuple[Tensor, bool]]
 ) -> Tensor:
     """A table from its file in a folder; or a new one, which is written there if it is worth keeping.
 

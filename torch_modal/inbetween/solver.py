@@ -61,7 +61,6 @@ class InBetweenSolver(nn.Module):
         self.fine = backend.fine_energy(mesh, terms)
         #: Products with the Hessian in each step of all vertices.
         self.products = [LOCAL_PRODUCTS] * solver.local_steps + [POLISH_PRODUCTS] * solver.polish
-        self.has_anchors = any(term.anchors is not None for term in terms)
         self.distortion = backend.distortion(mesh, Energy(mesh, others) if others else None)
         paired = objective.space == "paired"
         self.blend = None if paired else RotationBlend(mesh.connectivity, self.alignment.references, backend)
@@ -92,9 +91,8 @@ class InBetweenSolver(nn.Module):
         """
         weights = samples.weights
         shapes, pose, usable = self.alignment(samples.keyframes, weights)
-        anchors: Any = None
-        if self.has_anchors:
-            anchors = self.fine.energy.anchors
+        anchors = self.fine.energy.anchors
+        if anchors is not None:
             anchors = self.alignment.to_frame(anchors.to(weights).expand(len(weights), -1, -1), pose)
         rests = RestShapes(shapes, weights, samples.stiffness, anchors)
         straight = torch.bmm(weights[:, None], shapes.flatten(2)).view_as(shapes[:, 0])

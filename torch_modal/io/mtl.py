@@ -5,9 +5,9 @@ import os
 import posixpath
 import re
 import warnings
+from collections.abc import Callable
 from functools import cache, partial
 from pathlib import Path
-from typing import Any
 
 from torch_modal.errors import MeshWarning
 from torch_modal.io.asset import Material, as_png_or_jpeg
@@ -16,6 +16,7 @@ from torch_modal.io.files import try_companion
 _OPTIONS = re.compile(r"(?:-(?:[ost](?:\s+-?[\d.]+){1,3}|mm\s+\S+\s+\S+|\w+\s+\S+)\s+)*")
 """Options of a texture line with their values: options of coordinates have up to three numbers."""
 LARGEST_LIBRARY = 2**24  # bytes
+Read = Callable[..., tuple[str, bytes] | None]
 
 
 def read_libraries(path: Path, lines: list[str]) -> tuple[dict[str, Material], dict[str, bytes]]:
@@ -36,7 +37,7 @@ def read_libraries(path: Path, lines: list[str]) -> tuple[dict[str, Material], d
 
 
 def _read_library(
-    path: Path, library: str, data: bytes, read: Any, materials: dict[str, Material], files: dict[str, bytes]
+    path: Path, library: str, data: bytes, read: Read, materials: dict[str, Material], files: dict[str, bytes]
 ) -> None:
     """Add the materials and textures of a library to the results."""
     folder = posixpath.dirname(library)
