@@ -4,7 +4,7 @@ import importlib.util
 import subprocess
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ from torch_modal.elastic import backend
 from torch_modal.elastic.backend import TorchBackend, choose
 from torch_modal.elastic.bend import Bend
 from torch_modal.elastic.distortion import Distortion, KernelDistortion
-from torch_modal.elastic.energy import Energy, Reference, RestShapes
+from torch_modal.elastic.energy import Energy, RestShapes
 from torch_modal.elastic.kernel_energy import KernelEnergy, _MergeRests
 from torch_modal.elastic.kernel_steps import KernelFineEnergy, KernelProblem, _Relaxation
 from torch_modal.elastic.kernel_terms import by_kernels, serves
@@ -83,8 +83,8 @@ class Case:
         return descend(SumOfEnergies([own]), x, [4, 4])
 
     def by_warp(self, x: Tensor, *rests: Tensor) -> Tensor:
-        to = self.fused.reference(self.rests(*rests))
-        return _Relaxation(self.fused, [4, 4])(x, self.fused.no_anchors(x), *to.records)[0]
+        to = self.fused.target(self.rests(*rests))
+        return _Relaxation(self.fused, [4, 4])(x, to.anchors, *to.records)[0]
 
 
 @pytest.fixture(params=["closed", "open", "flat"])
@@ -95,6 +95,11 @@ def case(request: pytest.FixtureRequest, small_bars: Shapes) -> Case:
         return Case(Shapes(torch.stack([grid, bent, 1.1 * bent]), faces, []), faces, 0.1)
     faces = small_bars.faces[6:] if request.param == "open" else small_bars.faces
     return Case(small_bars, faces, 0.3)
+
+
+def records_by_torch(energy: Energy, rests: RestShapes) -> list[Tensor]:
+    """In the layout of kernels."""
+    return [record.mT for record in rests.reference(energy).records]
 
 
 def gradients(run, given: list[Tensor], create: bool = False) -> tuple[Tensor, ...]:
@@ -112,10 +117,9 @@ def assert_alike(found: tuple[Tensor, ...], truth: tuple[Tensor, ...], to: float
         torch.testing.assert_close(got, wanted, rtol=0, atol=to * max(float(wanted.abs().max()), 0.01))
 
 
-def assert_same_reference(found: Reference, wanted: Reference, rtol: float) -> None:
-    for got, truth in zip(found.records, wanted.records, strict=True):
+def assert_same_records(found: Sequence[Tensor], wanted: Sequence[Tensor], rtol: float) -> None:
+    for got, truth in zip(found, wanted, strict=True):
         torch.testing.assert_close(got, torch.where(truth[..., :1] > 0, truth, got), rtol=rtol, atol=1e-9)
-    torch.testing.assert_close(found.constant, wanted.constant, rtol=rtol, atol=1e-9)
 
 
 def assert_kernels(run: Any, truth: Any, given: list[Tensor], atol: float, to: float, second: bool = True) -> None:
@@ -154,17 +158,15 @@ def test_edges_that_are_points_at_rest_weigh_nothing(small_bars: Shapes) -> None
     one, other = case.mesh.edges[0].tolist()
     case.given[1][:, other] = case.given[1][:, one] + 1e-7
     rests = case.rests(*case.given[1:])
-    assert_same_reference(case.fused.reference(rests), rests.reference(case.energy).transpose(), 1e-9)
+    assert_same_records(case.fused.target(rests).records, records_by_torch(case.energy, rests), 1e-9)
     assert_alike(gradients(case.by_warp, case.given), gradients(case.by_torch, case.given), 1e-6)
 
 
 def test_steps_that_would_go_uphill_are_shortened(small_bars: Shapes) -> None:
     case = Case(small_bars, small_bars.faces, 10.0)
     case.given[5] *= 1e5
-    to, taken = case.fused.reference(case.rests(*case.given[1:])), []
-    found = descend(
-        KernelProblem(case.fused, to, case.fused.no_anchors(case.given[0])), case.given[0].contiguous(), [4, 4], taken
-    )
+    target, taken = case.fused.target(case.rests(*case.given[1:])), []
+    found = descend(KernelProblem(case.fused, target), case.given[0].contiguous(), [4, 4], taken)
     lengths = torch.stack([step[3] for step in taken])
     assert float(lengths.min()) < 0.5 < float(lengths.max()), "no step is shortened, or all are"
     torch.testing.assert_close(found, case.by_torch(*case.given), rtol=0, atol=1e-8 * CANONICAL_SIZE)
@@ -205,17 +207,17 @@ class TestReferences:
         shapes = torch.stack([first, second, 0.5 * (first + second), 1.1 * second], 1)[:, :n_shapes]
         weights = torch.tensor([[0.4, 0.7, 0.2, -0.3], [0.1, 0.2, 0.3, 0.4]], dtype=DOUBLE)[:, :n_shapes]
 
-        def by_kernels(*given: Tensor) -> Reference:
-            return shell.reference(RestShapes(*given[:2], given[2:]))
+        def by_kernels(*given: Tensor) -> Sequence[Tensor]:
+            return shell.target(RestShapes(*given[:2], given[2:])).records
 
-        def by_torch(*given: Tensor) -> Reference:
-            return RestShapes(*given[:2], given[2:]).reference(case.energy).transpose()
+        def by_torch(*given: Tensor) -> Sequence[Tensor]:
+            return records_by_torch(case.energy, RestShapes(*given[:2], given[2:]))
 
         def flat(run: Any) -> Any:
-            return lambda *given: torch.cat([part.flatten() for part in run(*given).records])
+            return lambda *given: torch.cat([part.flatten() for part in run(*given)])
 
         given = [shapes.clone(), weights.clone(), *stiffness]
-        assert_same_reference(by_kernels(*given), by_torch(*given), 1e-11)
+        assert_same_records(by_kernels(*given), by_torch(*given), 1e-11)
         assert_kernels(flat(by_kernels), flat(by_torch), given, 1e-6, 1e-9)
 
 
@@ -456,9 +458,10 @@ class TestLayers:
         start, first, second, t, *_ = case.given
         rests = case.rests(first, second, t, torch.full((2, 1), 1e3, dtype=DOUBLE))
         anchors = own.no_anchors(start) + torch.tensor([30.0, 20.0, 10.0], dtype=DOUBLE)
-        to, truth = own.reference(rests), TermsTowards(energy, rests.reference(energy), anchors)
-        found, wanted = KernelProblem(own, to, anchors).at(start.contiguous()), truth.at(start)
-        torch.testing.assert_close(found.value + to.constant, wanted.value, rtol=1e-12, atol=0)
+        target, reference = own.target(rests)._replace(anchors=anchors), rests.reference(energy)
+        found = KernelProblem(own, target).at(start.contiguous())
+        wanted = TermsTowards(energy, reference, anchors).at(start)
+        torch.testing.assert_close(found.value + reference.constant, wanted.value, rtol=1e-12, atol=0)
         assert_alike([found.gradient, found.diagonal], [wanted.gradient, wanted.diagonal], 1e-12)
         field, out = torch.randn_like(start).contiguous(), torch.zeros(start.shape, dtype=DOUBLE)
         own.add_products(field, found.factors, out)
@@ -479,7 +482,7 @@ class TestLayers:
         given = [*case.given, *more, anchors.clone()]
 
         def by_warp(x: Tensor, *rests: Tensor) -> Tensor:
-            to = own.reference(case.rests(*rests[:-1]))
+            to = own.target(case.rests(*rests[:-1]))
             return _Relaxation(own, relax)(x, rests[-1], *to.records)[0]
 
         def by_torch(x: Tensor, *rests: Tensor) -> Tensor:

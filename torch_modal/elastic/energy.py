@@ -35,13 +35,9 @@ class Reference(NamedTuple):
 
     records: tuple[Tensor, ...]
     """Record of each term (:meth:`torch_modal.elastic.term.Term.merge_rests`), with the stiffness; its first row is the
-    weight. *Shape of each:* ``(..., R, M)``; for kernels ``(B, M, R)``."""
+    weight. *Shape of each:* ``(..., R, M)``."""
     constant: Tensor
     """The energy that remains, whatever the shape. *Shape:* ``(...)``."""
-
-    def transpose(self) -> "Reference":
-        """Records in the layout of kernels from the layout of torch, or the other way round."""
-        return Reference(tuple(record.mT.contiguous() for record in self.records), self.constant)
 
 
 class Linearised(NamedTuple):

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from torch_modal.elastic.bend import NEEDLE, NEEDLE_OF_STEPS
-from torch_modal.elastic.energy import Energy, Reference, RestShapes
+from torch_modal.elastic.energy import Energy, RestShapes
 from torch_modal.elastic.kernel_terms import KernelTerm, KernelTotal, Pass, passes_of
 from torch_modal.elastic.kernels.function import Operation
 
@@ -21,8 +21,17 @@ Seen = tuple[Tensor, Tensor | None]
 """Shapes of the elements that are merged, and the sum of their measures where it counts."""
 
 
+class Target(NamedTuple):
+    """K rest shapes of each sample as one, in the layout of kernels: :class:`Reference` without its constant."""
+
+    anchors: Tensor
+    """Fixed points of the terms. *Shape:* ``(B, P, 3)``."""
+    records: Sequence[Tensor]
+    """Of each term. *Shape of each:* ``(B, M, R)``."""
+
+
 class KernelPoint(NamedTuple):
-    """The energy at given shapes, with factors of products with the convex Hessian."""
+    """The energy at given shapes, with factors of products with the convex Hessian; or gradients in these."""
 
     value: Tensor
     """But for the constant. *Shape:* ``(B,)``."""
@@ -31,7 +40,6 @@ class KernelPoint(NamedTuple):
     diagonal: Tensor
     """Blocks of the convex Hessian's diagonal, packed, if wanted. *Shape:* ``(B, V, 6)``."""
     factors: Factors
-    """Factors of the term and of the term that rides on it, for each pass. *Shape of each:* ``(B, M, f)``."""
     sums: Tensor
     """Totals, the first components of the second of two vertices. *Shape:* ``(T, B, 2, 3)``."""
     forces: Tensor
@@ -94,33 +102,31 @@ class KernelEnergy(nn.Module):
         out.add_(extended[:, :n])
         return out.index_add_(1, used, (extended[:, n : n + 1] / len(used)).expand(-1, len(used), -1))
 
-    def reference(self, rests: RestShapes, start: Tensor | None = None, relative: bool = False) -> Reference:
-        """Merge rest shapes into one reference (Eq. 8); arguments as :meth:`RestShapes.reference`."""
+    def target(self, rests: RestShapes, start: Tensor | None = None, relative: bool = False) -> Target:
+        """Merge rest shapes into one (Eq. 8); arguments as :meth:`RestShapes.reference`."""
         records: dict[int, Tensor] = {}
-        constant = rests.weights.new_zeros(len(rests.weights), dtype=torch.float64)
         for numbers, by_kernels in ((self.weighed, True), (self.unweighed, False)):
             if numbers:
                 tensors = [rests.shapes, rests.weights, *(rests.stiffness[i] for i in numbers)]
                 tensors += [] if start is None else [start]
-                parts = [self.parts[i] for i in numbers]
-                merge = _MergeRests(self, parts, relative)
-                *merged, left = merge(*tensors) if by_kernels else merge.by_torch(*(x.double() for x in tensors))
+                merge = _MergeRests(self, [self.parts[i] for i in numbers], relative)
+                merged = merge(*tensors) if by_kernels else merge.by_torch(*(x.double() for x in tensors))
                 records.update(zip(numbers, merged, strict=True))
-                constant = constant + left
-        return Reference(tuple(records[i] for i in range(len(self.parts))), constant)
+        anchors = self.no_anchors(rests.shapes[:, 0]) if rests.anchors is None else rests.anchors
+        return Target(anchors, [records[i] for i in range(len(self.parts))])
 
-    def at(self, x: Tensor, anchors: Tensor, to: Reference, order: int = 2) -> KernelPoint:
-        """Value, gradient from the order of 1 on, and convex Hessian from 2 on. *Shape:* ``(B, V, 3), (B, P, 3)``."""
+    def at(self, x: Tensor, target: Target, order: int = 2) -> KernelPoint:
+        """Value, gradient from the order of 1 on, and convex Hessian from 2 on. *Shape:* ``(B, V, 3)``."""
         (b, n), factors = x.shape[:2], []
-        energy, extended = x.new_zeros(b), self.extend(x, anchors) if self.any_extends else x
+        energy, extended = x.new_zeros(b), self.extend(x, target.anchors) if self.any_extends else x
         shapes = extended if self.extends else x
         gradient, diagonal = (
             x.new_zeros(*shapes.shape[:2], size) if order > least else None for size, least in ((3, 0), (6, 1))
         )
         for one in self.passes:
             pass_factors = [x.new_empty(b, *size) if order > 1 and size else None for size in one.sizes]
-            records = to.records[one.number], None if one.other is None else to.records[one.other]
-            one.launch("linearise", b, shapes.shape[1], shapes, *records, energy, gradient, diagonal, *pass_factors)
+            results = energy, gradient, diagonal, *pass_factors
+            one.launch("linearise", b, shapes.shape[1], shapes, *one.of_terms(target.records), *results)
             factors.append(pass_factors)
         if self.extends and gradient is not None:
             gradient = self.fold(gradient, torch.zeros_like(x))
@@ -135,80 +141,55 @@ class KernelEnergy(nn.Module):
             if folds and normal is not None:
                 self.fold(normal, normals[i])
             derivatives = (forces[i] if order > 0 else None), blocks, (own_factors[i] if order > 1 else None)
-            one.launch("linearise", b, 2, sums[i], to.records[one.number], None, energy, *derivatives, None)
+            one.launch("linearise", b, 2, sums[i], *one.of_terms(target.records), energy, *derivatives, None)
             if gradient is not None:
                 gradient.addcmul_(forces[i, :, 1:, :1], normals[i])
         stiffness = own_factors[:, :, 0, 3].contiguous()  # along the gradient
         return KernelPoint(energy, gradient, diagonal, factors, sums, forces, normals, stiffness)  # type: ignore[arg-type]
 
     def back(
-        self,
-        x: Tensor,
-        anchors: Tensor,
-        at: KernelPoint,
-        to: Reference,
-        to_gradient: Tensor,
-        to_x: Tensor,
-        to_anchors: Tensor,
-        to_records: Sequence[Tensor],
-        to_diagonal: Tensor | None = None,
-        to_factors: Factors | None = None,
-        to_normals: Tensor | None = None,
-        to_stiffness: Tensor | None = None,
-        to_energy: Tensor | None = None,
+        self, x: Tensor, target: Target, at: KernelPoint, to_x: Tensor, to_target: Target, to_at: KernelPoint
     ) -> None:
-        """Adjoint of :meth:`at`: add the gradients of shapes and references.
+        """Adjoint of :meth:`at`: adds the gradients in the shapes and their target.
 
         Args:
             x: The shapes. *Shape:* ``(B, V, 3)``.
-            anchors: Fixed points of the terms. *Shape:* ``(B, P, 3)``.
+            target: What they were compared with.
             at: The energy there.
-            to: The references.
-            to_gradient: In the gradient. *Shape:* ``(B, V, 3)``.
             to_x: Is added to. *Shape:* ``(B, V, 3)``.
-            to_anchors: Is added to. *Shape:* ``(B, P, 3)``.
-            to_records: Are added to.
-            to_diagonal: In the blocks of the diagonal. *Shape:* ``(B, V, 6)``.
-            to_factors: In the factors of products.
-            to_normals: In the gradients of totals beyond that. *Shape:* ``(T, B, V, 3)``.
-            to_stiffness: In the stiffnesses of totals. *Shape:* ``(T, B)``.
-            to_energy: In the energy. *Shape:* ``(B,)``.
+            to_target: Is added to.
+            to_at: Gradients in the energy there. Those in the totals are overwritten.
         """
         (b, n), extends = x.shape[:2], self.extends
-        shapes, to_shapes, to_forces = x, to_x, to_gradient
-        extended = self.extend(x, anchors) if self.any_extends else x
+        shapes, to_shapes, to_forces, to_diagonal = x, to_x, to_at.gradient, to_at.diagonal
+        extended = self.extend(x, target.anchors) if self.any_extends else x
         if extends:
-            shapes, to_forces, to_shapes = extended, self.extend(to_gradient), torch.zeros_like(extended)
+            shapes, to_forces, to_shapes = extended, self.extend(to_at.gradient), torch.zeros_like(extended)
             if to_diagonal is not None:
                 to_diagonal = nn.functional.pad(to_diagonal, (0, 0, 0, shapes.shape[1] - n))
-        for one, factors, received in zip(self.passes, at.factors, to_factors or at.factors, strict=True):
-            records, to_own = (
-                (each[one.number], None if one.other is None else each[one.other]) for each in (to.records, to_records)
-            )
+        for one, factors, received in zip(self.passes, at.factors, to_at.factors, strict=True):
+            records, to_records = one.of_terms(target.records), one.of_terms(to_target.records)
             # Of results, adjoints read no values, only which are wanted.
             values = shapes.shape[1], shapes, *records, at.value, to_forces, to_diagonal, *factors
-            adjoints = None, to_shapes, *to_own, to_energy, to_forces, to_diagonal, *received
+            adjoints = None, to_shapes, *to_records, to_at.value, to_forces, to_diagonal, *received
             one.launch("linearise", b, *values, adjoints=adjoints)
         if extends:
-            self.fold(to_shapes, to_x, to_anchors)
+            self.fold(to_shapes, to_x, to_target.anchors)
         for i, one in enumerate(self.totals):
             total: KernelTotal = one.term  # type: ignore[assignment]
-            to_sums, to_force = torch.zeros_like(at.sums[i]), torch.zeros_like(at.forces[i])
-            to_force[:, 1, 0] = (to_gradient * at.normals[i]).sum((1, 2))
-            known = 2, at.sums[i], to.records[one.number], None, at.value, at.forces[i], None, None, None
-            received = None, to_sums, to_records[one.number], None, to_energy, to_force, None, None, None
+            to_record = to_target.records[one.number]
+            to_at.forces[i, :, 1, 0] = (to_at.gradient * at.normals[i]).sum((1, 2))
+            known = 2, at.sums[i], *one.of_terms(target.records), at.value, at.forces[i], None, None, None
+            received = None, to_at.sums[i], to_record, None, to_at.value, to_at.forces[i], None, None, None
             one.launch("linearise", b, *known, adjoints=received)
-            if to_stiffness is not None:  # twice the weight, the first row of a record
-                to_records[one.number][:, 0, 0].add_(to_stiffness[i], alpha=2)
-            to_normal = at.forces[i, :, 1:, :1] * to_gradient
-            if to_normals is not None:
-                to_normal.add_(to_normals[i])
+            to_record[:, 0, 0].add_(to_at.stiffness[i], alpha=2)  # twice the weight, the first row of a record
+            to_normal = at.forces[i, :, 1:, :1] * to_at.gradient + to_at.normals[i]
             if total.extends:
                 to_shapes = torch.zeros_like(extended)
-                total.back(extended, to_sums, self.extend(to_normal), to_shapes)
-                self.fold(to_shapes, to_x, to_anchors)
+                total.back(extended, to_at.sums[i], self.extend(to_normal), to_shapes)
+                self.fold(to_shapes, to_x, to_target.anchors)
             else:
-                total.back(x, to_sums, to_normal, to_x)
+                total.back(x, to_at.sums[i], to_normal, to_x)
 
     def add_products(self, field: Tensor, factors: Factors, out: Tensor, scalars: Tensor | None = None) -> None:
         """Products with the convex Hessian but for the totals' parts, and their scalars. *Shape:* ``(B, V, 3)``."""
@@ -235,16 +216,11 @@ class KernelEnergy(nn.Module):
 
 @dataclass(frozen=True, eq=False)
 class _MergeRests(Operation[Seen]):
-    """Rest shapes, weights, the stiffnesses of some terms, and perhaps a start as records, and what remains."""
+    """Rest shapes, weights, the stiffnesses of some terms, and perhaps a start as the records of the terms."""
 
     energy: KernelEnergy
     parts: Sequence[KernelTerm]
     relative: bool
-
-    @property
-    def n_differentiable(self) -> int:  # type: ignore[override]
-        """Number of records."""
-        return len(self.parts)
 
     def _arguments(self, i: int, seen: Seen, tensors: Sequence[Tensor]) -> list[Tensor | float | None]:
         """Arguments of the kernel before its results, or their gradients."""
@@ -258,16 +234,15 @@ class _MergeRests(Operation[Seen]):
 
     def run(self, kept: list[Seen] | None, *tensors: Tensor) -> tuple[Tensor, ...]:
         shapes, records = tensors[0], []
-        constant = shapes.new_zeros(len(shapes))
         for i, term in enumerate(self.parts):
             x = shapes.flatten(0, 1)
             seen = term.shapes_to_merge(self.energy.extend(x) if term.extends else x)
             n_rows = 6 if term.formulas.periodic else 2  # formulas.periodic_record, square_record
             records.append(shapes.new_empty(len(shapes), term.n_elements, n_rows))
-            term.launch("merge", len(shapes), *self._arguments(i, seen, tensors), records[i], constant)
+            term.launch("merge", len(shapes), *self._arguments(i, seen, tensors), records[i])
             if kept is not None:
                 kept.append(seen)
-        return *records, constant
+        return tuple(records)
 
     def back(self, kept: list[Seen], grads: Sequence[Tensor], *tensors: Tensor) -> tuple[Tensor | None, ...]:
         if not kept:
@@ -278,7 +253,7 @@ class _MergeRests(Operation[Seen]):
             shapes = self.energy.extend(x) if term.extends else x
             to_shapes = torch.zeros_like(shapes) if term.extends else to_x
             to_seen = torch.zeros_like(kept[i][0]) if isinstance(term, KernelTotal) else to_shapes
-            values = *self._arguments(i, kept[i], tensors), torch.empty_like(grads[i]), torch.empty_like(grads[-1])
+            values = *self._arguments(i, kept[i], tensors), torch.empty_like(grads[i])
             _, _, to_weights, _, to_stiffness, to_start, *sizes = self._arguments(i, (to_seen, None), gradients)
             adjoints = None, to_seen, to_weights, None, to_stiffness, to_start, *[None] * len(sizes), grads[i]
             term.launch("merge", len(tensors[0]), *values, adjoints=adjoints)
@@ -294,7 +269,7 @@ class _MergeRests(Operation[Seen]):
         extend = self.energy.energy.extend
         rows, begin = extend(shapes.movedim(-1, 0)), None if start is None else extend(start.movedim(-1, 0))
         pairs = zip(self.parts, stiffness, strict=True)
-        merged = [term.part.merge_rests(rows, weights, factor, begin, self.relative) for term, factor in pairs]
-        return *(record.mT.contiguous() for record, _ in merged), torch.stack([left.sum(-1) for _, left in merged]).sum(
-            0
+        return tuple(
+            term.part.merge_rests(rows, weights, factor, begin, self.relative)[0].mT.contiguous()
+            for term, factor in pairs
         )

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch_modal import trees
 from torch_modal.autograd import is_eager
 from torch_modal.elastic.energy import Energy, Reference, RestShapes
-from torch_modal.elastic.kernel_energy import KernelEnergy, KernelPoint
+from torch_modal.elastic.kernel_energy import KernelEnergy, KernelPoint, Target
 from torch_modal.elastic.kernel_terms import by_kernels, serves
 from torch_modal.elastic.kernels.function import Operation
 from torch_modal.elastic.kernels.launch import kernels, launch
@@ -51,12 +51,11 @@ class KernelFineEnergy(FineEnergy):
         if self.further is not None:
             own, further = (rests.of_terms(self.energy, numbers) for numbers in (self.own, self.others))
             others.append(TermsTowards(self.further, further.reference(self.further), further.anchors))
-        to = self.kernels.reference(own, x, relative=True)
-        anchors = self.kernels.no_anchors(x) if own.anchors is None else own.anchors
+        target = self.kernels.target(own, x, relative=True)
         if alone:
-            return _Relaxation(self.kernels, products)(x, anchors, *to.records)[0].to(x)
+            return _Relaxation(self.kernels, products)(x, target.anchors, *target.records)[0].to(x)
         with torch.no_grad():
-            problem = KernelProblem(self.kernels, to, anchors.double(), others)
+            problem = KernelProblem(self.kernels, target._replace(anchors=target.anchors.double()), others)
             return descend(problem, x.double().contiguous(), products).to(x)
 
     def descend_towards(
@@ -65,26 +64,26 @@ class KernelFineEnergy(FineEnergy):
         """Overrides the base class. Gradients are left to torch."""
         if self.further is not None or (torch.is_grad_enabled() and x.requires_grad) or not is_eager(x):
             return super().descend_towards(x, reference, products, extra)
-        problem = KernelProblem(self.kernels, reference.transpose(), self.kernels.no_anchors(x).double(), extra)
+        records = [record.mT.contiguous() for record in reference.records]
+        problem = KernelProblem(self.kernels, Target(self.kernels.no_anchors(x).double(), records), extra)
         return descend(problem, x.double().contiguous(), products).to(x)
 
 
 @dataclass(frozen=True, eq=False)
 class KernelProblem:
-    """The terms towards a reference, for :func:`torch_modal.elastic.steps.descend`, in float64."""
+    """The terms towards a target, for :func:`torch_modal.elastic.steps.descend`, in float64."""
 
     kernels: KernelEnergy
-    to: Reference
-    anchors: Tensor
+    target: Target
     extra: Sequence[FreeEnergy] = ()
 
     def value(self, x: Tensor) -> Tensor:
         """*Shape:* ``(B, V, 3) -> (B,)``."""
-        return sum((other.value(x) for other in self.extra), start=self.kernels.at(x, self.anchors, self.to, 0).value)
+        return sum((other.value(x) for other in self.extra), start=self.kernels.at(x, self.target, 0).value)
 
     def at(self, x: Tensor) -> KernelPoint:
         """*Shape:* ``(B, V, 3)``."""
-        at = self.kernels.at(x, self.anchors, self.to)
+        at = self.kernels.at(x, self.target)
         if not self.extra:
             return at
         others = SumOfEnergies(self.extra).at(x)
@@ -135,67 +134,43 @@ def _iterations(fields: Tensor, scalars: Tensor, swept: Tensor) -> list[Sequence
     return [*zip(*(kind * n if len(kind) == 1 else kind + kind[-1:] for kind in kinds), scalars, swept, strict=True)]
 
 
-def _without_constant(records: Sequence[Tensor]) -> Reference:
-    """Records as a reference."""
-    return Reference(tuple(records), records[0].new_zeros(len(records[0])))
-
-
 @dataclass(frozen=True, eq=False)
 class _Relaxation(Operation[KernelStep]):
-    """Steps of all vertices from shapes, towards the records of a reference."""
+    """Steps of all vertices from shapes, towards anchors and the records of terms."""
 
     kernels: KernelEnergy
     products: Sequence[int]
 
     def run(self, kept: list[KernelStep] | None, x: Tensor, anchors: Tensor, *records: Tensor) -> tuple[Tensor, ...]:
-        problem = KernelProblem(self.kernels, _without_constant(records), anchors)
         with torch.no_grad():
-            return (descend(problem, x, self.products, kept),)
+            return (descend(KernelProblem(self.kernels, Target(anchors, records)), x, self.products, kept),)
 
     def back(
         self, kept: list[KernelStep], grads: Sequence[Tensor], x: Tensor, anchors: Tensor, *records: Tensor
     ) -> tuple[Tensor | None, ...]:
         if not kept:
             self.run(kept, x, anchors, *records)
-        to_x, to, to_anchors = grads[0], _without_constant(records), torch.zeros_like(anchors)
-        to_records = [torch.zeros_like(record) for record in records]
+        to_x, target = grads[0], Target(anchors, records)
+        to_target = trees.map_leaves(target, torch.zeros_like)
         for step in reversed(kept):
-            to_x = self._step_back(step, anchors, to, to_x, to_anchors, to_records)
-        return to_x, to_anchors, *to_records
+            to_x = self._step_back(step, target, to_x, to_target)
+        return to_x, to_target.anchors, *to_target.records
 
     def by_torch(self, x: Tensor, anchors: Tensor, *records: Tensor) -> tuple[Tensor, ...]:
-        terms = TermsTowards(self.kernels.energy, _without_constant(records).transpose(), anchors)
+        reference = Reference(tuple(record.mT for record in records), x.new_zeros(len(x)))
+        terms = TermsTowards(self.kernels.energy, reference, anchors)
         return (descend(SumOfEnergies([terms]), x, self.products),)
 
-    def _step_back(
-        self,
-        step: KernelStep,
-        anchors: Tensor,
-        to: Reference,
-        to_reached: Tensor,
-        to_anchors: Tensor,
-        to_records: Sequence[Tensor],
-    ) -> Tensor:
-        """Gradient at the start of a step from the gradient at its end; gradients of the records are added.
+    def _step_back(self, step: KernelStep, target: Target, to_reached: Tensor, to_target: Target) -> Tensor:
+        """Gradient at the start of a step from the gradient at its end; gradients of the target are added.
 
-        Args:
-            step: What :func:`descend` adds to its list: the start, the energy there, the whole step, its length, and
-                the further results of :meth:`KernelProblem.newton_direction`.
-            anchors: Fixed points of the terms. *Shape:* ``(B, P, 3)``.
-            to: The reference.
-            to_reached: Gradient at the end. *Shape:* ``(B, V, 3)``.
-            to_anchors: Is added to.
-            to_records: Are added to.
+        The step is what :func:`descend` adds to its list. *Shape:* ``(B, V, 3) -> (B, V, 3)``.
         """
         x, at, solution, length, (*kept, inverse) = step
-        to_x, to_solution, to_energy, to_slope = to_reached.clone(), to_reached, None, None
+        to_x, to_solution, to_at = to_reached.clone(), to_reached, trees.map_leaves(at, torch.zeros_like)
         if bool((length < 1).any()):
-            to_solution, to_energy, to_slope = self._length_back(
-                x, anchors, at, solution, to, to_x, to_anchors, to_records
-            )
-        module, (b, n) = kernels("steps"), x.shape[:2]
-        to_normals, to_inverse, to_stiffness = map(torch.zeros_like, (at.normals, inverse, at.stiffness))
-        to_factors = [[x if x is None else torch.zeros_like(x) for x in factors] for factors in at.factors]
+            to_solution = self._length_back(x, at, solution, target, to_x, to_target, to_at)
+        module, (b, n), to_inverse = kernels("steps"), x.shape[:2], torch.zeros_like(inverse)
         each, to_each = _iterations(*kept), _iterations(*map(torch.zeros_like, kept))
         for k in reversed(range(len(each) - 1)):
             (one, other), (to_one, to_other), residual, to_residual = each[k : k + 2], to_each[k : k + 2], None, None
@@ -203,45 +178,44 @@ class _Relaxation(Operation[KernelStep]):
             if k < len(each) - 2:
                 residual, to_residual = other[0], to_other[0]
                 turned, to_turned = (n, field, sums, *other), (None, to_field, to_sums, *to_other)
-                launch(module.turn, (b, n), [at.normals, inverse, *turned], [to_normals, to_inverse, *to_turned])
+                launch(module.turn, (b, n), [at.normals, inverse, *turned], [to_at.normals, to_inverse, *to_turned])
             moved = at.normals, inverse, at.stiffness, n, *one, residual, other[3], solution
             # A solution gives its gradient to the one before, which the adjoint of an update in place adds to it.
             received = to_residual, to_other[3], to_solution.clone()
-            launch(module.advance, (b, n), moved, [to_normals, to_inverse, to_stiffness, None, *to_one, *received])
-            self.kernels.add_products_back(field, at.factors, to_field, to_factors, to_one[2], to_sums)
-        to_gradient = torch.zeros_like(x) if to_slope is None else to_slope[:, None, None] * solution
-        to_diagonal = torch.zeros_like(at.diagonal)
+            to_moved = to_at.normals, to_inverse, to_at.stiffness, None, *to_one, *received
+            launch(module.advance, (b, n), moved, to_moved)
+            self.kernels.add_products_back(field, at.factors, to_field, to_at.factors, to_one[2], to_sums)
         begun = at.gradient, at.normals, at.diagonal, n, inverse, *each[0]
-        to_begun = to_gradient, to_normals, to_diagonal, None, to_inverse, *to_each[0]
+        to_begun = to_at.gradient, to_at.normals, to_at.diagonal, None, to_inverse, *to_each[0]
         launch(module.begin, (b, n), begun, to_begun)
-        further = to_diagonal, to_factors, to_normals, to_stiffness, to_energy
-        self.kernels.back(x, anchors, at, to, to_gradient, to_x, to_anchors, to_records, *further)
+        self.kernels.back(x, target, at, to_x, to_target, to_at)
         return to_x
 
     def _length_back(
         self,
         x: Tensor,
-        anchors: Tensor,
         at: KernelPoint,
         solution: Tensor,
-        to: Reference,
+        target: Target,
         to_x: Tensor,
-        to_anchors: Tensor,
-        to_records: Sequence[Tensor],
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Gradients of the lengths of steps that were shortened: in the solution, the energy before, and the slope.
+        to_target: Target,
+        to_at: KernelPoint,
+    ) -> Tensor:
+        """Gradient in the solution of steps that were shortened. *Shape:* ``(B, V, 3)``.
 
-        Those through the energy after the whole step are added to the gradients in the shape, on entry those at the
-        end of the step, and in the records. *Shape:* ``(B, V, 3), (B,), (B,)``.
+        Gradients through the energy after the whole step are added to those of the target and the shape, on entry those
+        at the end of the step; gradients in the energy before, and in its gradient, are written.
         """
         to_reached, whole = to_x.clone(), x + solution
-        there = self.kernels.at(whole, anchors, to, 1)
+        there = self.kernels.at(whole, target, 1)
         with torch.enable_grad():
             values = solution, at.value, there.value, at.slope(solution)
             step, before, after, slope = leaves = [value.detach().requires_grad_() for value in values]
             along = slope + at.slope(step - solution)
             taken = step_length(before, along, after, step.abs().amax((1, 2)))[:, None, None] * step
         to_solution, to_before, to_after, to_slope = torch.autograd.grad(taken, leaves, to_reached)
-        received = torch.zeros_like(to_x), to_x, to_anchors, to_records
-        self.kernels.back(whole, anchors, there, to, *received, to_energy=to_after)
-        return to_solution + (to_x - to_reached), to_before, to_slope
+        to_there = trees.map_leaves(there, torch.zeros_like)._replace(value=to_after)
+        self.kernels.back(whole, target, there, to_x, to_target, to_there)
+        to_at.value.copy_(to_before)
+        to_at.gradient.copy_(to_slope[:, None, None] * solution)
+        return to_solution + (to_x - to_reached)

@@ -191,6 +191,10 @@ class Pass(nn.Module):
         self.register_buffer("elements", elements, persistent=False)
         self.register_buffer("own", None if own is None else own.int(), persistent=False)
 
+    def of_terms(self, values: Sequence[Tensor]) -> tuple[Tensor, Tensor | None]:
+        """The values of the term and of the rider, from those of all terms."""
+        return values[self.number], None if self.other is None else values[self.other]
+
     def launch(self, name: str, dim: int, *arguments: object, adjoints: Sequence[object] = ()) -> None:
         """Run a kernel over the elements of so many samples, or its adjoint."""
         kernel = of_elements("elements", name, self.term.formulas, self.rider and self.rider.formulas)

@@ -177,7 +177,6 @@ def mean_pose(to_reference: Tensor, among: Tensor, weights: Tensor) -> tuple[Ten
 class _MeanPose(Operation[Tensor]):
     """*Shape:* ``(B, 2, 3, 3), (B, 2, 2, 3, 3), (B, 2) -> (B, 2, 3, 3), (B, 3, 3)``."""
 
-    n_differentiable = 2
     by_torch = staticmethod(procrustes.mean_pose)
 
     @staticmethod

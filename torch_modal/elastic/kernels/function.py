@@ -24,8 +24,6 @@ Kept = TypeVar("Kept")
 class Operation(Generic[Kept]):
     """A function of float64 tensors by kernels. The first dimension of all tensors counts the samples."""
 
-    n_differentiable = 1
-    """Number of results with gradients; they come first."""
     run: Callable[..., tuple[Tensor, ...]]
     """The results, of a list and the tensors; what :attr:`back` needs is added to the list, unless it is None."""
     back: Callable[..., tuple[Tensor | None, ...]]
@@ -52,17 +50,13 @@ class _Fused(torch.autograd.Function):
     @staticmethod
     def setup_context(ctx: Context, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
         ctx.operation, ctx.kept, *tensors = inputs
-        ctx.n_results = len(output)
-        ctx.mark_non_differentiable(*output[ctx.operation.n_differentiable :])
         ctx.save_for_backward(*tensors)
         ctx.save_for_forward(*tensors)
 
     @staticmethod
     def jvp(ctx: Context, *tangents: Tensor | None) -> tuple[Tensor | None, ...]:
-        n, by_torch = ctx.operation.n_differentiable, ctx.operation.by_torch
-        results, back = torch.func.vjp(lambda *tensors: by_torch(*tensors)[:n], *ctx.saved_tensors)[:2]
-        moved = apply_transpose(back, tuple(map(torch.zeros_like, results)), ctx.saved_tensors, tangents[2:])
-        return *moved, *[None] * (ctx.n_results - n)
+        results, back = torch.func.vjp(ctx.operation.by_torch, *ctx.saved_tensors)[:2]
+        return apply_transpose(back, tuple(map(torch.zeros_like, results)), ctx.saved_tensors, tangents[2:])
 
     @staticmethod
     def backward(ctx: Context, *grads: Tensor) -> tuple[Tensor | None, ...]:

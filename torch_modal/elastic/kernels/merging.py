@@ -72,12 +72,11 @@ def kernels_of(f: Formulas) -> SimpleNamespace:
     def merge(
         elements: wp.array[corners], n_vertices: int, x: wp.array[vec3], weights: wp.array[real], whole: wp.array[vec3],
         stiffness: wp.array[real], start: wp.array[vec3], altitude: real, relative: int, n_shapes: int,
-        n_stiffness: int, out: wp.array[record], constant: wp.array[real], threads: int,
+        n_stiffness: int, out: wp.array[record], threads: int,
     ):  # fmt: skip
-        """K rest shapes of each sample as one, softened at the needles of a start, and the energy that remains."""
+        """K rest shapes of each sample as one, softened at the needles of a start."""
         i = wp.tid()
         s = i // threads
-        left = real(0.0)
         for k in range(i - s * threads, elements.shape[0], threads):
             q = elements[place(k, 0)]
             first, last = s * n_shapes, (s + 1) * n_shapes
@@ -87,9 +86,6 @@ def kernels_of(f: Formulas) -> SimpleNamespace:
             factor = stiffness[place(s * n_stiffness, wp.min(k, n_stiffness - 1))]
             if start:
                 factor *= softness(fullness(edge_vectors(start, s * n_vertices, q), altitude), usual, relative)
-            to = potential.merge_rests(moments, factor)
-            left += potential.left(moments, factor, to)
-            out[place(s * elements.shape[0], k)] = to
-        wp.atomic_add(constant, s, left)
+            out[place(s * elements.shape[0], k)] = potential.merge_rests(moments, factor)
 
     return SimpleNamespace(merge=merge)
