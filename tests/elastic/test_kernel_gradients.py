@@ -51,7 +51,7 @@ def test_compiling_them_says_nothing(tmp_path: Path) -> None:
         "import sys, torch; sys.path.append('tests'); from helpers.terms import fibres; "
         "from torch_modal.elastic.kernels import launch; "
         "kind = fibres(); kind.linearised = None; "
-        "kernel = launch.of_elements('elements', 'linearise', kind(1.0).kernel_formulas(1), None); "
+        "kernel = launch.of_elements('elements', 'convex', kind(1.0).kernel_formulas(1), None).linearise; "
         "launch._load(kernel.module, torch.device('cpu'))"
     )
     given = os.environ | {"WARP_CACHE_PATH": str(tmp_path)}

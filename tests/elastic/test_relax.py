@@ -9,10 +9,10 @@ from conftest import Shapes
 from torch import Tensor
 from torch.func import hessian, jacfwd
 
+from torch_modal.elastic import formulas
 from torch_modal.elastic.energy import Energy, EnergyAt, Reference, RestShapes
 from torch_modal.elastic.shell import ShellEnergy
 from torch_modal.elastic.steps import (
-    RIDGE,
     SumOfEnergies,
     TermsTowards,
     descend,
@@ -93,7 +93,7 @@ def test_convex_hessian_is_gauss_newton_and_the_stretched_edges(case: Case) -> N
         own_volume = to_volume[:, sample].T
         at_volume = volume.curvature[sample] * own_volume[:, :, None] * own_volume[:, None]
         diagonal = torch.stack([own[v, :, v] for v in range(n // 3)]) - at_volume
-        ridge = RIDGE * torch.eye(3) * diagonal.diagonal(dim1=1, dim2=2).sum(1)[:, None, None]
+        ridge = formulas.RIDGE * torch.eye(3) * diagonal.diagonal(dim1=1, dim2=2).sum(1)[:, None, None]
         product = (blocks @ (diagonal + ridge))[core.used]
         torch.testing.assert_close(product, torch.eye(3).double().expand_as(product), atol=1e-8, rtol=0)
 

@@ -60,9 +60,9 @@ def _make_kernels() -> None:
         kernels(name)
     for term in (Stretch, Bend, Volume):
         of_elements("merging", "merge", term.own_formulas)
-    of_elements("totals", "total", Stretch.own_formulas)
-    of_elements("elements", "linearise", Bend.own_formulas, Stretch.own_formulas)
-    of_elements("elements", "linearise", Volume.own_formulas, None)
+    of_elements("merging", "total", Stretch.own_formulas)
+    of_elements("elements", "convex", Bend.own_formulas, Stretch.own_formulas)
+    of_elements("elements", "convex", Volume.own_formulas, None)
 
 
 class WarpBackend(TorchBackend):

@@ -56,6 +56,8 @@ LARGEST_STRAIN = 4.0
 """Strain of an edge from which on its distortion is linear: of edges that have no length at rest it means nothing."""
 LARGEST_WEIGHT = 8.0
 """Bound on the weight l^2 / A of a hinge with a needle in a distortion; an equilateral hinge has 1.15."""
+RIDGE = 1e-6
+"""Added to blocks of a Hessian, relative to their trace: a vertex in a flat fan has no stiffness along its normal."""
 ZERO, ONE, TWO, HALF, THIRD, SIXTH = 0.0, 1.0, 2.0, 1 / 2, 1 / 3, 1 / 6
 
 
@@ -343,3 +345,27 @@ def periodic_square(difference: Scalar) -> Scalar:
     half = sin(HALF * difference)
     versine = TWO * half * half
     return versine * (TWO + THIRD * versine)
+
+
+# ------------------------------------------------------------------------------------------------ linear systems
+def quotient(a: Scalar, b: Scalar) -> Scalar:
+    """``a / b``, and 0 where ``b`` is not positive: a system that is solved exactly has no residual."""
+    positive = b > ZERO
+    return where(positive, a / where(positive, b, ONE), ZERO)
+
+
+def symmetric_inverse(m: Six) -> Six:
+    """Inverse by cofactors, with :data:`RIDGE`; of a vertex that no face uses, which has no stiffness, of the ridge."""
+    whole = m[0] + m[3] + m[5]
+    trace = where(whole > ZERO, whole, ONE)
+    a = m[0] / trace + RIDGE
+    d = m[3] / trace + RIDGE
+    f = m[5] / trace + RIDGE
+    b = m[1] / trace
+    c = m[2] / trace
+    e = m[4] / trace
+    aa = d * f - e * e
+    bb = c * e - b * f
+    cc = b * e - c * d
+    per = ONE / ((a * aa + b * bb + c * cc) * trace)
+    return six(per * aa, per * bb, per * cc, per * (a * f - c * c), per * (b * c - a * e), per * (a * d - b * b))

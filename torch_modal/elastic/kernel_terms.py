@@ -57,7 +57,7 @@ class KernelTerm(nn.Module):
         if not self.formulas.uses_mean:
             return shapes, None
         sizes = shapes.new_zeros(len(shapes), 2, 3)
-        kernel = of_elements("totals", "total", self.formulas)
+        kernel = of_elements("merging", "total", self.formulas)
         launch(kernel, (len(shapes), self.n_elements), [self.elements, shapes.shape[1], shapes, sizes, None])
         return shapes, sizes
 
@@ -100,7 +100,7 @@ class KernelTotal(KernelTerm):
             area: True to add the area, too, where the weight depends on it.
             adjoints: Gradients of the arguments.
         """
-        kernel = of_elements("totals", "total", self.formulas_of_sum)
+        kernel = of_elements("merging", "total", self.formulas_of_sum)
         launch(kernel, (dim, len(self.summands)), [self.summands, *arguments], adjoints and [None, *adjoints])
 
     def shapes_to_merge(self, shapes: Tensor) -> tuple[Tensor, Tensor | None]:
@@ -197,9 +197,9 @@ class Pass(nn.Module):
 
     def launch(self, name: str, dim: int, *arguments: object, adjoints: Sequence[object] = ()) -> None:
         """Run a kernel over the elements of so many samples, or its adjoint."""
-        kernel = of_elements("elements", name, self.term.formulas, self.rider and self.rider.formulas)
+        kernels = of_elements("elements", "convex", self.term.formulas, self.rider and self.rider.formulas)
         arguments = self.elements, self.own, self.n_own, *arguments
-        launch(kernel, (dim, self.n_elements), arguments, adjoints and [None] * 3 + [*adjoints])
+        launch(getattr(kernels, name), (dim, self.n_elements), arguments, adjoints and [None] * 3 + [*adjoints])
 
 
 def passes_of(parts: Sequence[KernelTerm], n_vertices: int) -> list[Pass]:

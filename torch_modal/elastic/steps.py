@@ -9,12 +9,10 @@ from torch import Tensor, nn
 
 from torch_modal import trees
 from torch_modal.autograd import is_eager
+from torch_modal.elastic import formulas
 from torch_modal.elastic.energy import ENERGY_ROUNDING, Energy, EnergyAt, Reference, RestShapes
 from torch_modal.elastic.term import Mesh, Term
 from torch_modal.geometry.canonical import CANONICAL_SIZE
-
-# Added to the diagonal blocks, relative to their trace: a vertex in a flat fan has no stiffness along its normal.
-RIDGE = 1e-6
 
 # The curvature along a shorter step is rounding of energies.
 SHORTEST_MOVE = 1e-5 * CANONICAL_SIZE
@@ -82,16 +80,9 @@ class Problem(Protocol[Kind]):
 
 
 def inverse_of_symmetric(blocks: Tensor) -> Tensor:
-    """Inverse by cofactors, with a ridge. *Shape:* ``(6, ...) -> (3, 3, ...)``."""
-    trace = blocks[0] + blocks[3] + blocks[5]
-    # Vertices that no face uses have no stiffness at all, and no gradient either.
-    trace = torch.where(trace > 0, trace, 1)
-    a, b, c, d, e, f = blocks / trace
-    a, d, f = a + RIDGE, d + RIDGE, f + RIDGE
-    aa, bb, cc = d * f - e * e, c * e - b * f, b * e - c * d
-    determinant = a * aa + b * bb + c * cc
-    cofactors = torch.stack([aa, bb, cc, bb, a * f - c * c, b * c - a * e, cc, b * c - a * e, a * d - b * b])
-    return (cofactors / (determinant * trace)).unflatten(0, (3, 3))
+    """:func:`torch_modal.elastic.formulas.symmetric_inverse` as full matrices. *Shape:* ``(6, ...) -> (3, 3, ...)``."""
+    xx, xy, xz, yy, yz, zz = formulas.symmetric_inverse(blocks.unbind())
+    return torch.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz]).unflatten(0, (3, 3))
 
 
 def descend(
@@ -211,11 +202,6 @@ def conjugate_gradients(
         tolerance: Of one system, the relative residual that ends the iteration. It also ends, in a direction that goes
             downhill, where the curvature is not positive. Default: all products are taken.
     """
-
-    def quotient(a: Tensor, b: Tensor) -> Tensor:
-        # A system that is solved exactly has nothing left: 0 / 0.
-        return torch.where(b > 0, a / torch.where(b > 0, b, 1), 0)
-
     solution = torch.zeros_like(right)
     residual = right
     direction = preconditioned = precondition(residual)
@@ -225,7 +211,7 @@ def conjugate_gradients(
         curvature = dot(direction, along)
         if tolerance is not None and not curvature > 0:
             return solution if k else preconditioned
-        length = quotient(size, curvature)
+        length = formulas.quotient(size, curvature)
         solution = solution + length * direction
         if k == n_products - 1:
             break
@@ -234,7 +220,7 @@ def conjugate_gradients(
         previous, size = size, dot(residual, preconditioned)
         if tolerance is not None and not size > tolerance**2 * first:
             break
-        direction = preconditioned + quotient(size, previous) * direction
+        direction = preconditioned + formulas.quotient(size, previous) * direction
     return solution
 
 

@@ -42,7 +42,6 @@ class JointSpace(AmplitudeEnergy[Sequence[Placement]]):
         members = [[i for i, term in enumerate(terms) if term.sampled == kind] for kind in (False, True)]
         #: The terms of each part.
         self.members = [numbers for numbers in members if numbers]
-        self.n_anchors = [0 if term.anchors is None else len(term.anchors) for term in terms]
         parts = []
         for numbers in self.members:
             sampled = terms[numbers[0]].sampled
@@ -65,17 +64,13 @@ class JointSpace(AmplitudeEnergy[Sequence[Placement]]):
         coarse, placed = self.coarse, []
         on_coarse, on_fine = (coarse.restrict(base), coarse.restrict(rests.shapes)), (base, rests.shapes)
         for part, members in zip(self.parts, self.members, strict=True):
-            energy, stiffness = part.energy, [rests.stiffness[i] for i in members]
+            energy, (_, _, stiffness, anchors) = part.energy, rests.of_terms(self.fine.energy, members)
             if energy.sampled:
                 part_base, shapes = (x[..., energy.vertices, :] for x in on_fine)
             else:
                 part_base, shapes = on_coarse
                 pairs = zip(stiffness, (self.fine.energy.parts[i] for i in members), energy.parts, strict=True)
                 stiffness = [coarse_values(*pair, coarse.clusters, coarse.n_vertices) for pair in pairs]
-            anchors = rests.anchors
-            if anchors is not None:
-                each = anchors.split(self.n_anchors, 1)
-                anchors = torch.cat([each[i] for i in members], 1)
             reference = RestShapes(shapes, rests.weights, stiffness).reference(energy, part_base if soften else None)
             placed.append(part.place(part_base, reference, anchors))
         return placed

@@ -93,14 +93,13 @@ def common(f: Formulas) -> SimpleNamespace:
     return SimpleNamespace(**locals())
 
 
-def module_of(f: Formulas, kind: str) -> "wp.Module":
-    """A module of the kernels of a term, which Warp compiles as a whole."""
-    return wp.get_module(f"{__name__}.{f.name}.{kind}")
+def kernel_of(kind: str, f: Formulas, rider: Formulas | None = None) -> Callable[[Callable[..., None]], "wp.Kernel"]:
+    """The decorator of kernels of one or two terms, in a module that Warp compiles as a whole.
 
-
-def kernel_of(f: Formulas, module: "wp.Module") -> Callable[[Callable[..., None]], "wp.Kernel"]:
-    """The decorator of kernels that are not differentiated, but for gradients of a measure by ``wp.grad``."""
-    return wp.kernel(enable_backward=not f.exact, module=module)
+    They are not differentiated, but for gradients of a measure by ``wp.grad``.
+    """
+    by_grad = not all(each.exact for each in (f, rider) if each is not None)
+    return wp.kernel(enable_backward=by_grad, module=wp.get_module(f"{__name__}.{f.name}.{kind}"))  # type: ignore[no-any-return]
 
 
 @cache
@@ -136,27 +135,21 @@ def _rider(f: Formulas | None) -> SimpleNamespace:
 
 
 @cache
-def kernels_of(f: Formulas, rider: Formulas | None) -> SimpleNamespace:
+def convex(f: Formulas, rider: Formulas | None) -> SimpleNamespace:
     """Value, gradient and convex Hessian of a term, and of another that rides on its elements.
 
     Where both read and write the same vertices, one pass takes two thirds of the time of two. The elements are then
     those of the rider; ``own`` has the number of the term's element, or -1 where there is none.
     """
-    return SimpleNamespace(linearise=_linearise(f, rider), product=_product(f, rider))
+    kernel = kernel_of(f"convex.{rider.name if rider else None}", f, rider)
+    return SimpleNamespace(linearise=kernel(_linearise(f, rider)), product=kernel(_product(f, rider)))
 
 
-def _kernel_of_pass(f: Formulas, rider: Formulas | None) -> Callable[[Callable[..., None]], "wp.Kernel"]:
-    return kernel_of(
-        f if rider is None or rider.exact else rider, module_of(f, f"convex.{rider.name if rider else None}")
-    )
-
-
-def _linearise(f: Formulas, rider: Formulas | None) -> "wp.Kernel":
+def _linearise(f: Formulas, rider: Formulas | None) -> Callable[..., None]:
     c, functions, other, n, rides = common(f), functions_of(f), _rider(rider), f.n, rider is not None
     vectors, corners, edge_vectors, add, Factors = c.vectors, c.corners, c.edge_vectors, c.add, c.Factors
-    kernel, potential, record = _kernel_of_pass(f, rider), functions.potential, functions.potential.record
+    potential, record = functions.potential, functions.potential.record
 
-    @kernel
     def linearise(
         elements: wp.array[corners], own: wp.array[wp.int32], n_own: int, n_vertices: int, x: wp.array[vec3],
         rests: wp.array[record], others: wp.array[other.record], total: wp.array[real],
@@ -217,11 +210,10 @@ def _linearise(f: Formulas, rider: Formulas | None) -> "wp.Kernel":
     return linearise
 
 
-def _product(f: Formulas, rider: Formulas | None) -> "wp.Kernel":
-    c, kernel, other, rides = common(f), _kernel_of_pass(f, rider), _rider(rider), rider is not None
+def _product(f: Formulas, rider: Formulas | None) -> Callable[..., None]:
+    c, other, rides = common(f), _rider(rider), rider is not None
     vectors, corners, edge_vectors, add, Factors = c.vectors, c.corners, c.edge_vectors, c.add, c.Factors
 
-    @kernel
     def product(
         elements: wp.array[corners], own: wp.array[wp.int32], n_own: int, n_vertices: int, field: wp.array[vec3],
         factors: wp.array[Factors], other_factors: wp.array[other.Factors], out: wp.array[vec3],

@@ -32,10 +32,10 @@ def kernels(name: str) -> ModuleType:
 
 
 @cache
-def of_elements(file: str, name: str, *formulas: Formulas | None) -> "wp.Kernel":
-    """A kernel that a file, ``"elements"`` or ``"merging"``, makes of the formulas of one or two terms."""
+def of_elements(file: str, name: str, *formulas: Formulas | None) -> Any:
+    """A kernel, or several, that a function of a file makes from the formulas of one or two terms."""
     with _LOADING:
-        return getattr(kernels(file).kernels_of(*formulas), name)
+        return getattr(kernels(file), name)(*formulas)
 
 
 @cache

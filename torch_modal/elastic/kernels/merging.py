@@ -1,24 +1,29 @@
-"""Kernels that merge the rest shapes of a term into records (Eq. 8), and their adjoints."""
+"""Kernels that merge the rest shapes of a term into records (Eq. 8), and that add up measures."""
 
 from functools import cache
-from types import SimpleNamespace
 
 import warp as wp
 
 from torch_modal.elastic import formulas
 from torch_modal.elastic.bind import for_kernels
-from torch_modal.elastic.kernels.elements import common, kernel_of, module_of
+from torch_modal.elastic.kernels.elements import common, kernel_of
 from torch_modal.elastic.kernels.measures import functions_of
 from torch_modal.elastic.kernels.types import place, real, vec3
 from torch_modal.elastic.term import Formulas
 
 
 @cache
-def _merging(f: Formulas) -> SimpleNamespace:
-    """Functions that merge the rest shapes of an element."""
+def merge(f: Formulas) -> "wp.Kernel":
+    """The kernel that merges the rest shapes of a term into records (Eq. 8)."""
     c, own, softness_of = common(f), functions_of(f), for_kernels(formulas.softness)
     potential, fullness, weight, measure = own.potential, own.fullness, own.weight, own.measure
-    vectors, corners, edge_vectors, sums = c.vectors, c.corners, c.edge_vectors, potential.sums
+    vectors, corners, edge_vectors, sums, record = (
+        c.vectors,
+        c.corners,
+        c.edge_vectors,
+        potential.sums,
+        potential.record,
+    )
 
     if fullness is None:
 
@@ -42,7 +47,7 @@ def _merging(f: Formulas) -> SimpleNamespace:
         return result
 
     @wp.func
-    def merge(
+    def merge_rests(
         x: wp.array[vec3], n_vertices: int, q: corners, weights: wp.array[real], whole: wp.array[vec3],
         n_elements: int, altitude: real, relative: int, first: int, last: int,
     ):  # fmt: skip
@@ -57,18 +62,7 @@ def _merging(f: Formulas) -> SimpleNamespace:
                 usual += weights[r] * fullness(e, altitude)
         return result, usual
 
-    return SimpleNamespace(**locals())
-
-
-@cache
-def kernels_of(f: Formulas) -> SimpleNamespace:
-    """Kernels that merge the rest shapes of a term into records (Eq. 8)."""
-    c, potential, module = common(f), functions_of(f).potential, module_of(f, "forward")
-    corners, edge_vectors, record = c.corners, c.edge_vectors, potential.record
-    kernel, merging = kernel_of(f, module), _merging(f)
-    fullness, softness, merge_rests = merging.fullness, merging.softness, merging.merge
-
-    @kernel
+    @kernel_of("forward", f)
     def merge(
         elements: wp.array[corners], n_vertices: int, x: wp.array[vec3], weights: wp.array[real], whole: wp.array[vec3],
         stiffness: wp.array[real], start: wp.array[vec3], altitude: real, relative: int, n_shapes: int,
@@ -88,4 +82,33 @@ def kernels_of(f: Formulas) -> SimpleNamespace:
                 factor *= softness(fullness(edge_vectors(start, s * n_vertices, q), altitude), usual, relative)
             out[place(s * elements.shape[0], k)] = potential.merge_rests(moments, factor)
 
-    return SimpleNamespace(merge=merge)
+    return merge
+
+
+@cache
+def total(f: Formulas) -> "wp.Kernel":
+    """The kernel that adds up the measures of all elements, of a term that is no angle."""
+    c, functions = common(f), functions_of(f)
+    corners, edge_vectors, add = c.corners, c.edge_vectors, c.add
+
+    @kernel_of("total", f)
+    def total(
+        elements: wp.array[corners], n_vertices: int, x: wp.array[vec3], result: wp.array[vec3],
+        normal: wp.array[vec3], threads: int,
+    ):  # fmt: skip
+        """All measures of each shape together, in the second of two vertices; and the gradient of that, if wanted."""
+        i = wp.tid()
+        s = i // threads
+        whole = real(0.0)
+        for k in range(i - s * threads, elements.shape[0], threads):
+            q = elements[place(k, 0)]
+            e = edge_vectors(x, s * n_vertices, q)
+            if normal:
+                m, g = functions.linearise(e)
+                whole += m
+                add(normal, s * n_vertices, q, g)
+            else:
+                whole += functions.measure(e)
+        wp.atomic_add(result, 2 * s + 1, vec3(whole, real(0.0), real(0.0)))
+
+    return total

@@ -7,37 +7,11 @@ direction, which is swept. Gradients of totals, stiffnesses and changes are rows
 
 import warp as wp
 
-from torch_modal.elastic import steps as relax
+from torch_modal.elastic import formulas
+from torch_modal.elastic.bind import for_kernels
 from torch_modal.elastic.kernels.types import multiply, place, real, symmetric, vec2, vec3
 
-RIDGE = wp.constant(real(relax.RIDGE))
-
-
-@wp.func
-def invert(m: symmetric):
-    trace = m[0] + m[3] + m[5]
-    if trace <= real(0.0):
-        trace = real(1.0)
-    a = m[0] / trace + RIDGE
-    d = m[3] / trace + RIDGE
-    f = m[5] / trace + RIDGE
-    b = m[1] / trace
-    c = m[2] / trace
-    e = m[4] / trace
-    aa = d * f - e * e
-    bb = c * e - b * f
-    cc = b * e - c * d
-    per = real(1.0) / ((a * aa + b * bb + c * cc) * trace)
-    return symmetric(per * aa, per * bb, per * cc, per * (a * f - c * c), per * (b * c - a * e), per * (a * d - b * b))
-
-
-@wp.func
-def quotient(a: real, b: real):
-    # A sample that is solved exactly has nothing left: 0 / 0.
-    result = real(0.0)
-    if b > real(0.0):
-        result = a / b
-    return result
+quotient, invert = for_kernels(formulas.quotient), for_kernels(formulas.symmetric_inverse)
 
 
 @wp.func
