@@ -3,6 +3,7 @@
 import pytest
 import torch
 from conftest import Shapes
+from helpers.terms import WholeSlope
 from torch import Tensor
 from torch.func import hessian, jacfwd
 
@@ -34,6 +35,13 @@ class PlainShell(SmoothShell):
         super().__init__(faces)
         for term in self.terms:
             term.__class__ = type("Plain", (type(term),), {"linearise": Term.linearise})
+
+
+class SlopedShell(ShellEnergy):
+    """With the sum of a few angles as a further term."""
+
+    def __init__(self, faces: Tensor) -> None:
+        super().__init__(faces, terms=(WholeSlope(1e4),))
 
 
 class Case:
@@ -144,6 +152,10 @@ def require_true_hessian(case: Case) -> None:
 def test_each_term_alone(stiffness: tuple[float, float, float], cut: int, small_bars: Shapes) -> None:
     names = dict(zip(("alpha", "beta", "gamma"), stiffness, strict=True))
     require_true_hessian(Case(small_bars.faces[cut:], small_bars.keyframes[1] * 20, **names))
+
+
+def test_a_total_of_angles(small_bars: Shapes) -> None:
+    require_true_hessian(Case(small_bars.faces, small_bars.keyframes[1] * 20, SlopedShell))
 
 
 @pytest.mark.parametrize("stiffness", [{"gamma": 0.0}, {"alpha": 0.0, "beta": 0.0}], ids=["area", "volume"])

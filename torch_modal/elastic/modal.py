@@ -135,14 +135,19 @@ class ModalEnergy(AmplitudeEnergy[Placement]):
         terms, curved = [], []
         for i, (summand, record) in enumerate(zip(self.energy.parts, placement.reference.records, strict=True)):
             one, columns = summand.linearise(x, record, by_torch=True), getattr(self, f"edge_vectors_{i}").to(a)
+            beyond = None
             if summand.term.total:
                 row = one.gradients.transpose(0, 1).flatten(1) @ self.columns.to(a).flatten(1).mT
-                normal = one.slope * row, one.curvature[..., None] * row[:, :, None] * row[:, None, :]
+                outer = row[:, :, None] * row[:, None, :]
+                normal = one.slope * row, one.curvature[..., None] * outer
+                beyond = None if one.beyond is None else one.beyond[..., None] * outer
+                one = one._replace(beyond=None)
             else:
                 normal = _normal_equations(one, columns)
             terms.append((one.energy, *normal, one.curvature.sum(-1)))
             if second_order:
-                curved.append(_second_order(summand.term, one, columns))
+                own = _second_order(summand.term, one, columns)
+                curved.append(own if beyond is None else own + beyond)
         value, gradient, inner, stiffness = (reduce(torch.add, each) for each in zip(*terms, strict=True))
         stiffest = inner.diagonal(dim1=-2, dim2=-1).amax(-1)
         resolution = torch.finfo(x.dtype).eps * x.abs().amax((0, -1)) * (stiffest * stiffness).sqrt()
