@@ -1,8 +1,4 @@
-"""Backends of in-betweens: torch, the reference, and kernels of NVIDIA Warp, the fast path.
-
-A backend makes each part of an in-between. It is chosen once, when a layer is made (:func:`choose`); no other room
-knows which one it is.
-"""
+"""Backends of in-betweens: torch, the reference, and kernels of NVIDIA Warp. A layer chooses one when it is made."""
 
 import importlib.util
 import warnings
@@ -33,8 +29,8 @@ from torch_modal.geometry.rigid import best_rotation, volumes_of
 class TorchBackend:
     """Makes the parts of in-betweens, all in torch. Each takes K shapes of every sample with their weights.
 
-    This is the reference: it serves all dtypes, devices, gradients and transforms. Another backend overrides the parts
-    that it is faster at, and returns to these where it cannot serve; both give the same numbers, up to rounding.
+    It has all dtypes, devices, gradients and transforms. Another backend overrides the parts that it is faster at, and
+    falls back on these; both compute the same numbers, up to rounding.
     """
 
     mean_pose, volumes_of = staticmethod(mean_pose), staticmethod(volumes_of)

@@ -60,20 +60,15 @@ class Linearised(NamedTuple):
 
 
 def edge_vectors_of(rows: Tensor, corners: Tensor) -> Tensor:
-    """Vectors from the first vertex of each element to the others.
-
-    *Shape:* ``(3, ..., V), (n, M) -> (n-1, 3, ..., M)``.
-    """
+    """Vectors from the first vertex of each element to others. *Shape:* ``(3, ..., V), (n, M) -> (n-1, 3, ..., M)``."""
     first, *others = (pick(rows, corner) for corner in corners)
     return torch.stack([other - first for other in others])
 
 
 class AssembledTerm(nn.Module):
-    """A term on a mesh.
+    """A term on a mesh, from the vertices of each element. *Shape:* ``(M, n)``.
 
-    Args:
-        term: The term. It is not registered here: a term serves several meshes and is owned by the layer.
-        elements: Numbers of the vertices of each element. *Shape:* ``(M, n)``.
+    The term is not registered here: it may be on several meshes, and belongs to the layer.
     """
 
     term: Term
@@ -121,10 +116,7 @@ class AssembledTerm(nn.Module):
         return Linearised(energy, edge_vectors, measures, gradients, *self.term.derivatives(measures, record))
 
     def along(self, one: "Linearised", field: Tensor) -> tuple[Tensor, Tensor]:
-        """Edge vectors of a displacement, for a total itself, and the first change of the measures with it.
-
-        *Shape:* ``(3, B, V)``, extended; ``(n-1, 3, B, M), (B, M)``.
-        """
+        """Edge vectors of a displacement ``(3, B, V)``, for a total itself, and the first change of the measures."""
         if self.term.total:
             return field, (one.gradients * field).sum((0, -1))[:, None]
         vectors = self.edge_vectors(field)
@@ -198,12 +190,7 @@ class Energy(nn.Module):
 
     # ------------------------------------------------------------------------------------------------------- vertices
     def extend(self, rows: Tensor, anchors: Tensor | None = None) -> Tensor:
-        """The vertices, their centre and the anchors.
-
-        Args:
-            rows: *Shape:* ``(3, ..., V)``.
-            anchors: Zeros where None, for displacements. *Shape:* ``(3, ..., P)``.
-        """
+        """The vertices ``(3, ..., V)``, their centre and the anchors ``(3, ..., P)``: by default zeros, as if moved."""
         centre = pick(rows, self.used).mean(-1, keepdim=True)
         shape = *rows.shape[:-1], self.n_extended - self.n_vertices - 1
         return torch.cat([rows, centre, rows.new_zeros(shape) if anchors is None else anchors.expand(shape)], -1)
@@ -226,12 +213,7 @@ class Energy(nn.Module):
         return Rest(tuple(measures), tuple(weights))
 
     def reference_of(self, rest: Rest, stiffness: Sequence[float | Tensor]) -> Reference:
-        """One rest shape as the reference.
-
-        Args:
-            rest: Its measures and weights.
-            stiffness: Of each term: a number, or *shape* ``(..., M)`` or ``(..., 1)``.
-        """
+        """One rest shape as the reference, with the stiffness of each term: ``(..., M)``, ``(..., 1)`` or a number."""
         merged = [
             summand.term.merge_rests(measures[..., None, :], weights.expand_as(measures)[..., None, :], factor)
             for summand, measures, weights, factor in zip(self.parts, *rest, stiffness, strict=True)
@@ -254,14 +236,9 @@ def join_references(merged: Sequence[tuple[Tensor, Tensor]]) -> Reference:
 
 
 class EnergyAt:
-    """An energy at given shapes: value, gradient, and products with a convex Hessian.
+    """An energy at given shapes: value, gradient, and products with a convex Hessian. *Shape:* ``(3, B, V)``, extended.
 
     The Hessian is Gauss-Newton's and the second-order term of stretched edges: it is never negative.
-
-    Args:
-        energy: The energy.
-        extended: The shapes. *Shape:* ``(3, B, V)``, extended.
-        reference: What they are compared with.
     """
 
     def __init__(self, energy: Energy, extended: Tensor, reference: Reference) -> None:
@@ -340,11 +317,8 @@ class RestShapes(NamedTuple):
     def reference(self, energy: Energy, start: Tensor | None = None, relative: bool = False) -> Reference:
         """Merge the rest shapes into one reference of an energy, of the terms that the stiffnesses belong to.
 
-        Args:
-            energy: The energy.
-            start: Where a minimisation starts, for :meth:`torch_modal.elastic.term.Term.softening`. *Shape:* ``(B, V,
-                3)``.
-            relative: Elements keep as much of their stiffness as the rest shapes have of it.
+        Elements are softened by :meth:`torch_modal.elastic.term.Term.softening` where a minimisation starts, ``(B, V,
+        3)``; relative to the rest shapes if wanted.
         """
         rows = energy.extend(self.shapes.movedim(-1, 0))
         begin = None if start is None else energy.extend(start.movedim(-1, 0))

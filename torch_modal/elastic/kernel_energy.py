@@ -57,12 +57,7 @@ class KernelPoint(NamedTuple):
 
 
 class KernelEnergy(nn.Module):
-    """Terms towards K rest shapes, by kernels.
-
-    Args:
-        energy: The same in torch.
-        parts: Its terms.
-    """
+    """Terms towards K rest shapes, by kernels: an energy in torch, and its terms."""
 
     def __init__(self, energy: Energy, parts: Sequence[KernelTerm]) -> None:
         super().__init__()
@@ -92,10 +87,7 @@ class KernelEnergy(nn.Module):
         return x.new_zeros(len(x), sum(self.energy.n_anchors), 3)
 
     def fold(self, extended: Tensor, out: Tensor, to_anchors: Tensor | None = None) -> Tensor:
-        """The adjoint of :meth:`extend`, which is added to values of the vertices, and of the anchors.
-
-        *Shape:* ``(B, E, 3), (B, V, 3), (B, P, 3) -> (B, V, 3)``.
-        """
+        """Adjoint of :meth:`extend`: adds to values of vertices and anchors. *Shape:* ``(B, E, 3) -> (B, V, 3)``."""
         n, used = out.shape[1], self.energy.used
         if to_anchors is not None:
             to_anchors.add_(extended[:, n + 1 :])
@@ -150,15 +142,9 @@ class KernelEnergy(nn.Module):
     def back(
         self, x: Tensor, target: Target, at: KernelPoint, to_x: Tensor, to_target: Target, to_at: KernelPoint
     ) -> None:
-        """Adjoint of :meth:`at`: adds the gradients in the shapes and their target.
+        """Adjoint of :meth:`at`: adds the gradients in the shapes ``(B, V, 3)`` and their target.
 
-        Args:
-            x: The shapes. *Shape:* ``(B, V, 3)``.
-            target: What they were compared with.
-            at: The energy there.
-            to_x: Is added to. *Shape:* ``(B, V, 3)``.
-            to_target: Is added to.
-            to_at: Gradients in the energy there. Those in the totals are overwritten.
+        ``to_at`` has the gradients in the energy there; those in its sums and forces are overwritten.
         """
         (b, n), extends = x.shape[:2], self.extends
         shapes, to_shapes, to_forces, to_diagonal = x, to_x, to_at.gradient, to_at.diagonal

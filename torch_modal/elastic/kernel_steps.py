@@ -92,12 +92,7 @@ class KernelProblem:
         return at._replace(value=at.value + others.value, extra=others.product)
 
     def newton_direction(self, at: KernelPoint, n_products: int, keep: bool = False) -> tuple[Tensor, ...]:
-        """Conjugate gradients, fused.
-
-        Args:
-            at: The energy where the step starts.
-            n_products: Iterations.
-            keep: True to keep the fields of all iterations.
+        """Conjugate gradients, fused; the fields of all iterations are kept if wanted.
 
         Returns:
             The solution, *shape* ``(B, V, 3)``; residuals, directions, and the Hessian's products with these but for

@@ -16,12 +16,7 @@ from torch_modal.geometry.rigid import volumes_of
 
 
 class KernelTerm(nn.Module):
-    """A term on a mesh, by kernels.
-
-    Args:
-        part: The term.
-        mesh: The mesh.
-    """
+    """A term on a mesh, by kernels."""
 
     elements: Tensor
     term: Term
@@ -50,10 +45,7 @@ class KernelTerm(nn.Module):
         launch(kernel, (dim, self.n_elements), [self.elements, *arguments], adjoints and [None, *adjoints])
 
     def shapes_to_merge(self, shapes: Tensor) -> tuple[Tensor, Tensor | None]:
-        """The shapes that elements are merged of, and all measures together, where their mean counts.
-
-        *Shape:* ``(N, V, 3) -> (N, n, 3), (N, 2, 3)``.
-        """
+        """Shapes that elements are merged of, ``(N, n, 3)``, and the sum of the measures if weights need their mean."""
         if not self.formulas.uses_mean:
             return shapes, None
         sizes = shapes.new_zeros(len(shapes), 2, 3)
@@ -63,10 +55,7 @@ class KernelTerm(nn.Module):
 
 
 class KernelTotal(KernelTerm):
-    """A total by kernels: one element, which begins at zero, and whose vector consists of the sum of the measures.
-
-    Arguments as for the base class.
-    """
+    """A total by kernels: one element, which begins at zero, and whose vector consists of the sum of the measures."""
 
     summands: Tensor
 
@@ -91,14 +80,9 @@ class KernelTotal(KernelTerm):
         return own._replace(weight=None, periodic=False)
 
     def sum(self, dim: int, *arguments: object, area: bool = False, adjoints: Sequence[object] = ()) -> None:
-        """Run the kernel that adds up the measures, or its adjoint.
+        """Run the kernel that adds up the measures of some shapes, and areas if the weight needs them, or its adjoint.
 
-        Args:
-            dim: Number of shapes.
-            arguments: Number of their vertices; shapes, *shape* ``(N, V, 3)``; sums, *shape* ``(N, 2, 3)``; gradients
-                of these or None, *shape* ``(N, V, 3)``.
-            area: True to add the area, too, where the weight depends on it.
-            adjoints: Gradients of the arguments.
+        Arguments are the number of vertices, shapes, sums ``(N, 2, 3)``, and gradients of these or None.
         """
         kernel = of_elements("merging", "total", self.formulas_of_sum)
         launch(kernel, (dim, len(self.summands)), [self.summands, *arguments], adjoints and [None, *adjoints])
@@ -117,10 +101,7 @@ class KernelTotal(KernelTerm):
 
 
 class KernelVolume(KernelTotal):
-    """The volume of a mesh, by kernels.
-
-    Cones join the boundary of an open surface to its centre. Arguments as for the base class.
-    """
+    """The volume of a mesh, by kernels. Cones join the boundary of an open surface to its centre."""
 
     formulas = KernelTerm.formulas
 
@@ -161,12 +142,9 @@ def by_kernels(part: AssembledTerm, mesh: Mesh) -> KernelTerm:
 
 
 class Pass(nn.Module):
-    """A pass over elements: a term, and perhaps one of edges that rides on it.
+    """A pass over the elements of a term and, if there is a rider, a term of edges, each with its number.
 
-    Args:
-        term: The number of the term, and the term.
-        rider: The number of the other, and the other.
-        own: For each edge the element that begins with it, or -1. *Shape:* ``(E,)``.
+    ``own`` has the element that begins with each edge, or -1. *Shape:* ``(E,)``.
     """
 
     elements: Tensor

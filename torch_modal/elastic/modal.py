@@ -66,13 +66,7 @@ class AmplitudeEnergy(nn.Module, Generic[Placed]):
         return value, back(torch.ones_like(value))[0]
 
     def derivatives(self, a: Tensor, placement: Placed, second_order: bool = True) -> Derivatives:
-        """Energy, gradient and Hessians at ``a``.
-
-        Args:
-            a: Amplitudes. *Shape:* ``(B, n)``.
-            placement: What the energy depends on.
-            second_order: True to compute the term beyond Gauss-Newton.
-        """
+        """Energy, gradient and Hessians at ``a``, with the term beyond Gauss-Newton if wanted. *Shape:* ``(B, n)``."""
         raise NotImplementedError
 
 
@@ -135,19 +129,17 @@ class ModalEnergy(AmplitudeEnergy[Placement]):
         terms, curved = [], []
         for i, (summand, record) in enumerate(zip(self.energy.parts, placement.reference.records, strict=True)):
             one, columns = summand.linearise(x, record, by_torch=True), getattr(self, f"edge_vectors_{i}").to(a)
-            beyond = None
             if summand.term.total:
                 row = one.gradients.transpose(0, 1).flatten(1) @ self.columns.to(a).flatten(1).mT
-                outer = row[:, :, None] * row[:, None, :]
-                normal = one.slope * row, one.curvature[..., None] * outer
-                beyond = None if one.beyond is None else one.beyond[..., None] * outer
+                normal = one.slope * row, one.curvature[..., None] * row[:, :, None] * row[:, None, :]
+                if second_order and one.beyond is not None:
+                    curved.append(one.beyond[..., None] * row[:, :, None] * row[:, None, :])
                 one = one._replace(beyond=None)
             else:
                 normal = _normal_equations(one, columns)
             terms.append((one.energy, *normal, one.curvature.sum(-1)))
             if second_order:
-                own = _second_order(summand.term, one, columns)
-                curved.append(own if beyond is None else own + beyond)
+                curved.append(_second_order(summand.term, one, columns))
         value, gradient, inner, stiffness = (reduce(torch.add, each) for each in zip(*terms, strict=True))
         stiffest = inner.diagonal(dim1=-2, dim2=-1).amax(-1)
         resolution = torch.finfo(x.dtype).eps * x.abs().amax((0, -1)) * (stiffest * stiffness).sqrt()

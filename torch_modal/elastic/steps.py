@@ -91,17 +91,14 @@ def descend(
     """Steps of a truncated Newton method on all vertices, shortened where the energy would rise.
 
     Each step solves with a convex Hessian by conjugate gradients, preconditioned by its diagonal blocks and cut short:
-    the error that a modal space leaves is local, so a few iterations suffice. Every sample takes the same
-    number of both, so that the result is differentiable like any other expression.
+    the error of a base or a modal space is local, so a few iterations suffice. Every sample takes the same number of
+    both, so that the result is differentiable.
 
     Args:
         problem: A :class:`SumOfEnergies`, or one that kernels solve.
         x: Where to start. *Shape:* ``(B, V, 3)``.
         products: Iterations of conjugate gradients in each Newton step.
         taken: A list to which each step is added.
-
-    Returns:
-        *Shape:* ``(B, V, 3)``.
     """
     at = None
     for k, n_products in enumerate(products, 1):
@@ -125,14 +122,11 @@ def step_length(before: Tensor, slope: Tensor, after: Tensor, largest: Tensor) -
     """Length that minimises the parabola along a step, at most 1: continuous in the step, unlike a line search.
 
     Args:
-        before: The energy where the step starts. *Shape:* ``(B,)``.
-        slope: Its derivative along the step, at most zero. *Shape:* ``(B,)``.
-        after: The energy where the whole step leads. *Shape:* ``(B,)``.
+        before: The energy where the step starts. *Shape:* ``(B,)``, here and below.
+        slope: Its derivative along the step, at most zero.
+        after: The energy where the whole step leads.
         largest: Largest coordinate of the step; none below :data:`SHORTEST_MOVE` is shortened, and one of ten times
-            that in full. *Shape:* ``(B,)``.
-
-    Returns:
-        *Shape:* ``(B,)``.
+            that in full.
     """
     half, finite = -0.5 * slope, after.isfinite()
     rounding = ENERGY_ROUNDING * torch.finfo(before.dtype).eps * before.detach().abs()
@@ -147,11 +141,7 @@ def step_length(before: Tensor, slope: Tensor, after: Tensor, largest: Tensor) -
 
 
 class SumOfEnergies:
-    """Several energies as one, and the solution with its Hessian by torch.
-
-    Args:
-        energies: The energies.
-    """
+    """Several energies as one, and the solution with its Hessian by torch."""
 
     def __init__(self, energies: Sequence[FreeEnergy]) -> None:
         self.energies = energies
@@ -225,13 +215,7 @@ def conjugate_gradients(
 
 
 class TermsTowards:
-    """Terms towards a reference.
-
-    Args:
-        energy: The terms.
-        reference: What they are compared with.
-        anchors: Their fixed points, where there are some. *Shape:* ``(B, P, 3)``.
-    """
+    """Terms towards a reference, perhaps with fixed points as anchors. *Shape:* ``(B, P, 3)``."""
 
     def __init__(self, energy: Energy, reference: Reference, anchors: Tensor | None = None) -> None:
         self.energy, self.reference = energy, reference
@@ -261,12 +245,7 @@ ExtraEnergies = Callable[[slice, Tensor], Sequence[FreeEnergy]]
 
 
 class FineEnergy(nn.Module):
-    """All terms on the caller's mesh.
-
-    Args:
-        mesh: The mesh.
-        terms: The terms; the terms of Eq. 5 come first.
-    """
+    """All terms on the caller's mesh; the terms of Eq. 5 come first."""
 
     def __init__(self, mesh: Mesh, terms: Sequence[Term]) -> None:
         super().__init__()

@@ -185,12 +185,7 @@ class Term(nn.Module):
     def energies(self, measures: Tensor, record: Tensor) -> Tensor:
         """Energy of each element, but for what remains.
 
-        Args:
-            measures: *Shape:* ``(..., M)``.
-            record: Of :meth:`merge_rests`. *Shape:* ``(..., R, M)``.
-
-        Returns:
-            *Shape:* ``(..., M)``.
+        *Shape:* measures ``(..., M)``, a record of :meth:`merge_rests` ``(..., R, M) -> (..., M)``.
         """
         weight, value = record.unbind(-2)
         return formulas.square_energy(self.difference(measures, value), (weight, real(0.0)))
@@ -270,10 +265,7 @@ class Term(nn.Module):
     def tension(self, edge_vectors: Tensor, slope: Tensor, curvature: Tensor) -> Tensor | None:
         """Stiffness that stretched elements of two vertices have across; None for elements of more.
 
-        Args:
-            edge_vectors: *Shape:* ``(1, 3, B, M)``.
-            slope: First derivative of the energy in each measure. *Shape:* ``(B, M)``.
-            curvature: Second derivative. *Shape:* ``(B, M)``.
+        *Shape:* ``(1, 3, B, M)``, first and second derivatives of the energy in the measures ``(B, M) -> (B, M)``.
         """
         return None
 

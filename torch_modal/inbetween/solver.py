@@ -91,7 +91,7 @@ class InBetweenSolver(nn.Module):
         """
         weights = samples.weights
         shapes, pose, usable = self.alignment(samples.keyframes, weights)
-        anchors = self.fine.energy.anchors
+        anchors = self.fine.energy.anchors if any(self.fine.energy.n_anchors) else None
         if anchors is not None:
             anchors = self.alignment.to_frame(anchors.to(weights).expand(len(weights), -1, -1), pose)
         rests = RestShapes(shapes, weights, samples.stiffness, anchors)

@@ -94,10 +94,7 @@ def common(f: Formulas) -> SimpleNamespace:
 
 
 def kernel_of(kind: str, f: Formulas, rider: Formulas | None = None) -> Callable[[Callable[..., None]], "wp.Kernel"]:
-    """The decorator of kernels of one or two terms, in a module that Warp compiles as a whole.
-
-    They are not differentiated, but for gradients of a measure by ``wp.grad``.
-    """
+    """The decorator of kernels of one or two terms, in a module that Warp compiles as a whole."""
     by_grad = not all(each.exact for each in (f, rider) if each is not None)
     return wp.kernel(enable_backward=by_grad, module=wp.get_module(f"{__name__}.{f.name}.{kind}"))  # type: ignore[no-any-return]
 
@@ -136,10 +133,10 @@ def _rider(f: Formulas | None) -> SimpleNamespace:
 
 @cache
 def convex(f: Formulas, rider: Formulas | None) -> SimpleNamespace:
-    """Value, gradient and convex Hessian of a term, and of another that rides on its elements.
+    """Value, gradient and convex Hessian of a term, and of a rider: a term of edges, on their first edge vectors.
 
-    Where both read and write the same vertices, one pass takes two thirds of the time of two. The elements are then
-    those of the rider; ``own`` has the number of the term's element, or -1 where there is none.
+    One pass takes two thirds of the time of two. The elements are then those of the rider; ``own`` has the number of
+    the term's element, or -1 where there is none.
     """
     kernel = kernel_of(f"convex.{rider.name if rider else None}", f, rider)
     return SimpleNamespace(linearise=kernel(_linearise(f, rider)), product=kernel(_product(f, rider)))
@@ -156,10 +153,7 @@ def _linearise(f: Formulas, rider: Formulas | None) -> Callable[..., None]:
         gradient: wp.array[vec3], diagonal: wp.array[symmetric], factors: wp.array[Factors],
         other_factors: wp.array[other.Factors], threads: int,
     ):  # fmt: skip
-        """Energy, gradient, and blocks and factors of the convex Hessian.
-
-        What has no arrays is left out.
-        """
+        """Energy, gradient, and blocks and factors of the convex Hessian, as far as there are arrays."""
         i = wp.tid()
         s = i // threads
         v = s * n_vertices

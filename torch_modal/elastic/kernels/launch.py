@@ -64,10 +64,7 @@ def _load(module: "str | wp.Module", device: torch.device) -> None:
 
 @contextmanager
 def _quietly() -> Iterator[None]:
-    """Warp without its messages, such as that ``wp.grad`` is not differentiated, or that there is no GPU.
-
-    Native code writes the latter to the file descriptor, where no setting of Warp's or Python's reaches.
-    """
+    """Warp without its messages; native code writes that there is no GPU to the file descriptor, past all settings."""
     import warp as wp
 
     level, wp.config.log_level = wp.config.log_level, wp.LOG_ERROR
@@ -114,10 +111,10 @@ def launch(
 
     Args:
         kernel: Of :func:`kernels`.
-        dim: Number of samples; and of what each has, where a sample may have several threads, whose number is then the
-            kernel's last argument. Each takes the first of what is left, then every so many-th. On a CPU there is one.
-        arguments: Its arguments but for that: contiguous tensors, None for no array, and numbers.
-        adjoints: Gradients of each, where the adjoint is wanted; None for what has none.
+        dim: Number of samples; and of the elements of each, if the kernel's last argument is the number of threads of
+            a sample: one on a CPU, one for each element on a GPU.
+        arguments: Its other arguments: contiguous tensors, None for no array, and numbers.
+        adjoints: Gradients of each for the adjoint; None where an argument has none.
 
     Raises:
         RuntimeError: A tensor is not contiguous, or of another type than the kernel's.

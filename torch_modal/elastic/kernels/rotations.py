@@ -168,10 +168,7 @@ def sign_votes(
     order: wp.array[wp.int32], parents: wp.array[wp.int32], pieces: wp.array[wp.int32], n_pieces: int,
     quaternions: wp.array[vec4], areas: wp.array[real], sign: wp.array[real], vote: wp.array[real],
 ):  # fmt: skip
-    """Signs passed down the tree, in an order of parents before children; then each piece votes.
-
-    One thread for a sample.
-    """
+    """Signs passed down the tree, parents before children; then each piece votes. One thread for a sample."""
     s = wp.tid()
     n = order.shape[0]
     for j in range(n):
