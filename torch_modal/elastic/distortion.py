@@ -9,7 +9,6 @@ from torch_modal.autograd import is_eager
 from torch_modal.elastic import formulas
 from torch_modal.elastic.energy import Energy, RestShapes, edge_vectors_of
 from torch_modal.elastic.kernels.launch import kernels, launch
-from torch_modal.elastic.shell import N_SHELL_TERMS
 from torch_modal.elastic.steps import TermsTowards
 from torch_modal.elastic.term import Mesh
 
@@ -30,7 +29,7 @@ class Distortion(nn.Module):
 
     Args:
         mesh: The mesh.
-        further: Terms beyond Eq. 5.
+        further: Terms beyond Eq. 5, which come last.
     """
 
     edge: Tensor
@@ -55,7 +54,7 @@ class Distortion(nn.Module):
         """The distortion of S shapes of each sample. *Shape of each:* ``(B, V, 3) -> (S, B)``."""
         total = self.of_shell(shapes, rests)
         if self.further is not None:
-            rests = rests._replace(stiffness=rests.stiffness[N_SHELL_TERMS:])
+            rests = rests._replace(stiffness=rests.stiffness[-len(self.further.parts) :])
             terms = TermsTowards(self.further, rests.reference(self.further), rests.anchors)
             total = total + torch.stack([terms.value(x) for x in shapes])
         return total

@@ -17,9 +17,6 @@ from torch_modal.keyframes.arrays import as_faces
 ALPHA, BETA, GAMMA = 500.0, 10.0, 1000.0
 """The paper's stiffnesses. Eq. 5 is not scale-invariant: they are meant for shapes of `CANONICAL_SIZE`."""
 
-N_SHELL_TERMS = 3
-"""Number of terms in Eq. 5; they come first."""
-
 
 class Measures(NamedTuple):
     """The measures of Eq. 5 on a shape."""

@@ -11,7 +11,6 @@ from torch_modal.elastic.backend import choose
 from torch_modal.elastic.energy import Energy, RestShapes
 from torch_modal.elastic.implicit import solve_implicit
 from torch_modal.elastic.minimise import Solution, Status
-from torch_modal.elastic.shell import N_SHELL_TERMS
 from torch_modal.elastic.term import Mesh, Term
 from torch_modal.inbetween.alignment import KeyframeAlignment, Pose
 from torch_modal.inbetween.blend import RotationBlend
@@ -55,7 +54,7 @@ class InBetweenSolver(nn.Module):
         solver: Solver,
     ) -> None:
         super().__init__()
-        backend, others = choose(solver.backend), terms[N_SHELL_TERMS:]
+        backend, others = choose(solver.backend), objective.terms
         self.solver, self.mesh, self.backend = solver, mesh, backend
         self.alignment = KeyframeAlignment(references, mesh.connectivity, backend)
         self.fine = backend.fine_energy(mesh, terms)
