@@ -25,7 +25,7 @@ from torch_modal.elastic.distortion import Distortion, KernelDistortion
 from torch_modal.elastic.energy import Energy, RestShapes
 from torch_modal.elastic.kernel_energy import KernelEnergy, _MergeRests
 from torch_modal.elastic.kernel_steps import KernelFineEnergy, KernelProblem, _Relaxation
-from torch_modal.elastic.kernel_terms import by_kernels, serves
+from torch_modal.elastic.kernel_terms import by_kernels, has_kernels
 from torch_modal.elastic.kernels import launch
 from torch_modal.elastic.rotations import WarpRotations, best_rotations, mean_pose
 from torch_modal.elastic.steps import FineEnergy, SumOfEnergies, TermsTowards, descend
@@ -50,7 +50,7 @@ DOUBLE = torch.float64
 
 def by_kernels_alone(energy: Energy, mesh: Mesh) -> KernelEnergy:
     """Of terms that kernels serve."""
-    assert all(map(serves, energy.parts))
+    assert all(map(has_kernels, energy.parts))
     return KernelEnergy(energy, [by_kernels(part, mesh) for part in energy.parts])
 
 

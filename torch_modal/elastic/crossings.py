@@ -1,4 +1,4 @@
-"""Candidates for triangles that cross, by a kernel of NVIDIA Warp: one tree of faces serves all shapes."""
+"""Candidates for triangles that cross, by a kernel of NVIDIA Warp: one tree of faces for all shapes."""
 
 import numpy as np
 import torch

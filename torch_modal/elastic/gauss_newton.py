@@ -65,7 +65,7 @@ class GaussNewtonStep(nn.Module, Generic[Placed]):
 
         Args:
             a: Amplitudes. *Shape:* ``(B, n)``.
-            placement: What the energy knows of each sample.
+            placement: The data of the energy for each sample.
             at: The derivatives there, if known.
 
         Raises:

@@ -16,7 +16,7 @@ from torch_modal.elastic.kernel_terms import KernelTerm, KernelTotal, Pass, pass
 from torch_modal.elastic.kernels.function import Operation
 
 Factors = Sequence[Sequence[Tensor | None]]
-"""Factors of the term, and of the term that rides on it, of each pass. *Shape of each:* ``(B, M, f)``."""
+"""Factors of the term, and of the fused one, of each pass. *Shape of each:* ``(B, M, f)``."""
 Seen = tuple[Tensor, Tensor | None]
 """Shapes of the elements that are merged, and the sum of their measures where it counts."""
 
@@ -66,7 +66,7 @@ class KernelEnergy(nn.Module):
         #: Numbers of the terms whose rest shapes are merged by kernels, and by torch.
         self.weighed = [i for i, term in enumerate(parts) if term.formulas.weight is not None]
         self.unweighed = [i for i in range(len(parts)) if i not in self.weighed]
-        #: The terms in passes over elements, each alone or with another that rides on it.
+        #: The terms in passes over elements, each alone or fused with another.
         self.passes: Sequence[Pass] = nn.ModuleList(passes_of(parts, energy.n_extended))  # type: ignore[assignment]
         #: Passes over the one element of each total.
         totals = [Pass((i, term)) for i, term in enumerate(parts) if isinstance(term, KernelTotal)]
@@ -74,7 +74,7 @@ class KernelEnergy(nn.Module):
         #: True if the elements of passes have vertices beyond those of the mesh; and if any term's have.
         self.extends = any(one.term.extends for one in self.passes)
         self.any_extends = any(term.extends for term in parts)
-        #: True if kernels know the adjoints of all terms.
+        #: True if all terms have adjoints by kernels.
         self.exact = all(part.term.kernel_formulas(part.n).exact for part in parts)  # type: ignore[union-attr]
 
     def extend(self, x: Tensor, anchors: Tensor | None = None) -> Tensor:

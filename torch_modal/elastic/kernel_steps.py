@@ -11,7 +11,7 @@ from torch_modal import trees
 from torch_modal.autograd import is_eager
 from torch_modal.elastic.energy import Energy, Reference, RestShapes
 from torch_modal.elastic.kernel_energy import KernelEnergy, KernelPoint, Target
-from torch_modal.elastic.kernel_terms import by_kernels, serves
+from torch_modal.elastic.kernel_terms import by_kernels, has_kernels
 from torch_modal.elastic.kernels.function import Operation
 from torch_modal.elastic.kernels.launch import kernels, launch
 from torch_modal.elastic.steps import (
@@ -33,8 +33,8 @@ class KernelFineEnergy(FineEnergy):
 
     def __init__(self, mesh: Mesh, terms: Sequence[Term]) -> None:
         super().__init__(mesh, terms)
-        served = [serves(part) for part in self.energy.parts]
-        #: Numbers of the terms that kernels serve, and of the others.
+        served = [has_kernels(part) for part in self.energy.parts]
+        #: Numbers of the terms with kernels, and of the others.
         self.own, self.others = ([i for i, one in enumerate(served) if one == own] for own in (True, False))
         shell = Energy(mesh, [terms[i] for i in self.own]) if self.others else self.energy
         self.further = Energy(mesh, [terms[i] for i in self.others]) if self.others else None

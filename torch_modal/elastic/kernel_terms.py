@@ -37,10 +37,10 @@ class KernelTerm(nn.Module):
     @cached_property
     def formulas(self) -> Formulas:
         """The formulas that kernels are made from."""
-        return self.term.kernel_formulas(self.n)  # type: ignore[return-value]  # :func:`serves` has seen them
+        return self.term.kernel_formulas(self.n)  # type: ignore[return-value]  # :func:`has_kernels` has seen them
 
     def launch(self, name: str, dim: int, *arguments: object, adjoints: Sequence[object] = ()) -> None:
-        """Run a kernel over the elements of so many samples, or its adjoint."""
+        """Run a kernel over the elements of each sample, or its adjoint."""
         kernel = of_elements("merging", name, self.formulas)
         launch(kernel, (dim, self.n_elements), [self.elements, *arguments], adjoints and [None, *adjoints])
 
@@ -129,7 +129,7 @@ def volumes_by_kernel(x: Tensor, faces: Tensor) -> Tensor:
     return sizes[:, 1, 0].view(x.shape[:-2]).to(x)
 
 
-def serves(part: AssembledTerm) -> bool:
+def has_kernels(part: AssembledTerm) -> bool:
     """True for a term that kernels compute."""
     n = len(part.corners) - 1
     return n <= 3 and part.term.kernel_formulas(n) is not None
@@ -142,7 +142,7 @@ def by_kernels(part: AssembledTerm, mesh: Mesh) -> KernelTerm:
 
 
 class Pass(nn.Module):
-    """A pass over the elements of a term and, if there is a rider, a term of edges, each with its number.
+    """A pass over the elements of a term, perhaps fused with a term of edges, each with its number.
 
     ``own`` has the element that begins with each edge, or -1. *Shape:* ``(E,)``.
     """
@@ -151,37 +151,37 @@ class Pass(nn.Module):
     own: Tensor | None
 
     def __init__(
-        self, term: tuple[int, KernelTerm], rider: tuple[int, KernelTerm] | None = None, own: Tensor | None = None
+        self, term: tuple[int, KernelTerm], fused: tuple[int, KernelTerm] | None = None, own: Tensor | None = None
     ) -> None:
         super().__init__()
         self.number, self.term = term
-        self.other = rider and rider[0]
-        self.rider = rider and rider[1]
+        self.other = fused and fused[0]
+        self.fused = fused and fused[1]
         elements = self.term.elements
-        if self.rider is not None and own is not None:
+        if self.fused is not None and own is not None:
             # Where there is no element, all further vertices are the first.
-            edges, n = self.rider.elements, elements.shape[1]
+            edges, n = self.fused.elements, elements.shape[1]
             alone = torch.cat([edges, edges[:, :1].expand(-1, n - 2)], 1)
             elements = torch.where((own < 0)[:, None], alone, elements[own.clamp_min(0)]).contiguous()
-        #: Numbers of elements of the term and the rider, and of the factors of each: gradient, and two stiffnesses.
-        self.sizes = [part and (part.n_elements, 3 * part.formulas.n + 2) for part in (self.term, self.rider)]
+        #: Numbers of elements of the term and the fused one, and of the factors of each: gradient, and two stiffnesses.
+        self.sizes = [part and (part.n_elements, 3 * part.formulas.n + 2) for part in (self.term, self.fused)]
         self.n_elements, self.n_own = len(elements), self.term.n_elements
         self.register_buffer("elements", elements, persistent=False)
         self.register_buffer("own", None if own is None else own.int(), persistent=False)
 
     def of_terms(self, values: Sequence[Tensor]) -> tuple[Tensor, Tensor | None]:
-        """The values of the term and of the rider, from those of all terms."""
+        """The values of the term and of the fused one, from the values of all terms."""
         return values[self.number], None if self.other is None else values[self.other]
 
     def launch(self, name: str, dim: int, *arguments: object, adjoints: Sequence[object] = ()) -> None:
-        """Run a kernel over the elements of so many samples, or its adjoint."""
-        kernels = of_elements("elements", "convex", self.term.formulas, self.rider and self.rider.formulas)
+        """Run a kernel over the elements of each sample, or its adjoint."""
+        kernels = of_elements("elements", "convex", self.term.formulas, self.fused and self.fused.formulas)
         arguments = self.elements, self.own, self.n_own, *arguments
         launch(getattr(kernels, name), (dim, self.n_elements), arguments, adjoints and [None] * 3 + [*adjoints])
 
 
 def passes_of(parts: Sequence[KernelTerm], n_vertices: int) -> list[Pass]:
-    """The terms but totals in as few passes as may be: edges ride on elements that begin with them."""
+    """Group the terms but totals into passes: edges are fused with elements that begin with them."""
     terms = [(i, part) for i, part in enumerate(parts) if not isinstance(part, KernelTotal)]
     ends = torch.tensor([n_vertices, 1])
     for edges in (term for term in terms if term[1].formulas.even):

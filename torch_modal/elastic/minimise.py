@@ -11,7 +11,7 @@ from torch_modal.autograd import without_saved_tensor_hooks
 from torch_modal.elastic.gauss_newton import GaussNewtonStep, add_ridge
 from torch_modal.elastic.modal import AmplitudeEnergy, Placed
 
-# A Hessian serves for as long as each step leaves at most this part of the gradient: a new one costs ten gradients.
+# A Hessian is kept as long as each step leaves at most this part of the gradient: a new one costs ten gradients.
 SHRINKAGE = 0.5
 
 
@@ -70,7 +70,7 @@ def minimise(
 ) -> Solution:
     """Minimise by :class:`~torch_modal.elastic.gauss_newton.GaussNewtonStep`, and by further steps with its Hessian.
 
-    The first Hessian is Gauss-Newton's, at a fifth of the cost of the full one. Each serves for as long as the gradient
+    The first Hessian is Gauss-Newton's, at a fifth of the cost of the full one. Each is kept as long as the gradient
     shrinks to :data:`SHRINKAGE`. A converged sample takes one more step, whose gradient is not evaluated: the gradient
     norm of the solution is the one before. A sample's result does not depend on its batch.
 
@@ -78,7 +78,7 @@ def minimise(
         energy: The energy of the amplitudes: a :class:`~torch_modal.elastic.modal.ModalEnergy`, or what has its
             methods ``value``, ``value_and_gradient`` and ``derivatives``.
         a: Where to start. *Shape:* ``(B, n)``.
-        placement: What the energy knows of each sample: nested tuples of tensors. *Shape of each:* ``(B, ...)``.
+        placement: The data of the energy for each sample: nested tuples of tensors. *Shape of each:* ``(B, ...)``.
         max_steps: Number of Hessians at most.
         tolerance: Bound on the gradient norm, relative to the one at the start.
     """

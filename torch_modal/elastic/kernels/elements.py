@@ -93,15 +93,15 @@ def common(f: Formulas) -> SimpleNamespace:
     return SimpleNamespace(**locals())
 
 
-def kernel_of(kind: str, f: Formulas, rider: Formulas | None = None) -> Callable[[Callable[..., None]], "wp.Kernel"]:
+def kernel_of(kind: str, f: Formulas, fused: Formulas | None = None) -> Callable[[Callable[..., None]], "wp.Kernel"]:
     """The decorator of kernels of one or two terms, in a module that Warp compiles as a whole."""
-    by_grad = not all(each.exact for each in (f, rider) if each is not None)
+    by_grad = not all(each.exact for each in (f, fused) if each is not None)
     return wp.kernel(enable_backward=by_grad, module=wp.get_module(f"{__name__}.{f.name}.{kind}"))  # type: ignore[no-any-return]
 
 
 @cache
-def _rider(f: Formulas | None) -> SimpleNamespace:
-    """Functions of a term of edges that rides on one of larger elements, on their first edge vectors; or of none."""
+def _fused(f: Formulas | None) -> SimpleNamespace:
+    """Functions of a term of edges that is fused with one of larger elements, on their first edge vectors."""
     if f is None:
         return SimpleNamespace(record=real, Factors=real)
     c, own = common(f), functions_of(f)
@@ -132,18 +132,18 @@ def _rider(f: Formulas | None) -> SimpleNamespace:
 
 
 @cache
-def convex(f: Formulas, rider: Formulas | None) -> SimpleNamespace:
-    """Value, gradient and convex Hessian of a term, and of a rider: a term of edges, on their first edge vectors.
+def convex(f: Formulas, fused: Formulas | None) -> SimpleNamespace:
+    """Value, gradient and convex Hessian of a term, fused with a term of edges, on their first edge vectors.
 
-    One pass takes two thirds of the time of two. The elements are then those of the rider; ``own`` has the number of
-    the term's element, or -1 where there is none.
+    One pass takes two thirds of the time of two. The elements then begin with the edges; ``own`` has the number of the
+    term's element, or -1 where there is none.
     """
-    kernel = kernel_of(f"convex.{rider.name if rider else None}", f, rider)
-    return SimpleNamespace(linearise=kernel(_linearise(f, rider)), product=kernel(_product(f, rider)))
+    kernel = kernel_of(f"convex.{fused.name if fused else None}", f, fused)
+    return SimpleNamespace(linearise=kernel(_linearise(f, fused)), product=kernel(_product(f, fused)))
 
 
-def _linearise(f: Formulas, rider: Formulas | None) -> Callable[..., None]:
-    c, functions, other, n, rides = common(f), functions_of(f), _rider(rider), f.n, rider is not None
+def _linearise(f: Formulas, fused: Formulas | None) -> Callable[..., None]:
+    c, functions, other, n, fuses = common(f), functions_of(f), _fused(fused), f.n, fused is not None
     vectors, corners, edge_vectors, add, Factors = c.vectors, c.corners, c.edge_vectors, c.add, c.Factors
     potential, record = functions.potential, functions.potential.record
 
@@ -167,10 +167,10 @@ def _linearise(f: Formulas, rider: Formulas | None) -> Callable[..., None]:
             edge = place(s * elements.shape[0], k)
             if gradient:
                 energy = real(0.0)
-                ridden = vec3()
+                of_edge = vec3()
                 square = symmetric()
-                if wp.static(rides):
-                    energy, ridden, square = other.linearise(e[0], others, edge, other_factors)
+                if wp.static(fuses):
+                    energy, of_edge, square = other.linearise(e[0], others, edge, other_factors)
                 summed += energy
                 received = vectors()
                 g = vectors()
@@ -185,7 +185,7 @@ def _linearise(f: Formulas, rider: Formulas | None) -> Callable[..., None]:
                     if diagonal:
                         along, across = c.stiffness(m, slope, real(2.0) * to[0])
                         factors[place(s * n_own, at)] = c.factors_of(g, along, across)
-                received[0] += ridden
+                received[0] += of_edge
                 add(gradient, v, q, received)
                 if diagonal:
                     whole = g[0]
@@ -195,7 +195,7 @@ def _linearise(f: Formulas, rider: Formulas | None) -> Callable[..., None]:
                         wp.atomic_add(diagonal, place(v, q[j + 1]), block(along, g[j], across))
                     wp.atomic_add(diagonal, place(v, q[0]), square + block(along, whole, across))
             else:
-                if wp.static(rides):
+                if wp.static(fuses):
                     summed += other.energy(e[0], others, edge)
                 if at >= 0:
                     summed += potential.energy(functions.measure(e), rests[place(s * n_own, at)])
@@ -204,8 +204,8 @@ def _linearise(f: Formulas, rider: Formulas | None) -> Callable[..., None]:
     return linearise
 
 
-def _product(f: Formulas, rider: Formulas | None) -> Callable[..., None]:
-    c, other, rides = common(f), _rider(rider), rider is not None
+def _product(f: Formulas, fused: Formulas | None) -> Callable[..., None]:
+    c, other, fuses = common(f), _fused(fused), fused is not None
     vectors, corners, edge_vectors, add, Factors = c.vectors, c.corners, c.edge_vectors, c.add, c.Factors
 
     def product(
@@ -223,16 +223,16 @@ def _product(f: Formulas, rider: Formulas | None) -> Callable[..., None]:
             if own:
                 at = own[place(k, 0)]
             e = edge_vectors(field, s * n_vertices, q)
-            ridden = vec3()
+            of_edge = vec3()
             form = real(0.0)
-            if wp.static(rides):
-                ridden, form = other.product(other_factors, place(s * elements.shape[0], k), e[0])
+            if wp.static(fuses):
+                of_edge, form = other.product(other_factors, place(s * elements.shape[0], k), e[0])
                 total += form
             received = vectors()
             if at >= 0:
                 received, form = c.product(factors[place(s * n_own, at)], e)
                 total += form
-            received[0] += ridden
+            received[0] += of_edge
             add(out, s * n_vertices, q, received)
         if scalars:
             wp.atomic_add(scalars, s, vec2(real(0.0), total))
