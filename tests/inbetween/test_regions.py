@@ -10,8 +10,9 @@ from conftest import Shapes
 from helpers.shapes import edge_error, largest
 from torch import Tensor
 
-from torch_modal.elastic.bend import NEEDLE, SquaredBend, fullness
+from torch_modal.elastic.bend import NEEDLE, SquaredBend
 from torch_modal.elastic.energy import Energy, Rest, RestShapes
+from torch_modal.elastic.formulas import hinge_fullness
 from torch_modal.elastic.minimise import Status
 from torch_modal.elastic.shell import ShellEnergy
 from torch_modal.elastic.stretch import Stretch
@@ -137,7 +138,7 @@ def test_minimises_eq_5_against_measures_half_way_and_moves_nothing_else(
 
     rests = [rest_of(y) for y in (x, other)]
 
-    x_full, y_full = (fullness(energy.parts[1].edge_vectors(z.mT[:, None]), NEEDLE) for z in (x, other))
+    x_full, y_full = (hinge_fullness(energy.parts[1].edge_vectors(z.mT[:, None]), NEEDLE) for z in (x, other))
 
     def gradient(y: Tensor) -> Tensor:
         y = y.clone().requires_grad_()

@@ -28,7 +28,7 @@ BOUNDS = {
     "functions of in-between": 88,
     "files of in-between": 22,
     "functions of in-between, forward and backward": 113,
-    "files of in-between, forward and backward": 23,
+    "files of in-between, forward and backward": 22,
     "functions of subdivide": 159,
     "files of subdivide": 35,
     "functions of making a layer": 107,

@@ -6,10 +6,10 @@ from torch import Tensor
 from torch_modal.elastic import formulas
 from torch_modal.elastic.term import Formulas, Mesh, PeriodicTerm, Term, wrap_angle
 
-NEEDLE = 0.2
-"""Altitude of a triangle over its longest side at which its fullness is a half, in the modal solve; an equilateral one
-has 0.87."""
-NEEDLE_OF_STEPS = 0.3
+NEEDLE = 0.2**2
+"""Square of the altitude of a triangle over its longest side at which its fullness is a half, in the modal solve; an
+equilateral one has 0.75."""
+NEEDLE_OF_STEPS = 0.3**2
 """The same for the steps of all vertices."""
 
 
@@ -64,14 +64,9 @@ class Bend(PeriodicTerm, SquaredBend):
     def softening(self, start: Tensor, rest: Tensor, weights: Tensor | None) -> Tensor:
         """Less stiffness at needles: their gradient has no bound, and minimisers would turn their normals over.
 
-        The factor is :func:`fullness`, or its ratio to the fullness of the rest shapes.
+        The factor is the fullness, or its ratio to the fullness of the rest shapes.
         """
         if weights is None:
-            return fullness(start, NEEDLE)
-        usual = (weights[..., None] * fullness(rest, NEEDLE_OF_STEPS)).sum(1)
-        return formulas.softness(fullness(start, NEEDLE_OF_STEPS), usual)
-
-
-def fullness(edge_vectors: Tensor, needle: float) -> Tensor:
-    """0 to 1 by how far both triangles of a hinge are from needles. *Shape:* ``(3, 3, ..., H) -> (..., H)``."""
-    return formulas.hinge_fullness(edge_vectors, needle**2)
+            return formulas.hinge_fullness(start, NEEDLE)
+        usual = (weights[..., None] * formulas.hinge_fullness(rest, NEEDLE_OF_STEPS)).sum(1)
+        return formulas.softness(formulas.hinge_fullness(start, NEEDLE_OF_STEPS), usual)

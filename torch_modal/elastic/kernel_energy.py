@@ -215,7 +215,7 @@ class _MergeRests(Operation[Seen]):
         soft = None if self.parts[i].formulas.fullness is None else start
         relative = self.relative and soft is not None
         needle = NEEDLE_OF_STEPS if relative else NEEDLE
-        sizes = needle**2, int(relative), shapes.shape[1], stiffness[i].shape[1]
+        sizes = needle, int(relative), shapes.shape[1], stiffness[i].shape[1]
         return [x.shape[1], x, weights, total, stiffness[i], soft, *sizes]
 
     def run(self, kept: list[Seen] | None, *tensors: Tensor) -> tuple[Tensor, ...]:

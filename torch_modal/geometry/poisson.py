@@ -8,7 +8,7 @@ from scipy.spatial import KDTree
 from torch import Tensor, nn
 
 from torch_modal.arrays import FloatArray, IntArray
-from torch_modal.autograd import Context, Recent, is_eager
+from torch_modal.autograd import Recent, is_eager
 from torch_modal.geometry.connectivity import Connectivity, half_cotangents, label_pieces, vertex_areas
 from torch_modal.geometry.rigid import RigidMotion, best_fit
 from torch_modal.geometry.sparse import SparseSolver, graph_laplacian, solve_by
@@ -116,16 +116,11 @@ def solve_exported(edges: Tensor, weights: Tensor, right: Tensor) -> Tensor:
     return solver(right)
 
 
-def _save(ctx: Context, inputs: tuple[Tensor, ...], output: Tensor) -> None:
-    ctx.save_for_backward(*inputs[:2])
-
-
-def _backward(ctx: Context, grad: Tensor) -> tuple[None, None, Tensor]:
-    return None, None, solve_exported(*ctx.saved_tensors, grad)
-
-
 solve_exported.register_fake(lambda edges, weights, right: torch.empty_like(right))
-solve_exported.register_autograd(_backward, setup_context=_save)
+solve_exported.register_autograd(
+    lambda ctx, grad: (None, None, solve_exported(*ctx.saved_tensors, grad)),
+    setup_context=lambda ctx, inputs, output: ctx.save_for_backward(*inputs[:2]),
+)
 
 
 class Reconstruction(nn.Module):

@@ -19,8 +19,9 @@ import torch
 from torch import Tensor, nn
 
 from torch_modal.arrays import FloatArray, IntArray
-from torch_modal.elastic.bend import NEEDLE, Bend, fullness
+from torch_modal.elastic.bend import NEEDLE, Bend
 from torch_modal.elastic.energy import Energy, Rest, RestShapes
+from torch_modal.elastic.formulas import hinge_fullness
 from torch_modal.elastic.implicit import solve_implicit
 from torch_modal.elastic.minimise import Status
 from torch_modal.elastic.stretch import Stretch
@@ -191,7 +192,7 @@ class LocalInterpolation(nn.Module):
             values = value if some is None or value.shape[-1] == 1 else value[:, some.to(value.device)]
             values = values.double()
             if isinstance(summand.term, Bend):  # needles turn over at little cost, and would end where they collapse
-                values = values * fullness(summand.edge_vectors(shapes.movedim(-1, 0)), NEEDLE).prod(1)
+                values = values * hinge_fullness(summand.edge_vectors(shapes.movedim(-1, 0)), NEEDLE).prod(1)
             stiffness.append(values)
         reference = energy.reference_of(Rest(tuple(measures), tuple(w.mean(1) for w in rest.weights)), stiffness)
         results, status = [], torch.full_like(usable, Status.CONVERGED, dtype=torch.int64)

@@ -1,6 +1,7 @@
 """Shapes between two key-frames at any time, as a differentiable layer."""
 
 import warnings
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -109,7 +110,7 @@ class InBetween(InBetweenLayer):
         if is_traced(times):
             times = torch.where((times >= 0) & (times <= 1), times, torch.nan)
         else:
-            run_outside_transforms(_check_half if self.objective.space == "paired" else _check_times, times)
+            run_outside_transforms(partial(_check_times, paired=self.objective.space == "paired"), times)
         dtype = torch.promote_types(x_a.dtype, x_b.dtype)
         keyframes = torch.stack(torch.broadcast_tensors(x_a.to(dtype), x_b.to(dtype)), -3)
         weights = torch.stack([1 - times, times], -1)
@@ -117,12 +118,9 @@ class InBetween(InBetweenLayer):
         return result._replace(shapes=with_exact_keyframes(result.shapes, keyframes, weights))
 
 
-def _check_times(t: Tensor) -> None:
+def _check_times(t: Tensor, paired: bool) -> None:
+    if paired and bool((t != 0.5).any()):
+        raise ValueError("the paired space (Eq. 4) is defined at t = 1/2 only; other presets have all times")
     outside = ~((t >= 0) & (t <= 1))
     if bool(outside.any()):
         raise ValueError(f"t lies in [0, 1], from key-frame to key-frame; got {float(t[outside][0])}")
-
-
-def _check_half(t: Tensor) -> None:
-    if bool((t != 0.5).any()):
-        raise ValueError("the paired space (Eq. 4) is defined at t = 1/2 only; other presets have all times")
