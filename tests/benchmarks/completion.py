@@ -15,7 +15,7 @@ Errors are mean distances of all vertices from the truth at the times of the sam
 
 Hidden over seen is the error of the vertices that no point of the scan is near, over that of the others. Within is the
 part of the vertices that are nearer to the truth than their expected errors, of which nine of ten should be, and rank
-the correlation of the ranks of both. Seconds are of the processor.
+the correlation of the ranks of both. Volume is the largest difference from the true one. Seconds are of the processor.
 """
 
 import argparse
@@ -39,6 +39,7 @@ from torch import Tensor
 import torch_modal as tm
 from torch_modal.completion.pairs import SampledSurface
 from torch_modal.geometry.canonical import CANONICAL_SIZE
+from torch_modal.geometry.inspect import volume_of
 from torch_modal.registration.fit import ElasticSurface
 from torch_modal.registration.surface import places_between
 
@@ -131,7 +132,7 @@ def noisy(frames: Tensor, at: Sequence[int], vertices: Tensor, lost: float, size
 
 
 def complete(name: str, samples: str) -> tuple[list[float], float]:
-    """Errors without samples, of what is simple, and completed; hidden over seen; within, rank; seconds."""
+    """Errors without samples, of what is simple, and completed; hidden over seen; within, rank, volume; seconds."""
     frames, faces = motion(name)
     step = MOTIONS[name][1]
     size = float((frames[0].amax(0) - frames[0].amin(0)).norm())
@@ -171,7 +172,8 @@ def complete(name: str, samples: str) -> tuple[list[float], float]:
     within = 100 * float((off <= result.errors).double().mean())
     rank = float(spearmanr(result.errors.flatten(), off.flatten()).statistic)
     errors = [100 / size * float((x - truth).norm(dim=-1).mean()) for x in (without, simple, result.shapes)]
-    return [*errors, hidden, within, rank], seconds
+    volumes = np.array([[volume_of(x.numpy(), faces.numpy()) for x in shapes] for shapes in (result.shapes, truth)])
+    return [*errors, hidden, within, rank, 100 * float(abs(volumes[0] / volumes[1] - 1).max())], seconds
 
 
 def main() -> None:
@@ -192,6 +194,7 @@ def main() -> None:
         "hidden over seen",
         "within, %",
         "rank",
+        "volume, %",
         "s",
     ]
     check = "--samples markers --motions mh-hand-path"

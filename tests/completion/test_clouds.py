@@ -12,7 +12,9 @@ from torch import Tensor
 
 import torch_modal as tm
 from torch_modal.completion.clouds import Camera, estimate_normals, find_view, outwardness
+from torch_modal.completion.frames import CompletionProblem
 from torch_modal.completion.pairs import SampledSurface
+from torch_modal.completion.poses import FramePoses
 from torch_modal.modes.coarsening import coarsen
 
 Body = tuple[Tensor, Tensor, float]
@@ -91,6 +93,24 @@ def test_a_turned_template_is_turned_back(animal: Body) -> None:
     rotation = torch.from_numpy(Rotation.from_euler("y", 180, degrees=True).as_matrix())
     found = tm.complete(x[0] @ rotation.mT, faces, [cloud(x[1], faces)])
     assert error(found.shapes, x[1:2], diagonal) < 1.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("turn", [("y", 90), ("z", -90)])
+def test_a_turned_template_starts_where_it_fits_best_once_it_is_turned_back(turn: tuple[str, int]) -> None:
+    """As it is, it fits a later frame as badly as the first."""
+    sample = tm.load_sample("creature")
+    shapes = torch.stack([sample.keyframes, sample.truth], 1).flatten(0, 1)[:5].double().numpy()
+    coarse = coarsen(shapes, sample.faces.numpy(), 1600)
+    x = torch.from_numpy(np.stack([coarse.restrict(one) for one in shapes]))
+    faces, view = torch.from_numpy(coarse.faces), torch.from_numpy(VIEW)
+    seen = [replace(cloud(one, faces, Camera(VIEW), view=view), time=float(i)) for i, one in enumerate(x[1:])]
+    rotation = torch.from_numpy(Rotation.from_euler(*turn, degrees=True).as_matrix())
+    problem = CompletionProblem((x[:1] @ rotation.mT).numpy(), faces, np.zeros(0), seen)
+    poses = FramePoses(problem)
+    ((first, fit),) = poses._first(poses.template).items()
+    truth = torch.from_numpy(problem.to_canonical(x[1]))
+    assert first == 0 and float((fit.x - truth).norm(dim=1).mean()) < 0.5
 
 
 def test_another_size_is_said(animal: Body) -> None:

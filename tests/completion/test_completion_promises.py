@@ -150,7 +150,7 @@ def test_the_former_pairs_of_a_limb_that_is_tried_are_released(tube, monkeypatch
     points = torch.cat([scanned(x[2], faces, 0.0, VIEWS[2], n=600).points, x[4, 12 * 16 : 12 * 24]])
     problem = CompletionProblem(x[2:3].numpy(), faces, np.zeros(0), [tm.Observation(0.0, points, noise=0.002)])
     poses, (seen,) = FramePoses(problem), problem.frames[0].seen
-    search, base, group = poses.poses, poses._coarsen(problem.template), seen.points[600:]
+    search, base, group = poses.poses, poses.template, seen.points[600:]
     tip = int(np.linalg.norm(base.numpy()[search.tips] - group.mean(0), axis=1).argmin())
     pairs, touched = ObservedPoints.pairs, []
 

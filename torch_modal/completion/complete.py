@@ -169,14 +169,14 @@ def _complete(
     exact = np.zeros(0) if is_template else check_times(times, len(shapes)).numpy()
     problem = CompletionProblem(shapes, torch.from_numpy(indices), exact, observations)
     shape_at, solve = dict(zip(exact.tolist(), problem.whole, strict=False)), None
-    poses = list[Tensor]()
+    poses: Sequence[Tensor] = []
     if problem.frames:
         with ProgressReport(len(problem.frames) * (3 + ROUNDS), "completing", progress) as report:
-            poses = FramePoses(problem).search(report)
+            poses, followed = zip(*FramePoses(problem).search(report), strict=True)
             if estimate_times:
                 when = times_between(problem, poses)
                 problem.frames = [frame._replace(time=t) for frame, t in zip(problem.frames, when, strict=True)]
-            found, solve = Refinement(problem, objective).run(poses, report)
+            found, solve = Refinement(problem, objective).run(poses, followed, report)
         shape_at |= {frame.time: one for frame, one in zip(problem.frames, found, strict=True)}
     frames = sorted([*problem.frames, *problem.exact], key=lambda frame: frame.time)
     x = torch.stack([shape_at[frame.time] for frame in frames])

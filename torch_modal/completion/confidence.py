@@ -8,13 +8,11 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from torch_modal.completion.frames import CompletionProblem, Frame
-from torch_modal.completion.pairs import OUTLIERS, SampledSurface, robust_weights
+from torch_modal.completion.pairs import OUTLIERS, SampledSurface, robust_weights, seen_at
 from torch_modal.elastic.volume import encloses
 from torch_modal.geometry.inspect import volume_of
 from torch_modal.geometry.rigid import best_fit
 
-SEEN_WITHIN = 2.5
-"""Distance from an observed point within which a vertex counts as seen, at a size of 100."""
 OF_NOISE, OF_MODES, OF_TIME = 0.3, 1.6, 0.5
 """Factors of the noise, of the way from the shape by modes, and of the distance from neighbours in time, in errors."""
 HALF_AT = 0.02
@@ -54,7 +52,7 @@ def compare(
             weights = agree * robust_weights(distances, one.noise)
             misses[one.numbers], trust[one.numbers] = distances, weights
             gaps, nearest = cKDTree(one.points).query(surface.vertices, 3)
-            close = (weights[nearest] * np.exp(-0.5 * (gaps / SEEN_WITHIN) ** 2)).max(1)
+            close = (weights[nearest] * seen_at(gaps)).max(1)
             explained = float(np.average(weights, weights=one.weights))
             if explained < DOUBTFUL:
                 doubtful[frame.time] = explained

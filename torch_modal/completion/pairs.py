@@ -13,8 +13,8 @@ from torch_modal.geometry.closest import closest_on_triangles, dot
 from torch_modal.geometry.connectivity import Connectivity, label_pieces
 from torch_modal.registration.surface import MeshSurface, places_between
 
-# Places of each triangle that are candidates: its middle, and one near each corner.
-_PLACES = np.array([[2, 2, 2], [4, 1, 1], [1, 4, 1], [1, 1, 4]]) / 6
+# Places of each triangle that are candidates: its middle, and one near each corner; of many, the middle alone.
+_PLACES, MANY_FACES = np.array([[2, 2, 2], [4, 1, 1], [1, 4, 1], [1, 1, 4]]) / 6, 10_000
 
 # Part of the stiffness of a pair with a normal that is left along the surface.
 SLIDE = 0.3
@@ -34,6 +34,8 @@ OUTLIERS = 4.0
 NOISES = 0.1, 2.0
 # Trees that are asked once: made in half the time.
 QUICK = {"balanced_tree": False, "compact_nodes": False}
+# Distance from an observed point within which a vertex counts as seen.
+SEEN_WITHIN = 2.5
 # Steps in a factor of two, to which an estimated noise is rounded.
 NOISE_STEPS = 4
 
@@ -134,7 +136,8 @@ class ObservedPoints(NamedTuple):
             agree &= ~released[surface.faces[faces]].any(1)
         seen, faces, nearest = seen[agree], faces[agree], nearest[agree]
         if len(seen):
-            places = places_between(surface.faces[faces], _PLACES[seen % len(_PLACES)], len(surface.vertices))
+            within = surface.places[seen % len(surface.places)]
+            places = places_between(surface.faces[faces], within, len(surface.vertices))
             points, normals = self.points[nearest], self.normals[nearest]
             weights = np.full(len(seen), self.weights.sum() / len(seen))
             pairs.append(ObservedPoints(points, normals, weights, self.numbers[nearest], self.noise, places))
@@ -183,6 +186,12 @@ def robust_weights(distances: FloatArray, noise: float) -> FloatArray:
     return weights
 
 
+def seen_at(distances: FloatArray) -> FloatArray:
+    """Weights, from 0 to 1, with which vertices at distances from observed points count as seen."""
+    seen: FloatArray = np.exp(-0.5 * (distances / SEEN_WITHIN) ** 2)
+    return seen
+
+
 def join_features(points: FloatArray, normals: FloatArray | None) -> FloatArray:
     """Points with their normals, as places of which near ones are alike. *Shape:* ``(n, 3), (n, 3) -> (n, 6)``."""
     return points if normals is None else np.hstack([points, CLOUD_NORMAL_WEIGHT * normals])
@@ -193,8 +202,9 @@ class SampledSurface(MeshSurface):
 
     def __init__(self, vertices: FloatArray, faces: IntArray | Connectivity) -> None:
         super().__init__(vertices, faces)
-        self.samples = (_PLACES @ self.vertices[self.faces]).reshape(-1, 3)
-        self.sample_faces = np.arange(len(self.faces)).repeat(len(_PLACES))
+        self.places = _PLACES if len(self.faces) <= MANY_FACES else _PLACES[:1]
+        self.samples = (self.places @ self.vertices[self.faces]).reshape(-1, 3)
+        self.sample_faces = np.arange(len(self.faces)).repeat(len(self.places))
 
     def most_alike(
         self, points: FloatArray, normals: FloatArray | None

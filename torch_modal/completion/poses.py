@@ -14,10 +14,11 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from torch_modal.completion.bending import ModalBending, ModalPose
-from torch_modal.completion.follow import follow
+from torch_modal.completion.details import Details
+from torch_modal.completion.follow import follow, volume_at
 from torch_modal.completion.frames import CompletionProblem, Frame
 from torch_modal.completion.pairs import SampledSurface
-from torch_modal.completion.search import AFTER_FIRST, FIRST, N_KEPT, N_SOFT, REST, PoseSearch
+from torch_modal.completion.search import AFTER_FIRST, FIRST, N_KEPT, N_SOFT, REST, UNTURNED, PoseSearch
 from torch_modal.geometry.rigid import align, best_fit
 from torch_modal.geometry.triangle_frames import frames_of, mirror_sides
 from torch_modal.modes.coarsening import coarsen
@@ -34,12 +35,12 @@ COARSE_FACES = 2500
 SHIFTS = (-0.17, 0.17)
 """Times at which a motion may be instead of where its neighbours say, in parts of the gap between these."""
 N_TURNED, DISTINCT, CERTAIN = 3, 0.8, 0.7
-"""Turned poses of the template that a search starts from; the largest cosine of the angle between two; score over that
-of the template as it is below which it is turned.
+"""Turns of the template that are tried; the largest cosine of the angle between two; score over that of the template as
+it is below which it is turned.
 """
 N_COMPARED, N_FOLLOWED, FOLLOWED = 2, 8, (6.0, 1.5)
 """Poses of a search that are compared after as-rigid-as-possible steps, these, and the largest distance of a pair in
-the first and in the last.
+the first and in the last; so do all vertices follow after the coarse ones.
 """
 TRUSTED, SETTLED, EXPLAINED = 0.34, 1.2, 0.2
 """Part of the frames, those that explain most, that are settled; score over the least one below which others are, too;
@@ -68,29 +69,30 @@ class FramePoses:
     """Finds modal poses of all frames of a problem."""
 
     def __init__(self, problem: CompletionProblem) -> None:
-        self.problem, self.faces = problem, problem.faces
+        self.problem = problem
         n_modes = min(N_MODES, 3 * len(problem.mesh.used) - 6)
-        basis = extract_bases(problem.template[None], self.faces, n_modes)[0]
-        modes = scale_modes(basis.modes, 100.0)
-        self.bending = ModalBending(problem.template, self.faces, modes)
-        whole = problem.whole.numpy()
-        self.coarse = coarsen(whole, self.faces.numpy(), COARSE_FACES)
-        reference, fields = self._coarsen(problem.template), self._coarsen(modes)
-        self.poses = PoseSearch(ModalBending(reference, torch.from_numpy(self.coarse.faces), fields), basis.eigenvalues)
+        basis = extract_bases(problem.template[None], problem.faces, n_modes)[0]
+        self.coarse = coarse = coarsen(problem.whole.numpy(), problem.faces.numpy(), COARSE_FACES)
+        self.faces = torch.from_numpy(coarse.faces)
+        whole, fields = (coarse.restrict(x.numpy()) for x in (problem.whole, scale_modes(basis.modes, 100.0)))
+        #: The template, on the coarse mesh as all that follows.
+        self.template = torch.from_numpy(whole[problem.largest])
+        self.bending = ModalBending(self.template, self.faces, torch.from_numpy(fields))
+        self.poses = PoseSearch(self.bending, basis.eigenvalues)
         #: Times and whole shapes.
-        self.whole = list(zip(problem.times.tolist(), problem.whole, strict=False))
-        select = sparse.identity(self.coarse.n_vertices, format="csr")[np.maximum(self.coarse.clusters, 0)]
+        self.whole = list(zip(problem.times.tolist(), torch.from_numpy(whole), strict=False))
+        select = sparse.identity(coarse.n_vertices, format="csr")[np.maximum(coarse.clusters, 0)]
         #: With known places on the coarse mesh.
         self.frames = [one._replace(seen=[each.restrict(select) for each in one.seen]) for one in problem.frames]
         #: Frames, and the shapes from which they were searched.
         self.searched = set[tuple[int, bytes]]()
 
-    def search(self, report: ProgressReport) -> list[Tensor]:
-        """Shapes of all frames. *Shape of each:* ``(V, 3)``."""
+    def search(self, report: ProgressReport) -> list[tuple[Tensor, Tensor]]:
+        """Shapes by modes of all frames, and those that follow their clouds from there. *Shape of each:* ``(V, 3)``."""
         fits, alone = dict[int, ModalFit](), not self.whole
         if alone:
             report.expect((N_OUTWARD + N_BETWEEN - 1) * len(self.frames))
-            fits = self._first(self.problem.template)
+            fits = self._first(self.template)
             report.update()
         self._outward(fits, {}, report)
         for _ in range(N_OUTWARD if alone else 0):
@@ -104,12 +106,22 @@ class FramePoses:
                 if known and i not in settled:
                     fits[i] = self._again(i, self._starts(self.frames[i].time, known), fits[i])
                 report.update()
-        return run([partial(self._stiffen, fits[i], frame, report) for i, frame in enumerate(self.frames)])
+        details = Details(self.problem, self.coarse)
+        return run([partial(self._finish, i, fits[i], details, report) for i in range(len(self.frames))])
 
-    def _stiffen(self, fit: ModalFit, frame: Frame, report: ProgressReport) -> Tensor:
-        pose = self.poses.stiffen(self._coarsen(fit.base), fit.pose, frame)
+    def _finish(self, i: int, fit: ModalFit, details: Details, report: ProgressReport) -> tuple[Tensor, Tensor]:
+        """The shape of the stiffest modes that explain as much, and the one that follows; of all vertices."""
+        frame, problem = self.frames[i], self.problem
+        x = self.bending.shape(fit.base, self.poses.stiffen(fit.base, fit.pose, frame))
+        whole = torch.stack([shape for _, shape in self.whole] or [self.template])
+        volume = volume_at(frame.time, problem.times, whole, self.poses.mesh)
+        followed = follow(frame, x, self.poses.mesh, volume=volume)
+        by_modes, followed = (details.add(frame.time, one) for one in (x, followed))
+        if len(self.faces) < len(problem.faces):
+            volume = volume_at(frame.time, problem.times, problem.whole, problem.mesh)
+            followed = follow(problem.frames[i], followed, problem.mesh, N_FOLLOWED, FOLLOWED, volume)
         report.update()
-        return self.bending.shape(fit.base, pose)
+        return by_modes, followed
 
     def _settled(self, fits: dict[int, ModalFit]) -> dict[int, ModalFit]:
         """The fits that explain about as much as the best one, or the best third of all."""
@@ -121,24 +133,29 @@ class FramePoses:
         """The frame that the template fits best after a rigid motion.
 
         It may be turned: then a quarter turn about its principal axes is a better start, by far, as symmetric bodies
-        fit as well after some turns.
+        fit as well after some turns. With each turn another frame may fit best.
         """
         body, turns = self._surface(template), torch.from_numpy(Rotation.create_group("O").as_matrix())
-        placed = run([partial(self.poses.place, body, frame) for frame in self.frames])
-        first = int(np.argmin([score for _, score in placed]))
-        fit = self._search(first, [(template, placed[first][0])])
+        _, first, pose = self._place(body)
+        fit = self._search(first, [(template, pose)])
         if fit.score < EXPLAINED * len(self.frames[first].seen):
             return {first: fit}
         turned = run([partial(self.poses.place, body, self.frames[first], turn) for turn in turns])
-        distinct = [placed[first][0]]
+        distinct = [pose]
         for pose, _ in sorted(turned, key=lambda one: one[1]):
             # The trace of a rotation by an angle is 1 + 2 cos.
             if all(float((pose.rotation * other.rotation).sum()) < 1 + 2 * DISTINCT for other in distinct):
                 distinct.append(pose)
-        if len(distinct) == 1:  # markers come from anywhere to the same pose
-            return {first: fit}
-        other = self._search(first, [(template, pose) for pose in distinct[1 : 1 + N_TURNED]])
-        return {first: other if other.score < CERTAIN * fit.score else fit}
+        placed = [self._place(body, one.rotation) for one in (fit.pose, *distinct[1 : 1 + N_TURNED])]
+        _, best, pose = min(placed, key=lambda one: one[0])
+        other = self._search(best, [(template, pose)])
+        return {best: other} if other.score < CERTAIN * fit.score else {first: fit}
+
+    def _place(self, body: SampledSurface, turn: Tensor = UNTURNED) -> tuple[float, int, ModalPose]:
+        """The frame that a turned body fits best, with its score and rigid pose."""
+        placed = run([partial(self.poses.place, body, frame, turn) for frame in self.frames])
+        first = min(range(len(placed)), key=lambda i: placed[i][1])
+        return placed[first][1], first, placed[first][0]
 
     def _outward(self, fits: dict[int, ModalFit], before: dict[int, ModalFit], report: ProgressReport) -> None:
         """Add all other frames, those near in time to what is known first; none is worse than it was before."""
@@ -204,21 +221,19 @@ class FramePoses:
         ways, n_modes = [frame, frame.without_cameras()][: 1 + both], N_SOFT if alone else None
 
         def begin(base: Tensor, pose: ModalPose, way: Frame) -> tuple[Tensor, ModalPose, Frame, float]:
-            coarse = self._coarsen(base)
-            pose = poses.descend(coarse, pose, way, part=FIRST, n_modes=n_modes)
-            return base, pose, way, poses.score(coarse, pose, frame._replace(unit=AFTER_FIRST))
+            pose = poses.descend(base, pose, way, part=FIRST, n_modes=n_modes)
+            return base, pose, way, poses.score(base, pose, frame._replace(unit=AFTER_FIRST))
 
         def finish(base: Tensor, pose: ModalPose, way: Frame | None) -> tuple[Tensor, ModalPose, float]:
-            coarse = self._coarsen(base)
-            pose = pose if way is None else poses.descend(coarse, pose, way, part=REST)
-            return base, pose, poses.score(coarse, pose, frame)
+            pose = pose if way is None else poses.descend(base, pose, way, part=REST)
+            return base, pose, poses.score(base, pose, frame)
 
         begun = run([partial(begin, *start, way) for start in starts for way in ways])
         kept = [one[:-1] for one in sorted(begun, key=lambda one: one[-1])[:N_KEPT]]
         fits = run([partial(finish, *one) for one in (*((*start, None) for start in starts), *kept)])
         fits.sort(key=lambda one: one[2])
         base, pose, score = fits[0]
-        fits[0] = base, *poses.move_limbs(self._coarsen(base), pose, frame, score)
+        fits[0] = base, *poses.move_limbs(base, pose, frame, score)
         if alone:
             followed = run([partial(self._follow, i, *one) for one in fits[:N_COMPARED]])
             return min(followed, key=lambda one: one.score)
@@ -228,18 +243,15 @@ class FramePoses:
     def _follow(self, i: int, base: Tensor, pose: ModalPose, score: float) -> ModalFit:
         """A fit whose shape follows the clouds: what modes cannot express would add up from frame to frame."""
         frame, x = self.frames[i], self.bending.shape(base, pose)
-        followed = follow(self.problem.frames[i], x, self.problem.mesh, N_FOLLOWED, FOLLOWED)
+        followed = follow(frame, x, self.poses.mesh, N_FOLLOWED, FOLLOWED)
         score += frame.score(self._surface(followed)) - frame.score(self._surface(x))
         return ModalFit(followed, base, pose, score)
 
-    def _coarsen(self, x: Tensor) -> Tensor:
-        return torch.from_numpy(self.coarse.restrict(x.numpy()))
-
     def _surface(self, x: Tensor) -> SampledSurface:
-        return SampledSurface(self.coarse.restrict(x.numpy()), self.poses.mesh)
+        return SampledSurface(x.numpy(), self.poses.mesh)
 
 
-def times_between(problem: CompletionProblem, shapes: list[Tensor]) -> list[float]:
+def times_between(problem: CompletionProblem, shapes: Sequence[Tensor]) -> list[float]:
     """Times at which the path through all other shapes is nearest to each; the first and the last stay.
 
     Args:

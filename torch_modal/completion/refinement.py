@@ -1,5 +1,6 @@
 """The last stage: steps of all vertices of all frames, with new pairs and new neighbours in each round."""
 
+from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
@@ -8,7 +9,6 @@ from scipy.optimize import NoConvergence, anderson
 from torch import Tensor
 
 from torch_modal.completion.energy import PointEnergy
-from torch_modal.completion.follow import follow
 from torch_modal.completion.frames import CompletionProblem, Frame
 from torch_modal.completion.gradient import LastSolve
 from torch_modal.completion.markers import MarkerShape, shape_of_markers
@@ -61,8 +61,13 @@ class Refinement:
         #: Fixed points of the terms. *Shape:* ``(1, P, 3)``.
         self.anchors = None if points is None else torch.from_numpy(problem.to_canonical(points))[None]
 
-    def run(self, poses: list[Tensor], report: ProgressReport) -> tuple[Tensor, LastSolve]:
-        """Shapes of the frames from their poses by modes, and how they were found. *Shape:* ``(T, V, 3)``."""
+    def run(
+        self, poses: Sequence[Tensor], followed: Sequence[Tensor], report: ProgressReport
+    ) -> tuple[Tensor, LastSolve]:
+        """Shapes of the frames, from those by modes and those that follow their clouds; and how they were found.
+
+        *Shape of each:* ``(V, 3)``; *shape:* ``(T, V, 3)``.
+        """
         frames = self.problem.frames
         # With few markers, shapes are smooth functions of the points, and are minimised until nothing moves.
         few = MOST_MARKERS * len(self.problem.template)
@@ -70,12 +75,11 @@ class Refinement:
         for i, pose in enumerate(poses):
             surface = SampledSurface(pose.numpy(), self.problem.mesh)
             frames[i] = frames[i]._replace(seen=[one.with_noise(surface) for one in frames[i].seen])
-        pairs = zip(frames, poses, strict=True)
-        followed = torch.stack(run([partial(follow, frame, pose, self.problem.mesh) for frame, pose in pairs]))
-        markers: list[MarkerShape | None] = self._markers(followed) if smooth else [None] * len(frames)
-        own = torch.stack([x if one is None else one.x.detach() for one, x in zip(markers, followed, strict=True)])
+        x = torch.stack(list(followed))
+        markers: list[MarkerShape | None] = self._markers(x) if smooth else [None] * len(frames)
+        own = torch.stack([each if one is None else one.x.detach() for one, each in zip(markers, x, strict=True)])
         shares = [OWN_OF_MARKERS if one else OWN * (not smooth) for one in markers]
-        (numbers, weights), x, of_known = self._rests(shares), followed, OF_KNOWN
+        (numbers, weights), of_known = self._rests(shares), OF_KNOWN
 
         def rests_of(x: Tensor, own: Tensor) -> list[RestShapes]:
             shapes = torch.cat([own, self.problem.whole, x])[numbers]
