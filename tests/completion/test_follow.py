@@ -3,13 +3,15 @@
 import numpy as np
 import pytest
 import torch
+import trimesh
 from torch import Tensor
 
 import torch_modal as tm
+from torch_modal.completion.clouds import Camera
 from torch_modal.completion.details import Details
 from torch_modal.completion.follow import centred_volume, follow, volume_at
 from torch_modal.completion.frames import CompletionProblem
-from torch_modal.completion.pairs import SampledSurface
+from torch_modal.completion.pairs import MANY_FACES, SampledSurface
 from torch_modal.modes.coarsening import coarsen
 
 VIEW = np.array([0.6, 0.0, 0.8])
@@ -97,3 +99,19 @@ def test_a_mesh_of_few_faces_is_its_own_coarse_one(creature: tuple[Tensor, Tenso
     problem = problem_of(x, faces, [])
     coarse, y = coarsen(problem.whole.numpy(), faces.numpy(), len(faces)), problem_of(x[1:], faces, []).template
     assert float((Details(problem, coarse).add(1.0, y) - y).norm(dim=1).max()) < 1e-9
+
+
+def test_points_are_paired_with_a_mesh_of_many_faces(creature: tuple[Tensor, Tensor]) -> None:
+    """One place in each face finds as near ones as four, where faces are small."""
+    x, faces = creature
+    fine = SampledSurface(*trimesh.remesh.subdivide(x[0].numpy(), faces.numpy()))
+    assert len(fine.faces) > MANY_FACES and len(fine.samples) == len(fine.faces)
+    some = np.random.default_rng(0).choice(len(fine.faces), 2000)
+    points = fine.face_centres[some] + 0.05 * fine.face_normals[some]
+    distances = [
+        each.most_alike(points, fine.face_normals[some])[2]
+        for each in (fine, SampledSurface(x[0].numpy(), faces.numpy()))
+    ]
+    assert np.median(distances[0]) < 1.01 * np.median(distances[1]) and np.percentile(distances[0], 99) < 0.06
+    seen = fine.visible(Camera(VIEW))
+    assert 0.2 < len(seen) / len(fine.faces) < 0.6
