@@ -17,13 +17,8 @@ def merge(f: Formulas) -> "wp.Kernel":
     """The kernel that merges the rest shapes of a term into records (Eq. 8)."""
     c, own, softness_of = common(f), functions_of(f), for_kernels(formulas.softness)
     potential, fullness, weight, measure = own.potential, own.fullness, own.weight, own.measure
-    vectors, corners, edge_vectors, sums, record = (
-        c.vectors,
-        c.corners,
-        c.edge_vectors,
-        potential.sums,
-        potential.record,
-    )
+    vectors, corners, edge_vectors = c.vectors, c.corners, c.edge_vectors
+    sums, record = potential.sums, potential.record
 
     if fullness is None:
 
