@@ -16,7 +16,6 @@ from torch_modal.completion.markers import shape_of_markers
 from torch_modal.completion.pairs import ObservedPoints, SampledSurface
 from torch_modal.elastic.steps import FineEnergy
 from torch_modal.elastic.term import Mesh
-from torch_modal.geometry.rigid import best_fit
 from torch_modal.motion.decoder import scale_modes
 from torch_modal.registration.surface import places_between
 from torch_modal.statistics.variation import Variation
@@ -107,11 +106,11 @@ def test_each_vertex_has_an_expected_error_and_a_confidence(tube, between):
     assert float(halves.mean()) == pytest.approx(0.02 * tube[2], rel=0.1)
 
 
-def test_what_moves_far_is_less_certain(tube, between):
-    before, x = tube[0][1], tube[0][2]
-    moved = (best_fit(before, x).apply(before) - x).norm(dim=1)
-    by_ring = torch.stack([moved, between.confidence[1]])[:, :-2].reshape(2, -1, 12).mean(2)
-    assert float(torch.corrcoef(by_ring)[0, 1]) < -0.7
+def test_what_is_far_from_the_truth_is_less_certain(tube, between):
+    """Ring by ring: a smooth tube slides along itself, most in its middle."""
+    off = (between.shapes[1] - tube[0][2]).norm(dim=1)
+    by_ring = torch.stack([off, between.confidence[1]])[:, :-2].reshape(2, -1, 12).mean(2)
+    assert float(torch.corrcoef(by_ring)[0, 1]) < -0.6
 
 
 def test_a_template_follows_scans_of_two_sides(tube):
