@@ -15,7 +15,7 @@ from torch_modal.completion import poses
 from torch_modal.completion.confidence import OF_MODES, OF_NOISE, compare, expected_errors
 from torch_modal.completion.frames import CompletionProblem
 from torch_modal.completion.pairs import ObservedPoints, SampledSurface
-from torch_modal.completion.poses import FramePoses, ModalFit, times_between
+from torch_modal.completion.poses import N_KNOWN, FramePoses, ModalFit, times_between
 from torch_modal.progress import ProgressReport
 
 tube = test_completion.tube
@@ -180,6 +180,32 @@ def test_a_pose_that_comes_again_is_found_from_the_shape_of_another_time(tube, m
     fits = {i: ModalFit(known[i], known[i], still, 0.0) for i in (0, 1)}
     poses._outward(fits, {2: ModalFit(known[1], known[1], still, 9.0)}, ProgressReport(1, "", False))
     assert float((fits[2].x - known[2]).norm(dim=1).mean()) < 8.0
+
+
+def test_starts_of_a_long_motion_are_made_from_few_shapes(tube, monkeypatch):
+    """Else the time grows with the square of the number of frames."""
+    x, faces, diagonal = tube
+    seen = tm.Observation(50.5, x[0], vertices=torch.arange(x.shape[1]), noise=0.002)
+    poses = FramePoses(CompletionProblem(x[2:3].numpy(), faces, np.zeros(0), [seen]))
+    swing = [2, 3, 4, 3, 2, 1, 0, 1]
+    known = [(float(t), 100 / diagonal * x[swing[t % 8]]) for t in range(100)]
+    times, shapes = [t for t, _ in known], torch.stack([one for _, one in known])
+    placed, knots = [], []
+
+    def place(body, frame):
+        placed.append(body)
+        return poses.bending.still(), -len(placed)
+
+    def path(near, *args, **options):
+        knots.append(len(near))
+        return tm.Path(near, *args, **options)
+
+    monkeypatch.setattr(poses.poses, "place", place)
+    monkeypatch.setattr("torch_modal.completion.poses.Path", path)
+    assert len(poses._alike(0, list(shapes))) == 2 and len(placed) <= N_KNOWN
+    start = poses._starts(50.5, known)[0][0]
+    assert knots == [N_KNOWN]
+    assert float((start - tm.Path(shapes, faces, times=times)(shapes, 50.5)).norm(dim=1).max()) < 0.01
 
 
 # ---------------------------------------------------------------------------------------------------------------- noise

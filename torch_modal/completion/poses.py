@@ -46,9 +46,10 @@ TRUSTED, SETTLED, EXPLAINED = 0.34, 1.2, 0.2
 """Part of the frames, those that explain most, that are settled; score over the least one below which others are, too;
 and score of a cloud below which turns of the template are not tried.
 """
-N_OUTWARD, N_BETWEEN, N_ALIKE = 2, 3, 2
+N_OUTWARD, N_BETWEEN, N_ALIKE, N_KNOWN = 2, 3, 2, 24
 """Rounds in which frames that are not settled are searched again, outward from settled ones, then between their
-neighbours; starts of the former from shapes of any time.
+neighbours; starts of the former from shapes of any time; shapes that starts are made from: of a long motion the nearest
+in time, and for starts from any time some in equal steps.
 """
 TIME_ROUNDS, LATEST, UNCHANGED = 6, 0.5, 10.0
 """Rounds in which times are estimated; the largest change, in parts of the gap between neighbours, and its weight."""
@@ -183,12 +184,14 @@ class FramePoses:
 
     def _alike(self, i: int, shapes: Sequence[Tensor]) -> list[tuple[Tensor, ModalPose]]:
         """The shapes that explain most of a frame after a rigid motion: motions repeat."""
+        shapes = shapes[:: math.ceil(len(shapes) / N_KNOWN)]
         placed = run([partial(self.poses.place, self._surface(x), self.frames[i]) for x in shapes])
         ranked = sorted(zip(shapes, placed, strict=True), key=lambda one: one[1][1])
         return [(x, pose) for x, (pose, _) in ranked[:N_ALIKE]]
 
     def _starts(self, t: float, known: list[tuple[float, Tensor]]) -> list[tuple[Tensor, ModalPose]]:
         """Shapes from which a search at a time starts."""
+        known = sorted(sorted(known, key=lambda one: abs(one[0] - t))[:N_KNOWN], key=lambda one: one[0])
         times, shapes = np.array([time for time, _ in known]), torch.stack([x for _, x in known])
         nearest = np.argsort(np.abs(times - t))
         bases = [shapes[nearest[0]]]
