@@ -20,14 +20,19 @@ from torch_modal.modes.coarsening import coarsen
 Body = tuple[Tensor, Tensor, float]
 
 
-@pytest.fixture(scope="module")
-def animal() -> Body:
-    """Three shapes of a gallop with few faces, and the diagonal."""
+def gallop(n: int) -> Body:
+    """The first shapes, with few faces, and the diagonal."""
     sample = tm.load_sample("creature")
-    shapes = torch.cat([sample.keyframes[:1], sample.truth[:1], sample.keyframes[1:2]]).double().numpy()
+    shapes = torch.stack([sample.keyframes, sample.truth], 1).flatten(0, 1)[:n].double().numpy()
     coarse = coarsen(shapes, sample.faces.numpy(), 1600)
     x = torch.from_numpy(np.stack([coarse.restrict(one) for one in shapes]))
     return x, torch.from_numpy(coarse.faces), float((x[0].amax(0) - x[0].amin(0)).norm())
+
+
+@pytest.fixture(scope="module")
+def animal() -> Body:
+    """Three shapes of a gallop with few faces, and the diagonal."""
+    return gallop(3)
 
 
 def cloud(x: Tensor, faces: Tensor, camera: Camera | None = None, n: int = 1500, **given: Any) -> tm.Observation:
@@ -99,11 +104,7 @@ def test_a_turned_template_is_turned_back(animal: Body) -> None:
 @pytest.mark.parametrize("turn", [("y", 90), ("z", -90)])
 def test_a_turned_template_starts_where_it_fits_best_once_it_is_turned_back(turn: tuple[str, int]) -> None:
     """As it is, it fits a later frame as badly as the first."""
-    sample = tm.load_sample("creature")
-    shapes = torch.stack([sample.keyframes, sample.truth], 1).flatten(0, 1)[:5].double().numpy()
-    coarse = coarsen(shapes, sample.faces.numpy(), 1600)
-    x = torch.from_numpy(np.stack([coarse.restrict(one) for one in shapes]))
-    faces, view = torch.from_numpy(coarse.faces), torch.from_numpy(VIEW)
+    (x, faces, _), view = gallop(5), torch.from_numpy(VIEW)
     seen = [replace(cloud(one, faces, Camera(VIEW), view=view), time=float(i)) for i, one in enumerate(x[1:])]
     rotation = torch.from_numpy(Rotation.from_euler(*turn, degrees=True).as_matrix())
     problem = CompletionProblem((x[:1] @ rotation.mT).numpy(), faces, np.zeros(0), seen)

@@ -9,9 +9,10 @@ from torch import Tensor
 import torch_modal as tm
 from torch_modal.completion.clouds import Camera
 from torch_modal.completion.details import Details
-from torch_modal.completion.follow import centred_volume, follow, volume_at
+from torch_modal.completion.follow import follow, volumes_at
 from torch_modal.completion.frames import CompletionProblem
 from torch_modal.completion.pairs import MANY_FACES, SampledSurface
+from torch_modal.geometry.inspect import volume_of
 from torch_modal.modes.coarsening import coarsen
 
 VIEW = np.array([0.6, 0.0, 0.8])
@@ -42,13 +43,14 @@ def swollen(problem: CompletionProblem, by: float) -> Tensor:
 def test_what_no_point_is_near_keeps_the_volume(creature: tuple[Tensor, Tensor]) -> None:
     x, faces = creature
     problem = problem_of(x[:1], faces, [], VIEW)
-    volume = volume_at(1.0, problem.times, problem.whole, problem.mesh)
-    assert volume == pytest.approx(centred_volume(problem.template.numpy(), problem.mesh))
+    (volume,) = volumes_at([1.0], problem.times, problem.whole, problem.mesh)
+    assert volume is not None
+    assert volume == pytest.approx(volume_of(problem.template.numpy(), problem.mesh.faces))
     thick, (frame,) = swollen(problem, 0.2), problem.frames
     off, misses = [], []
     for kept in (None, volume):
         y = follow(frame, thick, problem.mesh, 8, (6.0, 1.5), kept).numpy()
-        off.append(centred_volume(y, problem.mesh) / volume - 1)
+        off.append(volume_of(y, problem.mesh.faces) / volume - 1)
         misses.append(np.median(frame.seen[0].misses(SampledSurface(y, problem.mesh))[0]))
     assert off[0] > 0.06 and abs(off[1]) < 0.005
     assert misses[1] < 0.05
@@ -58,21 +60,20 @@ def test_a_volume_that_all_points_show_is_not_changed(creature: tuple[Tensor, Te
     """A heart contracts."""
     x, faces = creature
     problem = problem_of(x[:1], faces, [])
-    (frame,), volume = problem.frames, centred_volume(problem.template.numpy(), problem.mesh)
+    (frame,), volume = problem.frames, volume_of(problem.template.numpy(), problem.mesh.faces)
     y = [follow(frame, problem.template, problem.mesh, 8, (6.0, 1.5), kept) for kept in (None, 1.3 * volume)]
     assert float((y[1] - y[0]).norm(dim=1).mean()) < 0.1
-    assert centred_volume(y[1].numpy(), problem.mesh) < 1.05 * volume
+    assert volume_of(y[1].numpy(), problem.mesh.faces) < 1.05 * volume
 
 
 def test_volumes_are_between_those_of_keyframes_and_none_of_open_ones(creature: tuple[Tensor, Tensor]) -> None:
     x, faces = creature
     problem = problem_of(x, faces, [0.0, 2.0])
-    volumes = [centred_volume(one.numpy(), problem.mesh) for one in problem.whole]
-    assert volume_at(0.5, problem.times, problem.whole, problem.mesh) == pytest.approx(
-        0.75 * volumes[0] + 0.25 * volumes[1]
-    )
+    volumes = [volume_of(one.numpy(), problem.mesh.faces) for one in problem.whole]
+    between = volumes_at([0.5, 2.0], problem.times, problem.whole, problem.mesh)
+    assert between == pytest.approx([0.75 * volumes[0] + 0.25 * volumes[1], volumes[1]])
     opened = problem_of(x[:1], faces[: len(faces) // 2], [])
-    assert volume_at(1.0, opened.times, opened.whole, opened.mesh) is None
+    assert volumes_at([1.0], opened.times, opened.whole, opened.mesh) == [None]
 
 
 def test_vertices_follow_coarse_ones_with_their_details(creature: tuple[Tensor, Tensor]) -> None:
@@ -83,14 +84,14 @@ def test_vertices_follow_coarse_ones_with_their_details(creature: tuple[Tensor, 
     problem = problem_of(x, faces, [])
     coarse = coarsen(problem.whole.numpy(), faces.numpy(), 1000)
     truth = torch.from_numpy(problem.to_canonical(x[1]))
-    y = Details(problem, coarse).add(1.0, torch.from_numpy(coarse.restrict(truth.numpy())))
+    (y,) = Details(problem, coarse).add(1.0, torch.from_numpy(coarse.restrict(truth.numpy())))
     off = (y - truth).norm(dim=1)[:-1]
     moved = float((truth - problem.template).norm(dim=1).mean())
     assert float(off.mean()) < 0.03 * moved and float((y - truth)[-1].norm()) < moved
     with_keyframes = problem_of(x, faces, [0.0, 2.0])
     details = Details(with_keyframes, coarse)
     path = tm.Path(with_keyframes.whole, faces, times=[0.0, 2.0])(with_keyframes.whole, 1.0)
-    y = details.add(1.0, torch.from_numpy(coarse.restrict(path.numpy())))
+    (y,) = details.add(1.0, torch.from_numpy(coarse.restrict(path.numpy())))
     assert float((y - path).norm(dim=1).max()) < 1e-9
 
 
@@ -98,7 +99,7 @@ def test_a_mesh_of_few_faces_is_its_own_coarse_one(creature: tuple[Tensor, Tenso
     x, faces = creature
     problem = problem_of(x, faces, [])
     coarse, y = coarsen(problem.whole.numpy(), faces.numpy(), len(faces)), problem_of(x[1:], faces, []).template
-    assert float((Details(problem, coarse).add(1.0, y) - y).norm(dim=1).max()) < 1e-9
+    assert float((Details(problem, coarse).add(1.0, y)[0] - y).norm(dim=1).max()) < 1e-9
 
 
 def test_points_are_paired_with_a_mesh_of_many_faces(creature: tuple[Tensor, Tensor]) -> None:

@@ -2,7 +2,6 @@
 
 import numpy as np
 import torch
-from scipy import sparse
 from torch import Tensor
 
 from torch_modal.arrays import FloatArray
@@ -29,29 +28,24 @@ class Details:
         self.problem, self.coarse = problem, coarse
         whole, times = problem.whole, problem.times.tolist()
         self._path = Path(whole, problem.faces, times=times) if len(times) > 1 else None
-        used = np.flatnonzero(coarse.clusters >= 0)
-        n, edges = len(problem.template), problem.mesh.edges
-        near = sparse.identity(n) + sparse.csr_matrix((np.ones(len(edges)), edges.T), shape=(n, n))
-        near = near + near.T
-        weights = sparse.csr_matrix((np.ones(len(used)), (used, coarse.clusters[used])), shape=(n, coarse.n_vertices))
-        # Rings of neighbours as wide as a cluster make the weights smooth.
-        for _ in range(int(np.ceil(np.sqrt(len(used) / coarse.n_vertices))) - 1):
-            weights = near @ weights
-        self.weights = sparse.diags(1 / np.maximum(np.asarray(weights.sum(1)).ravel(), 1)) @ weights
+        size = np.count_nonzero(coarse.clusters >= 0) / coarse.n_vertices
+        # Rings of neighbours as wide as a cluster.
+        self.weights = coarse.weights(problem.mesh, int(np.ceil(np.sqrt(size))) - 1)
 
-    def add(self, time: float, shape: Tensor) -> Tensor:
-        """The shape of all vertices at a time. *Shape:* ``(V_coarse, 3) -> (V, 3)``."""
-        problem, y = self.problem, shape.numpy()
+    def add(self, time: float, *shapes: Tensor) -> list[Tensor]:
+        """The shapes of all vertices at a time. *Shape of each:* ``(V_coarse, 3) -> (V, 3)``."""
+        problem = self.problem
         x = problem.template
         if self._path is not None:
             x = self._path(problem.whole, float(np.clip(time, *problem.times[[0, -1]])))
         elif len(problem.times):
             x = problem.whole[0]
-        centres = self.coarse.restrict(x.numpy())
-        rotations = vertex_rotations(centres, y, self.coarse.faces)
-        moves = y - np.einsum("cij,cj->ci", rotations, centres)
-        turned = (self.weights @ rotations.reshape(-1, 9)).reshape(-1, 3, 3)
-        placed: FloatArray = np.einsum("vij,vj->vi", turned, x.numpy()) + self.weights @ moves
-        unused = self.coarse.clusters < 0
-        placed[unused] = best_fit(torch.from_numpy(centres), shape).apply(x)[unused].numpy()
-        return torch.from_numpy(placed)
+        centres, unused, found = self.coarse.restrict(x.numpy()), self.coarse.clusters < 0, []
+        for shape in shapes:
+            rotations = vertex_rotations(centres, shape.numpy(), self.coarse.faces)
+            moves = shape.numpy() - np.einsum("cij,cj->ci", rotations, centres)
+            turned = (self.weights @ rotations.reshape(-1, 9)).reshape(-1, 3, 3)
+            placed: FloatArray = np.einsum("vij,vj->vi", turned, x.numpy()) + self.weights @ moves
+            placed[unused] = best_fit(torch.from_numpy(centres), shape).apply(x)[unused].numpy()
+            found.append(torch.from_numpy(placed))
+        return found

@@ -12,6 +12,7 @@ from torch_modal.completion.pairs import OUTLIERS, SampledSurface, robust_weight
 from torch_modal.elastic.volume import encloses
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.inspect import volume_of
+from torch_modal.geometry.surface import Surface
 from torch_modal.registration.fit import ElasticSurface
 
 STEPS, WEIGHTS, REACH = 20, (0.02, 0.5), (15.0, 1.5)
@@ -50,22 +51,17 @@ def follow(
             pulls.append((pairs.places, pairs.points, weight * unit * pairs.weights * trust))
         x = elastic.follow(x, pulls)
         if volume is not None:
-            current = SampledSurface(x, mesh)
-            hidden = 1 - seen_at(points.query(x)[0])
-            area = max(float(hidden @ current.vertex_areas), LEAST_HIDDEN * current.area)
-            move = (volume - centred_volume(x, mesh)) / area
-            x = x + np.clip(move, -MOST_MOVED, MOST_MOVED) * hidden[:, None] * current.vertex_normals
+            surface, hidden = Surface(x, mesh), 1 - seen_at(points.query(x)[0])
+            area = max(float(hidden @ surface.vertex_areas), LEAST_HIDDEN * surface.area)
+            move = (volume - volume_of(x, mesh.faces, mesh.used)) / area
+            x = x + np.clip(move, -MOST_MOVED, MOST_MOVED) * hidden[:, None] * surface.vertex_normals
     return torch.from_numpy(x)
 
 
-def volume_at(time: float, times: FloatArray, shapes: Tensor, mesh: Connectivity) -> float | None:
-    """Volume between whole shapes, or of a template of no time; None if one is open. *Shape:* ``(K,), (K, V, 3)``."""
+def volumes_at(when: list[float], times: FloatArray, shapes: Tensor, mesh: Connectivity) -> list[float] | list[None]:
+    """Volumes between whole shapes, or of a template of no time; None if one is open. *Shape:* ``(K,), (K, V, 3)``."""
     if not all(encloses(x, mesh) for x in shapes):
-        return None
-    volumes = [centred_volume(x.numpy(), mesh) for x in shapes]
-    return float(np.interp(time, times, volumes)) if len(times) else volumes[0]
-
-
-def centred_volume(x: FloatArray, mesh: Connectivity) -> float:
-    """Volume, which does not depend on the place of a shape with small holes. *Shape:* ``(V, 3)``."""
-    return volume_of(x - x[mesh.used].mean(0), mesh.faces)
+        return [None] * len(when)
+    volumes = [volume_of(x.numpy(), mesh.faces, mesh.used) for x in shapes]
+    found: list[float] = np.interp(when, times, volumes).tolist() if len(times) else volumes * len(when)
+    return found

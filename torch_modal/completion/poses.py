@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torch_modal.completion.bending import ModalBending, ModalPose
 from torch_modal.completion.details import Details
-from torch_modal.completion.follow import follow, volume_at
+from torch_modal.completion.follow import follow, volumes_at
 from torch_modal.completion.frames import CompletionProblem, Frame
 from torch_modal.completion.pairs import SampledSurface
 from torch_modal.completion.search import AFTER_FIRST, FIRST, N_KEPT, N_SOFT, REST, UNTURNED, PoseSearch
@@ -107,20 +107,24 @@ class FramePoses:
                 if known and i not in settled:
                     fits[i] = self._again(i, self._starts(self.frames[i].time, known), fits[i])
                 report.update()
-        details = Details(self.problem, self.coarse)
-        return run([partial(self._finish, i, fits[i], details, report) for i in range(len(self.frames))])
+        problem, details = self.problem, Details(self.problem, self.coarse)
+        coarse = torch.stack([shape for _, shape in self.whole] or [self.template])
+        when, each = [frame.time for frame in self.frames], ((coarse, self.poses.mesh), (problem.whole, problem.mesh))
+        volumes = zip(*(volumes_at(when, problem.times, *one) for one in each), strict=True)
+        return run([partial(self._finish, i, fits[i], details, two, report) for i, two in enumerate(volumes)])
 
-    def _finish(self, i: int, fit: ModalFit, details: Details, report: ProgressReport) -> tuple[Tensor, Tensor]:
-        """The shape of the stiffest modes that explain as much, and the one that follows; of all vertices."""
-        frame, problem = self.frames[i], self.problem
+    def _finish(
+        self, i: int, fit: ModalFit, details: Details, volumes: tuple[float | None, ...], report: ProgressReport
+    ) -> tuple[Tensor, Tensor]:
+        """The shape of the stiffest modes that explain as much, and the one that follows; of all vertices.
+
+        Volumes are of the coarse mesh and of the caller's.
+        """
+        frame, problem, (of_coarse, of_all) = self.frames[i], self.problem, volumes
         x = self.bending.shape(fit.base, self.poses.stiffen(fit.base, fit.pose, frame))
-        whole = torch.stack([shape for _, shape in self.whole] or [self.template])
-        volume = volume_at(frame.time, problem.times, whole, self.poses.mesh)
-        followed = follow(frame, x, self.poses.mesh, volume=volume)
-        by_modes, followed = (details.add(frame.time, one) for one in (x, followed))
+        by_modes, followed = details.add(frame.time, x, follow(frame, x, self.poses.mesh, volume=of_coarse))
         if len(self.faces) < len(problem.faces):
-            volume = volume_at(frame.time, problem.times, problem.whole, problem.mesh)
-            followed = follow(problem.frames[i], followed, problem.mesh, N_FOLLOWED, FOLLOWED, volume)
+            followed = follow(problem.frames[i], followed, problem.mesh, N_FOLLOWED, FOLLOWED, of_all)
         report.update()
         return by_modes, followed
 
@@ -147,6 +151,8 @@ class FramePoses:
             # The trace of a rotation by an angle is 1 + 2 cos.
             if all(float((pose.rotation * other.rotation).sum()) < 1 + 2 * DISTINCT for other in distinct):
                 distinct.append(pose)
+        if len(distinct) == 1:  # markers come from anywhere to the same pose
+            return {first: fit}
         placed = [self._place(body, one.rotation) for one in (fit.pose, *distinct[1 : 1 + N_TURNED])]
         _, best, pose = min(placed, key=lambda one: one[0])
         other = self._search(best, [(template, pose)])

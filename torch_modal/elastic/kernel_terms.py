@@ -49,8 +49,7 @@ class KernelTerm(nn.Module):
         if not self.formulas.uses_mean:
             return shapes, None
         sizes = shapes.new_zeros(len(shapes), 2, 3)
-        kernel = of_elements("merging", "total", self.formulas)
-        launch(kernel, (len(shapes), self.n_elements), [self.elements, shapes.shape[1], shapes, sizes, None])
+        self.launch("total", len(shapes), shapes.shape[1], shapes, sizes, None)
         return shapes, sizes
 
 

@@ -126,10 +126,9 @@ class _OnTrajectory(Operation[Tensor]):
     """Number of trajectories, P: ``vmap`` passes several batches as one."""
 
     def run(self, kept: list[Tensor] | None, packed: Tensor, which: Tensor, t: Tensor) -> tuple[Tensor, ...]:
-        rotations, total = self.rotations, t.new_zeros(len(t), self.rotations.n_edges, 4)
-        tables = rotations.triangle_sides, rotations.triangle_signs, rotations.n_edges
-        args = [*tables, packed, self._index(packed, which), t, total]
-        launch(kernels("rotations").trajectory_edges, (len(t), len(rotations.faces)), args)
+        total = t.new_zeros(len(t), self.rotations.n_edges, 4)
+        args = [*self._arguments(packed, which, t), total]
+        launch(kernels("rotations").trajectory_edges, (len(t), len(self.rotations.faces)), args)
         sums, areas = total[..., :3], total[..., 3:].clamp_min(torch.finfo(total.dtype).tiny)
         if kept is not None:
             kept += [sums, areas]
@@ -143,8 +142,7 @@ class _OnTrajectory(Operation[Tensor]):
         to_sums = grads[0] / areas
         to_total = torch.cat([to_sums, -(sums * to_sums).sum(-1, keepdim=True) / areas], -1)
         to_packed, to_t = torch.zeros_like(packed), torch.zeros_like(t)
-        tables = self.rotations.triangle_sides, self.rotations.triangle_signs, self.rotations.n_edges
-        values = [*tables, packed, self._index(packed, which), t, torch.empty_like(to_total)]
+        values = [*self._arguments(packed, which, t), torch.empty_like(to_total)]
         adjoints = [None, None, None, to_packed, None, to_t, to_total]
         launch(kernels("rotations").trajectory_edges, (len(t), packed.shape[1]), values, adjoints)
         return to_packed, None, to_t
@@ -153,9 +151,11 @@ class _OnTrajectory(Operation[Tensor]):
         trajectory = Trajectory._make(packed.movedim(-1, 0).split([3, 3, 3, 3, 6, 6, 6]))
         return (LocalRotations.edges_along(self.rotations, trajectory, which.long(), t).movedim(0, -1),)
 
-    def _index(self, packed: Tensor, which: Tensor) -> Tensor:
-        first = torch.arange(0, len(packed), max(self.n_pairs, 1), device=which.device)
-        return (which.view(max(len(first), 1), -1) + first[:, None]).flatten().int()
+    def _arguments(self, packed: Tensor, which: Tensor, t: Tensor) -> list[Tensor | int]:
+        """Arguments of the kernel before its result."""
+        rotations, first = self.rotations, torch.arange(0, len(packed), max(self.n_pairs, 1), device=which.device)
+        index = (which.view(max(len(first), 1), -1) + first[:, None]).flatten().int()
+        return [rotations.triangle_sides, rotations.triangle_signs, rotations.n_edges, packed, index, t]
 
 
 def best_rotations(covariance: Tensor) -> Tensor:

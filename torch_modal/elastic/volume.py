@@ -38,5 +38,5 @@ def encloses(x: Tensor, mesh: Connectivity) -> bool:
     if open_part(points, mesh) > OPEN:
         return False
     area = double_areas(points, mesh.faces).sum() / 2
-    volume = volume_of(points - points[mesh.used].mean(0), mesh.faces)
+    volume = volume_of(points, mesh.faces, mesh.used)
     return bool(abs(volume) > MIN_RELATIVE_VOLUME * area**1.5)

@@ -160,6 +160,14 @@ def vertex_areas(vertices: FloatArray, faces: IntArray) -> FloatArray:
     return summed.astype(np.float64)  # integers if there are no faces
 
 
+def neighbour_means(mesh: Connectivity) -> sparse.csr_matrix:
+    """Means over a vertex and its neighbours. *Shape:* ``(V, V)``."""
+    n = mesh.n_vertices
+    ends = mesh.edges.T.reshape(-1), mesh.edges[:, ::-1].T.reshape(-1)
+    around = sparse.csr_matrix((np.ones(len(ends[0])), ends), shape=(n, n)) + sparse.identity(n)
+    return sparse.diags(1 / np.asarray(around.sum(axis=1)).reshape(-1)) @ around
+
+
 def edge_graph(vertices: FloatArray, edges: IntArray) -> sparse.csr_matrix:
     """Lengths of edges, none zero, between their ends. *Shape:* ``(V, 3), (E, 2) -> (V, V)``."""
     lengths = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)

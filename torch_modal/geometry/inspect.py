@@ -95,7 +95,12 @@ def open_part(points: FloatArray, mesh: Connectivity) -> float:
     return float(length**2 / (2 * np.pi * double_areas(points, mesh.faces).sum()))
 
 
-def volume_of(vertices: FloatArray, faces: IntArray) -> float:
-    """Enclosed volume of a closed mesh, positive for outward normals."""
+def volume_of(vertices: FloatArray, faces: IntArray, used: IntArray | None = None) -> float:
+    """Enclosed volume of a closed mesh, positive for outward normals.
+
+    With the vertices that faces use, it is about their mean: then it does not depend on the place of a mesh with holes.
+    """
+    if used is not None:
+        vertices = vertices - vertices[used].mean(0)
     a, b, c = vertices[faces[:, 0]], vertices[faces[:, 1]], vertices[faces[:, 2]]
     return float(np.einsum("fi,fi->", a, np.cross(b, c)) / 6)

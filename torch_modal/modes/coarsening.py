@@ -8,7 +8,7 @@ import numpy as np
 from scipy import sparse
 
 from torch_modal.arrays import FloatArray, IntArray
-from torch_modal.geometry.connectivity import Connectivity, double_areas, label_pieces
+from torch_modal.geometry.connectivity import Connectivity, double_areas, label_pieces, neighbour_means
 from torch_modal.geometry.decimation import decimate
 from torch_modal.geometry.inspect import degenerate_faces, fatness, find_repeated_faces
 
@@ -54,6 +54,20 @@ class Coarsening:
         shares = 1.0 / np.bincount(clusters, minlength=n)
         matrix = sparse.csr_matrix((shares[clusters], (clusters, members)), shape=(n, len(self.clusters)))
         return np.stack([matrix @ shape for shape in x.reshape(-1, *x.shape[-2:])]).reshape(*x.shape[:-2], n, 3)
+
+    def weights(self, mesh: Connectivity, rounds: int) -> sparse.csr_matrix:
+        """Membership averaged over neighbours several times: a smooth partition of unity. *Shape:* ``(V, V_coarse)``.
+
+        Rows of vertices that no cluster reaches are zero.
+        """
+        members = np.flatnonzero(self.clusters >= 0)
+        entries = members, self.clusters[members]
+        weights = sparse.csr_matrix((np.ones(len(members)), entries), shape=(len(self.clusters), self.n_vertices))
+        averages = neighbour_means(mesh)
+        for _ in range(rounds):
+            weights = averages @ weights
+        total = np.asarray(weights.sum(axis=1)).reshape(-1)
+        return sparse.diags(1 / np.where(total > 0, total, 1)) @ weights
 
 
 def coarsen(

@@ -13,7 +13,7 @@ from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.elastic.rest_hessian import rest_hessian
 from torch_modal.elastic.shell import BETA
 from torch_modal.geometry.canonical import CANONICAL_SIZE
-from torch_modal.geometry.connectivity import Connectivity, vertex_areas
+from torch_modal.geometry.connectivity import Connectivity, neighbour_means, vertex_areas
 from torch_modal.geometry.surface import Surface
 from torch_modal.modes.coarsening import collapse, join_clusters
 from torch_modal.modes.eigen import ElasticBody
@@ -70,7 +70,14 @@ def sheet_body(surface: Surface, n_modes: int) -> ElasticBody:
         # of unity; rigid motions and uniform strains are exact.
         if np.array_equal(coarsening.clusters, np.arange(len(surface.vertices))):
             return motions
-        weights = _cluster_weights(coarsening.clusters, surface, fine, points, mesh)
+        size = np.count_nonzero(coarsening.clusters >= 0) / len(points)
+        weights = coarsening.weights(fine, round(AVERAGES_PER_RADIUS * size**0.5))
+        rows = np.flatnonzero(np.asarray(weights.sum(axis=1)).reshape(-1) == 0)
+        if len(rows):  # pieces that no cluster reaches follow the clusters around the nearest one
+            nearest = cKDTree(points).query(surface.vertices[rows])[1]
+            follows = sp.csr_matrix((np.ones(len(rows)), (rows, nearest)), shape=weights.shape)
+            weights = weights + follows @ neighbour_means(mesh)
+        weights = sp.coo_matrix(weights)
         entries = weights.row, weights.col
         arms = (surface.vertices[weights.row] - points[weights.col]).T
         slopes = [sp.coo_matrix((weights.data * along, entries), weights.shape) for along in arms]
@@ -81,36 +88,8 @@ def sheet_body(surface: Surface, n_modes: int) -> ElasticBody:
     return ElasticBody(points, stiffness, mass, to_surface, SHIFT, LARGEST_SHEET_RESIDUAL)
 
 
-def _cluster_weights(
-    clusters: IntArray, surface: Surface, fine: Connectivity, points: FloatArray, mesh: Connectivity
-) -> sp.coo_matrix:
-    """Weights of the clusters that move each vertex, membership averaged over neighbours. *Shape:* ``(U, N)``."""
-    n_fine, n = len(surface.vertices), len(points)
-    clustered = np.flatnonzero(clusters >= 0)
-    weights = sp.csr_matrix((np.ones(len(clustered)), (clustered, clusters[clustered])), shape=(n_fine, n))
-    averages = _averages(fine)
-    for _ in range(round(AVERAGES_PER_RADIUS * (len(clustered) / n) ** 0.5)):
-        weights = averages @ weights
-    total = np.asarray(weights.sum(axis=1)).reshape(-1)
-    weights = sp.diags(1 / np.where(total > 0, total, 1)) @ weights
-    rows = np.flatnonzero(total == 0)
-    if len(rows):  # pieces that no cluster reaches follow the clusters around the nearest one
-        nearest = cKDTree(points).query(surface.vertices[rows])[1]
-        follows = sp.csr_matrix((np.ones(len(rows)), (rows, nearest)), shape=(n_fine, n))
-        weights = weights + follows @ _averages(mesh)
-    return sp.coo_matrix(weights)
-
-
 def _mean_length(points: FloatArray, mesh: Connectivity) -> float:
     return float(np.linalg.norm(points[mesh.edges[:, 1]] - points[mesh.edges[:, 0]], axis=1).mean())
-
-
-def _averages(mesh: Connectivity) -> sp.csr_matrix:
-    """Means over a vertex and its neighbours. *Shape:* ``(V, V)``."""
-    n = mesh.n_vertices
-    ends = mesh.edges.T.reshape(-1), mesh.edges[:, ::-1].T.reshape(-1)
-    around = sp.csr_matrix((np.ones(len(ends[0])), ends), shape=(n, n)) + sp.identity(n)
-    return sp.diags(1 / np.asarray(around.sum(axis=1)).reshape(-1)) @ around
 
 
 def _vertex_gradients(motions: FloatArray, points: FloatArray, faces: IntArray) -> FloatArray:
